@@ -11,7 +11,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install doctor pictures demo test test-ray test-board lint format lint-container bench \
-	bench-quick bench-loop vehicle board recording mutate lock clean
+	bench-quick bench-loop recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -35,16 +35,16 @@ pictures: $(STAMP)  ## every picture of the READMEs, into docs
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
 
-# Tests mostly wait for processes: a second worker takes a third off their time. A test's networks are
-# small: where each process computes with all cores, threads only wait for each other.
+# Tests often wait for processes, so that two cores serve three workers. A test's networks are small:
+# where each process computes with all cores, threads only wait for each other.
 test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
 	$(BIN)/python -m pytest -m ray trainer
 
-test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, with every fault; minutes, root
+test-board: $(STAMP)  ## whole bundles installed, with every fault; minutes, root
 	$(BIN)/python -m pytest -m board
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
@@ -65,7 +65,7 @@ format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## speed beside Stable-Baselines3 and highway-env: tables, and JSON in results/bench
+bench: $(STAMP)  ## speed, the learner beside Stable-Baselines3: tables, and JSON in results/bench
 	for threads in 1 2; do \
 		$(BIN)/python -m trainer bench --threads $$threads --out $(BENCH)/threads_$$threads.json || exit; \
 	done
@@ -73,15 +73,8 @@ bench: $(STAMP)  ## speed beside Stable-Baselines3 and highway-env: tables, and 
 bench-quick: $(STAMP)  ## a look at the same: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
 
-board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
-	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
-	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
-
-bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
+bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start
 	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
-
-vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
-	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests recording
@@ -93,13 +86,14 @@ $(MUTATION_STAMP): requirements/mutation.txt
 	@touch $@
 
 # On a copy: a run that is killed must change no source.
-mutate: $(MUTATION_STAMP)  ## change the safety core in every small way: a test must fail each time
+mutate: $(MUTATION_STAMP)  ## change the safety core in every small way, and show what no test notices
 	rm -rf build/mutation && mkdir -p build/mutation && cp -r edge_runtime hil_tests build/mutation
 	export PATH="$(CURDIR)/$(MUTATION)/bin:$$PATH" && cd build/mutation && for part in core hunter; do \
 		configuration=hil_tests/mutation/$$part.toml && cosmic-ray init $$configuration $$part.sqlite && \
 		cr-filter-operators $$part.sqlite $$configuration && cosmic-ray baseline $$configuration && \
-		cosmic-ray exec $$configuration $$part.sqlite || exit; \
-	done && python hil_tests/mutation/mutants.py core.sqlite hunter.sqlite
+		cosmic-ray exec $$configuration $$part.sqlite && \
+		cr-report --surviving-only --show-diff $$part.sqlite || exit; \
+	done
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

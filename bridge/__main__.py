@@ -8,16 +8,17 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime, and report"),
-    "router": ("bridge.relay:ROUTER", "connect simulators, edge runtimes and viewers"),
-    "relay": ("bridge.relay:RELAY", "inject a network between simulator and edge runtime"),
+    "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
+    "fork": ("bridge.fork:FORK", "drive a recorded drive again, and on in another way"),
+    "bisect": ("bridge.bisect:BISECT", "find the checkpoint from which on a drive ends otherwise"),
+    "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
     "repair": ("bridge.record:REPAIR", "save what is whole of a cut-off or damaged recording"),
-    "ros2": ("bridge.ros2", "show the wire to ROS 2, through a zenoh-bridge-ros2dds"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }
 EXAMPLE = examples(
-    "python -m bridge simulate --env left_turn --episodes 5 --clock realtime",
+    "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime",
     "python -m bridge view --serve",
 )
 

@@ -7,7 +7,7 @@ and a slow machine.
 
 Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
 after the episode's start; its state goes out through the delay line, and the vehicle acts at the
-latest 25 ms after the tick on the newest command that has arrived. With a vehicle in the loop
+latest T / 4 after the tick on the newest command that has arrived. With a vehicle in the loop
 (`VehicleClock`), its newest feedback at tick n + 1 says what came of state n.
 """
 
@@ -24,19 +24,20 @@ from typing import Any
 import msgspec
 
 from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold, VehicleDecision
-from bridge.network import EventHeap, LatencyModel, LatencySpec, make_link
+from bridge.network import Direction, EventHeap, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
-    COMMAND_WINDOW_S,
-    SILENCE_LIMIT_S,
+    COMMAND_WINDOW,
+    SILENCE_PERIODS,
     Arrival,
     CommandHold,
     Decision,
     VirtualLink,
 )
+from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Feedback, Reason, State, encode
+from edge_runtime.wire import SAFE_STOP, Command, Feedback, Reason, State, encode
 
 Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must not block
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
@@ -46,7 +47,15 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 class _Clock:
     """Drives the exchange of one episode at a time; ``begin``, ``exchange`` ..., ``finish``."""
 
-    def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
+    def __init__(
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
+    ) -> None:
+        self._period_s, self._silence_s = (
+            task.control_period_s,
+            SILENCE_PERIODS * task.control_period_s,
+        )
+        self._window_s = COMMAND_WINDOW * task.control_period_s
+        self._observation_bytes = Layout(task).size
         self.latencies_ms: list[float] = []
         """From state sent to command received, injected delays included; one per answered state."""
         self.tick_overruns = 0
@@ -59,7 +68,7 @@ class _Clock:
         self._publish = publish
         self._check = check
         self._spec = spec
-        self._hold = CommandHold(now_s=0.0)
+        self._hold = CommandHold(0.0, self._period_s)
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
@@ -77,18 +86,25 @@ class _Clock:
         """
         with self._arrived:
             self._check.end(state.step, self._hold.newest_step)
-        self._publish(encode(_stamp(state)))
+        self._publish(self._stamped(state))
 
     def close(self) -> None:
         """Stop any thread."""
+
+    def _stamped(self, state: State) -> bytes:
+        """The state as it leaves now: with the wall clock, and what was heard of the commands."""
+        heard = self._check.heard
+        return encode(msgspec.structs.replace(state, sent_ns=time.time_ns(), **heard))
 
 
 class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
-    def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
+    def __init__(
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
+    ) -> None:
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
-        super().__init__(publish, check, spec)
+        super().__init__(publish, check, spec, task)
         self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -97,6 +113,8 @@ class LockStepClock(_Clock):
         self._link: VirtualLink[State] = VirtualLink(
             self._spec,
             seed,
+            self._period_s,
+            self._observation_bytes,
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
             on_stale=lambda: self._check.reject(Reason.STALE.value),
         )
@@ -118,10 +136,10 @@ class LockStepClock(_Clock):
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
-        payload = encode(_stamp(arrival.message))
+        payload = self._stamped(arrival.message)
         # What came between two ticks is read all the same, so that faults are counted.
         while not self._inbox.empty():
-            self._check.read(self._inbox.get()[0])
+            self._check.read(self._inbox.get()[0], time.time_ns())
         published_s = time.monotonic()
         self._publish(payload)
         if arrival.overtaken:
@@ -138,7 +156,7 @@ class LockStepClock(_Clock):
                 payload, received_s = self._inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
-            if (command := self._check.read(payload)) is None:
+            if (command := self._check.read(payload, time.time_ns())) is None:
                 continue
             if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
@@ -157,14 +175,34 @@ class LockStepClock(_Clock):
         """
         answered_at_s = published_s if self._answered_at_s is None else self._answered_at_s
         if self._edge_silent:
-            return published_s + CONTROL_PERIOD_S
-        return max(answered_at_s + SILENCE_LIMIT_S, published_s + CONTROL_PERIOD_S)
+            return published_s + self._period_s
+        return max(answered_at_s + self._silence_s, published_s + self._period_s)
 
     def _wall_silence_s(self) -> float | None:
         """Wall time without an answer (s), if the last state really published got none."""
         if self._edge_silent and self._answered_at_s is not None:
             return time.monotonic() - self._answered_at_s
-        return SILENCE_LIMIT_S if self._edge_silent else None
+        return self._silence_s if self._edge_silent else None
+
+
+class InProcessClock(LockStepClock):
+    """Lock-step within one process: a function answers the states, and no wall time is in it.
+
+    Args:
+        answer: given a state's arrival at the edge runtime, its command; None: no answer.
+        spec: the network.
+        task: of the environment.
+    """
+
+    def __init__(
+        self, answer: Callable[[Arrival[State]], Command | None], spec: LatencySpec, task: Task
+    ) -> None:
+        self._answer = answer
+        super().__init__(lambda payload: None, CommandCheck("", task), spec, task)
+
+    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
+        if not arrival.overtaken and (command := self._answer(arrival)) is not None:
+            self._link.answer(arrival, command)
 
 
 class RealTimeClock(_Clock):
@@ -174,9 +212,11 @@ class RealTimeClock(_Clock):
     directions.
     """
 
-    def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
+    def __init__(
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
+    ) -> None:
         self._line = DelayLine()
-        super().__init__(publish, check, spec)
+        super().__init__(publish, check, spec, task)
         self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -185,7 +225,7 @@ class RealTimeClock(_Clock):
             self._check.begin(episode)
             self._link = make_link(self._spec, seed)
             self._start_s = self._begun_s = time.monotonic()
-            self._hold = CommandHold(now_s=self._start_s)
+            self._hold = CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
@@ -194,7 +234,7 @@ class RealTimeClock(_Clock):
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and decide when its command window closes."""
-        window_end_s = self._send_state(state) + COMMAND_WINDOW_S
+        window_end_s = self._send_state(state) + self._window_s
         with self._arrived:
             # An answered state ends the wait: nothing newer can arrive.
             self._arrived.wait_for(
@@ -215,14 +255,14 @@ class RealTimeClock(_Clock):
     def _send_state(self, state: State) -> float:
         """Wait for the state's tick, send it, and return the tick's time."""
         tick_s = self._wait_for_tick(state.step)
-        payload = encode(_stamp(state))
+        payload = self._stamped(state)
         with self._arrived:
             self._sent_s[state.step] = time.monotonic()
             self._check.sent(state.step)
         self._send(self._link.up, payload, self._publish)
         return tick_s
 
-    def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
+    def _send(self, direction: Direction, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
         for arrival_s in direction.arrivals(sent_s, len(payload)):
@@ -233,11 +273,11 @@ class RealTimeClock(_Clock):
 
         Catching up instead would run several ticks at once, at a pace no edge runtime can follow.
         """
-        tick_s = self._start_s + step * CONTROL_PERIOD_S
+        tick_s = self._start_s + step * self._period_s
         late_s = time.monotonic() - tick_s
-        if late_s > COMMAND_WINDOW_S:
+        if late_s > self._window_s:
             self.tick_overruns += 1
-            self.missed_ticks += int(late_s / CONTROL_PERIOD_S)
+            self.missed_ticks += int(late_s / self._period_s)
             self._start_s += late_s
             return tick_s + late_s
         time.sleep(max(0.0, -late_s))
@@ -246,7 +286,7 @@ class RealTimeClock(_Clock):
     def _arrive_at_vehicle(self, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            if (command := self._check.read(payload)) is None:
+            if (command := self._check.read(payload, time.time_ns())) is None:
                 return
             answered_step, sent_s = self._hold.newest_step, self._sent_s[command.step]
             if not self._hold.admit(command, now_s, sent_s):
@@ -261,11 +301,6 @@ class RealTimeClock(_Clock):
         """Look at a command that the vehicle takes; the caller holds the condition."""
 
 
-def _stamp(state: State) -> State:
-    """Return the state with the wall clock at which it is sent."""
-    return msgspec.structs.replace(state, sent_ns=time.time_ns())
-
-
 POLL_S = 0.02
 STANDSTILL_WAIT_S = 5.0
 """Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
@@ -275,21 +310,26 @@ class VehicleClock(RealTimeClock):
     """The clock of ``--loop vehicle``. ``tracking`` keeps what was asked, and what became of it."""
 
     def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, feedback: FeedbackCheck
+        self,
+        publish: Publish,
+        check: CommandCheck,
+        spec: LatencySpec,
+        task: Task,
+        feedback: FeedbackCheck,
     ) -> None:
         self.tracking = TrackingLog()
         self.feedback_ages_ms: list[float] = []
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
         self.feedback_check = feedback
-        self._feedback = FeedbackHold(time.monotonic())
-        super().__init__(publish, check, spec)
+        self._feedback = FeedbackHold(time.monotonic(), task.control_period_s)
+        super().__init__(publish, check, spec, task)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode now; the vehicle stands, or is counted as moving."""
         super().begin(episode, seed)
         with self._arrived:
-            # Its own stream, so that commands meet the same luck as without it; so has the relay.
+            # Its own stream, so that commands meet the same luck as without it.
             self._feedback_link = make_link(self._spec, seed + 1).down
             self.tracking.begin()
 
@@ -328,7 +368,7 @@ class VehicleClock(RealTimeClock):
 
     def exchange(self, state: State) -> VehicleDecision:
         """Wait for the tick, send its state, and at the next tick say what the vehicle has done."""
-        end_s = self._send_state(state) + CONTROL_PERIOD_S
+        end_s = self._send_state(state) + self._period_s
         time.sleep(max(0.0, end_s - time.monotonic()))
         with self._arrived:
             now_s = time.monotonic()
@@ -365,7 +405,7 @@ class VehicleClock(RealTimeClock):
         while time.monotonic() < give_up_s:
             with self._arrived:
                 heard, heard_s = self.feedback_check.heard, self.feedback_check.heard_s
-            if heard is not None and time.monotonic() - heard_s <= SILENCE_LIMIT_S and holds(heard):
+            if heard is not None and time.monotonic() - heard_s <= self._silence_s and holds(heard):
                 return True
             time.sleep(POLL_S)
         return False

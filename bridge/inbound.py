@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
 
-from bridge.virtual_link import ROUNDING_S, SILENCE_LIMIT_S, UNKNOWN_SAFE_STOP, Decision
+from bridge.virtual_link import ROUNDING_S, SILENCE_PERIODS, UNKNOWN_SAFE_STOP, Decision
+from edge_runtime.manifest import Action, Task
 from edge_runtime.wire import (
+    MAX_RIDE_S,
     SAFE_STOP,
     Command,
     Feedback,
@@ -28,6 +31,10 @@ from edge_runtime.wire import (
 
 ACTION_SIZE = "action_size"
 """Rejection reason: the policy has another number of actions than the environment."""
+ACTION_RANGE = "action_range"
+"""Rejection reason: beyond the action's range, where no policy and no actuator is."""
+PLAN_TOO_LONG = "plan_too_long"
+"""Rejection reason: it would keep the vehicle going for longer than any runtime may."""
 UNKNOWN_STEP = "unknown_step"
 """Rejection reason: the command (that the vehicle has taken) answers a state never sent."""
 
@@ -39,14 +46,17 @@ class CommandCheck:
     One thread at a time: the clock that owns it.
     """
 
-    def __init__(self, session: str, action_size: int) -> None:
+    def __init__(self, session: str, task: Task) -> None:
         self.rejected: Counter[str] = Counter()
         self.policy_ids: list[str] = []
         self._session = session
-        self._action_size = action_size
+        self._actions, self._period_s = task.action, task.control_period_s
         self._episode = 0
         self._newest_step = -1
         self._ended = (-1, -1)
+        self._stamps: deque[int] = deque(maxlen=64)  # Of commands: a copy is no second one.
+        self.heard: dict[str, int] = {}
+        """Of this session's commands, as a state says it; empty before the first."""
 
     def begin(self, episode: int) -> None:
         """Note that an episode begins: whatever answers an earlier one is stale from now on."""
@@ -64,15 +74,20 @@ class CommandCheck:
         self._newest_step = final_step
         self._ended = (self._episode, answered_step)
 
-    def read(self, payload: bytes) -> Command | None:
+    def read(self, payload: bytes, now_ns: int = 0) -> Command | None:
         """Return the command if it answers a state of this episode; None otherwise.
 
-        An answer that the end of its episode overtook is None, too, but is not counted.
+        An answer that the end of its episode overtook is None, too, but is not counted. ``now_ns``
+        is the wall clock.
         """
         command = decode_command(payload)
         if isinstance(command, Rejection):
             self.reject(command.reason.value)
             return None
+        if command.session == self._session and command.sent_ns not in self._stamps:
+            self._stamps.append(command.sent_ns)
+            heard = self.heard.get("heard", 0) + 1
+            self.heard = {"heard": heard, "heard_sent_ns": command.sent_ns, "heard_ns": now_ns}
         if fault := self._fault(command):
             self.reject(fault)
             return None
@@ -90,8 +105,12 @@ class CommandCheck:
         """Why a well-formed command answers nothing in this episode; empty if it does."""
         if command.session != self._session:
             return Reason.FOREIGN_SESSION.value
-        if len(command.action) != self._action_size:
-            return ACTION_SIZE
+        plan = command.plan or []
+        for action in (command.action, *plan):
+            if fault := _action_fault(action, self._actions, COMMAND_ROUNDING):
+                return fault
+        if len(plan) * self._period_s > MAX_RIDE_S + ROUNDING_S:
+            return PLAN_TOO_LONG
         if (command.episode, command.step) > (self._episode, self._newest_step):
             return UNKNOWN_STEP
         if command.episode < self._episode and not self._overtaken(command):
@@ -103,8 +122,20 @@ class CommandCheck:
         return command.episode == ended_episode and command.step > answered_step
 
 
-ACTION_RANGE = "action_range"  # Rejection reason: no actuator is beyond its end
-ROUNDING = 1e-3
+COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
+"""Of an action's whole range: a policy clamps to the last bit, an actuator is measured."""
+
+
+def _action_fault(values: Sequence[float], actions: Sequence[Action], rounding: float) -> str:
+    if len(values) != len(actions):
+        return ACTION_SIZE
+    for value, row in zip(values, actions, strict=True):
+        slack = rounding * (row.high - row.low)
+        if not row.low - slack <= value <= row.high + slack:
+            return ACTION_RANGE
+    return ""
+
+
 NOT_COMMANDED = ""
 """Session of a vehicle that has not taken a command since its edge runtime was started."""
 
@@ -117,13 +148,13 @@ class FeedbackCheck:
     begins anew: another board, with another clock, may have taken over.
     """
 
-    def __init__(self, session: str, action_size: int) -> None:
+    def __init__(self, session: str, task: Task) -> None:
         self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
         """The last that could be read, of whatever session: it tells that a vehicle is there."""
         self.heard_s = 0.0
         self._session = session
-        self._action_size = action_size
+        self._actions, self._silence_s = task.action, SILENCE_PERIODS * task.control_period_s
         self._sent = (-1, -1)
         self._met = False
         self._newest: Feedback | None = None
@@ -153,10 +184,8 @@ class FeedbackCheck:
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
         """Why a well-formed feedback of this session is not believed; empty if it is."""
-        if len(feedback.action) != self._action_size:
-            return ACTION_SIZE
-        if any(abs(value) > 1.0 + ROUNDING for value in feedback.action):
-            return ACTION_RANGE
+        if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
+            return fault
         if (feedback.episode, feedback.step) > self._sent:
             return UNKNOWN_STEP
         newest = self._newest
@@ -164,7 +193,7 @@ class FeedbackCheck:
             return ""
         if feedback.sent_ns == newest.sent_ns:
             return Reason.DUPLICATE.value
-        in_order = now_s - self._newest_s <= SILENCE_LIMIT_S
+        in_order = now_s - self._newest_s <= self._silence_s
         return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
 
 
@@ -185,7 +214,8 @@ class VehicleDecision(Decision):
 class FeedbackHold:
     """The newest feedback, and how long ago it arrived. Times are monotonic seconds."""
 
-    def __init__(self, now_s: float) -> None:
+    def __init__(self, now_s: float, period_s: float) -> None:
+        self._silence_s = SILENCE_PERIODS * period_s
         self._newest: Feedback | None = None
         self._received_s = self._heard_s = now_s
 
@@ -195,7 +225,7 @@ class FeedbackHold:
 
     def newest(self, now_s: float) -> Feedback | None:
         """Return the newest feedback; None if it has been silent for 2 T."""
-        silent = now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S
+        silent = now_s - self._heard_s > self._silence_s + ROUNDING_S
         return None if silent else self._newest
 
     def decide(self, heard: Decision, episode: int, now_s: float) -> VehicleDecision:
@@ -221,6 +251,7 @@ class FeedbackHold:
             brake_reason=reason,
             undriven_s=heard.undriven_s,
             command_age_s=None if reason else heard.command_age_s,
+            ridden=0 if reason else heard.ridden,
             feedback=feedback,
             feedback_age_s=None if feedback is None else now_s - self._received_s,
         )

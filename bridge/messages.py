@@ -13,7 +13,9 @@ import msgspec
 import numpy as np
 
 from edge_runtime import wire
-from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id
+from edge_runtime.manifest import Entry, Task, check_task
+from edge_runtime.util import UserError
+from edge_runtime.wire import MAX_STATE_BYTES, check_vehicle_id
 
 WIRE_TOPICS = ("state", "command", "feedback", "health", "scene")
 TOKEN_TOPICS = ("alive", "simulator")
@@ -63,8 +65,30 @@ class SceneVehicle(SeenCar, frozen=True, kw_only=True):
     speed_mps: float
 
 
+class Origin(msgspec.Struct, frozen=True, kw_only=True):
+    """How an episode was begun: with ``Scene.applied``, all that ``bridge fork`` needs of it.
+
+    The fields are the options of ``bridge simulate``; ``seed`` is the episode's own.
+    """
+
+    session: str
+    environment: str
+    condition: str
+    seed: int
+    standing: bool
+    clock: str
+    loop: str
+    latency: str
+
+
 class Scene(SeenScene, frozen=True, kw_only=True):
-    """The scene on the wire, with its place in time and what the simulator says beside it."""
+    """The scene on the wire, with its place in time and what the simulator says beside it.
+
+    ``task`` says how to read the states. ``picture`` is a JPEG of an environment that has no
+    ``scene()`` and draws itself; empty otherwise. ``applied`` is the action of the step that led
+    here, by whoever decided it, and ``braked`` whether the brake was pressed in it. ``ridden`` is
+    its place in an earlier command's plan; 0: it is of none.
+    """
 
     vehicles: Sequence[SceneVehicle] = ()
     episode: int
@@ -74,6 +98,12 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     """Of the newest command: from its state sent until it acts, injected delays included."""
     answered_step: int | None = None  # The state, of this episode, that ``round_trip_ms`` is of
     rejected: dict[str, int] = {}  # What the simulator did not believe so far, by reason
+    task: Task | None = None
+    picture: bytes = b""
+    origin: Origin | None = None
+    applied: list[float] | None = None
+    braked: bool = False
+    ridden: int = 0
 
 
 class Stamps(NamedTuple):
@@ -85,6 +115,12 @@ class Stamps(NamedTuple):
     round_trip_ms: float | None = None
     answered_step: int | None = None
     rejected: Mapping[str, int] = {}
+    task: Task | None = None
+    picture: bytes = b""
+    origin: Origin | None = None
+    applied: Sequence[float] | None = None
+    braked: bool = False
+    ridden: int = 0
 
 
 _ENCODER = msgspec.msgpack.Encoder(
@@ -108,14 +144,42 @@ def read_scene(scene: Mapping[str, Any]) -> SeenScene:
     return msgspec.msgpack.decode(_ENCODER.encode(scene), type=SeenScene)
 
 
+def period_of(state: wire.State) -> float:
+    """The control period in seconds as a state tells it; 0 for the first of an episode."""
+    return state.sim_time_s / state.step if state.step else 0.0
+
+
+def is_picture(entry: Entry) -> bool:
+    """Whether an observation's entry is drawn as a picture: bytes in two dimensions or more."""
+    return entry.dtype == "uint8" and len(entry.shape) > 1
+
+
+def images_of(array: np.ndarray) -> np.ndarray | None:
+    """An observation's array as images [count, height, width, 1 or 3]; None where it is none.
+
+    Bytes in two dimensions or more are images: with a last axis of 3 in colour, else grey ones
+    one after the other.
+    """
+    if array.dtype != np.uint8 or array.ndim < 2:
+        return None
+    colours = 3 if array.ndim > 2 and array.shape[-1] == 3 else 1
+    last = (*array.shape[-3:-1], 3) if colours == 3 else (*array.shape[-2:], 1)
+    return array.reshape(-1, *last)
+
+
 def decode_scene(payload: bytes) -> Scene | None:
     """Return the scene; None if the payload is not one (a viewer has nothing better to do)."""
-    if len(payload) > MAX_PAYLOAD_BYTES:
+    if len(payload) > MAX_STATE_BYTES:
         return None
     try:
-        return _DECODER.decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        scene = _DECODER.decode(payload)
+        if scene.origin is not None and scene.origin.seed < 0:
+            return None
+        if scene.task is not None:
+            check_task(scene.task)  # Whoever sent it, a viewer reads states by it.
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
         return None
+    return scene
 
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {

@@ -2,7 +2,7 @@
 
 Pure: no clock, no socket, no global. The caller passes the time in and gets the times at which the
 message comes out at the other end: none if it is lost, two if it is duplicated. The same model
-serves lock-step and training (virtual time), real time (timers), and the relay.
+serves lock-step and training (virtual time), and real time (timers).
 
 A specification (`LatencySpec`) says what the network does in each direction; `parse_spec` reads
 one as a person writes it. The way of a message (`LatencyModel`): queue and line, outage, loss, time
@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -68,7 +68,7 @@ RATE = _measure(_RATES, most=1e9, least=math.ulp(0.0))
 class Outage:
     """A window in which nothing gets through, once or again and again.
 
-    Time 0 is the episode's start (at the relay: the first state).
+    Time 0 is the episode's start.
     """
 
     length_s: float
@@ -384,15 +384,25 @@ class LatencyModel:
         return max(0.0, under_way_ms) * 1e-3
 
 
+class Direction(Protocol):
+    """What becomes of each message of one direction: drawn, or played from a trace."""
+
+    def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
+        """As `LatencyModel.arrivals`."""
+        ...
+
+
 class Link(NamedTuple):
     """The two directions of one episode."""
 
-    up: LatencyModel
-    down: LatencyModel
+    up: Direction
+    down: Direction
 
 
-def make_link(spec: LatencySpec, seed: int) -> Link:
-    """Make both directions, each with its own stream of the seed."""
+def make_link(spec: LatencySpec | Link, seed: int) -> Link:
+    """Make both directions, each with its own stream of the seed; a link is taken as it is."""
+    if isinstance(spec, Link):
+        return spec
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Link(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
 

@@ -5,7 +5,7 @@ every topic through a bounded queue. Zenoh's threads only put into it, so a list
 behind loses messages and never holds up the vehicle.
 
 After them stands what the commands share: their options, which say where an end is, and how they
-wait.
+wait. Last comes ``python -m bridge router``, which connects simulators, edge runtimes and viewers.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from typing import Any, NoReturn
 import msgspec
 import zenoh
 
-from bridge.environments import scene_of
+from bridge.environments import picture_of, scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
-from edge_runtime.cli import not_negative, seconds
+from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable
-from edge_runtime.policy import Manifest
+from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session
-from edge_runtime.util import UserError
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_PAYLOAD_BYTES, check_vehicle_id, key
+from edge_runtime.util import UserError, read_bytes
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
@@ -47,6 +47,14 @@ PayloadHandler = Callable[[bytes], None]
 def simulator_key(vehicle_id: str) -> str:
     """Return the liveliness key by which viewers see that the simulator is there (extension)."""
     return f"phil/{vehicle_id}/simulator"
+
+
+def scene_payload(environment: Any, stamps: Stamps) -> bytes:
+    """The scene as it is sent, or else the environment's picture."""
+    scene = scene_of(environment)
+    if scene is None:
+        stamps = stamps._replace(picture=picture_of(environment))
+    return encode_scene(scene or {}, stamps)
 
 
 class SimulatorPort:
@@ -80,10 +88,11 @@ class SimulatorPort:
         self._states.put(payload)
 
     def publish_scene(self, environment: Any, stamps: Stamps) -> None:
-        """Send the scene, if the environment has one and anybody is listening."""
+        """Send the scene, or else the environment's picture, if anybody is listening."""
         somebody: Any = self._scenes.matching_status
-        if somebody.matching and (scene := scene_of(environment)) is not None:
-            self._scenes.put(encode_scene(scene, stamps))
+        if not somebody.matching:
+            return
+        self._scenes.put(scene_payload(environment, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
@@ -198,7 +207,7 @@ class WireListener:
                 return  # put to many vehicles at once: no vehicle's own
             size = len(sample.payload)
             # A flood of huge messages must not fill the memory.
-            payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""
+            payload = sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b""
             self._put(str(sample.key_expr), topic, payload, size)
 
         return hear
@@ -249,7 +258,11 @@ def open_listener(
     with contextlib.closing(connect_client(connect, wait_s, tls)) as session:
         listener = WireListener()
         declared = [
-            session.declare_subscriber(f"phil/{vehicle_id}/{topic}", listener.hearer(topic))
+            # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
+            session.declare_subscriber(
+                f"phil/{vehicle_id}/{topic}",
+                zenoh.handlers.Callback(listener.hearer(topic), indirect=False),
+            )
             for topic in WIRE_TOPICS
         ]
         for topic in TOKEN_TOPICS:
@@ -323,3 +336,49 @@ def wait_to_be_told() -> NoReturn:
     """
     while True:
         time.sleep(RETRY_S)
+
+
+def _add_router_arguments(parser: Any) -> None:
+    help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
+    add_options(parser, "--listen", action="append", help=help_text)
+    add_options(parser, "--tls")
+    vehicle = "a vehicle whose parties have rights here, with --tls; may be repeated"
+    vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
+    add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
+    config = "all settings from a file of `python -m deploy router`, and no other option"
+    parser.add_argument("--config", metavar="FILE.json5", help=config)
+
+
+def _run_router(arguments: Any) -> int:
+    """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
+    listens = list(dict.fromkeys(arguments.listen or [DEFAULT_ENDPOINT]))
+    tls, rules, ready = None, None, f"config={arguments.config}"
+    if arguments.config is None:
+        ready = f"listen={','.join(listens)}"
+        tls = access.tls_for(arguments.tls, *listens)
+    elif arguments.listen or arguments.tls or arguments.vehicle_id:
+        raise UserError("--config goes with no other option: the file says it all")
+    if tls is not None:
+        access.check_name(tls.name, access.ROUTER)
+        rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
+    with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
+        if arguments.config is None:
+            session = open_session(listen=listens, mode="router", tls=tls, access=rules)
+        else:
+            read_bytes(arguments.config, "router's config file")
+            try:  # as zenohd would
+                session = zenoh.open(zenoh.Config.from_file(arguments.config))
+            except zenoh.ZError as error:
+                raise UserError(f"Zenoh opens no router with {arguments.config}: {error}") from None
+        with contextlib.closing(session):
+            print(f"ready {ready}", flush=True)
+            wait_to_be_told()
+    return 0
+
+
+ROUTER_EXAMPLE = examples(
+    "python -m bridge router --listen tcp/127.0.0.1:7447",
+    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02",
+)
+ROUTER = Command(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

@@ -9,8 +9,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-LINE_INTERVAL_S = 15.0
-"""Between two lines of progress where stderr is no terminal."""
+LINE_INTERVAL_S = 15.0  # Between two lines of progress where stderr is no terminal
 
 
 class ProgressBar:

@@ -27,7 +27,7 @@ import sys
 import time
 import typing
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -35,7 +35,7 @@ import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard
+from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, images_of
 from bridge.ports import (
     ANY_VEHICLE,
     POLL_S,
@@ -55,6 +55,7 @@ from edge_runtime.files import (
     try_to_lock_file,
     write_atomic,
 )
+from edge_runtime.manifest import Layout, Task
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, counted, open_regular
 
@@ -65,7 +66,7 @@ MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
 
 
-def _new(path: str) -> str:
+def new_recording(path: str) -> str:
     """The path itself; UserError where a recording could not be begun there later."""
     check_writable(path)
     if Path(path).exists():
@@ -75,7 +76,7 @@ def _new(path: str) -> str:
 
 def _add_record_arguments(parser: Any) -> None:
     out = "the recording; it must not exist yet"
-    parser.add_argument("--out", metavar="F.mcap", type=_new, required=True, help=out)
+    parser.add_argument("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     help_text = "record this vehicle only (otherwise all)"
     add_options(parser, "--vehicle-id", default=None, help=help_text)
@@ -129,12 +130,74 @@ def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> 
             return
 
 
+class ViewerCopies:
+    """Makes copies that viewers can draw, and hands each to ``add``. Used by one thread."""
+
+    def __init__(self, add: Callable[[str, Schema, int, bytes], None]) -> None:
+        self._add = add
+        self._layout: Layout | None = None  # The simulator says it with its scenes
+
+    def write(self, heard: Heard) -> None:
+        """Copy one message, or tell of it as an event."""
+        if heard.topic in TOKEN_TOPICS:
+            who = "edge runtime" if heard.topic == "alive" else "simulator"
+            what = "is here" if heard.payload == b"\x01" else "has gone"
+            self._event(heard, Level.INFO, f"{who} {what}")
+        elif heard.size > len(heard.payload):
+            self._event(heard, Level.WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
+        else:
+            self._view(heard)
+
+    def _view(self, heard: Heard) -> None:
+        message = DECODERS[heard.topic](heard.payload)
+        if message is None or isinstance(message, wire.Rejection):
+            why = message.detail if message else "not a scene"
+            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")
+            return
+        try:
+            self._copy(heard, heard.topic, message)
+        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
+            self._event(heard, Level.WARNING, f"{heard.topic} not drawn: {error}")
+            return
+        if isinstance(message, Scene):
+            self._layout = Layout(message.task) if message.task else None
+        elif isinstance(message, wire.State) and self._layout is not None:
+            self._copy_images(heard, message, self._layout)
+
+    def _copy_images(self, heard: Heard, state: wire.State, layout: Layout) -> None:
+        if layout.refusal(state.observation) is not None:
+            return
+        for name, array in layout.arrays(state.observation).items():
+            images = images_of(array)
+            if images is None:
+                continue
+            # They lie one after the other: in memory that is one picture, so many times as high.
+            count, height, width, colours = images.shape
+            encoding = "rgb8" if colours == 3 else "mono8"
+            size = (width, count * height, encoding, width * colours)
+            data, at = images.tobytes(), _stamp(heard.arrived_ns)
+            self._copy(heard, name, RawImage(at, *size, data, _vehicle_id(heard)))
+
+    def _event(self, heard: Heard, level: Level, text: str) -> None:
+        self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
+
+    def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
+        """Add what viewers can draw, to the vehicle's topic of that name."""
+        schema = describe(type(values))
+        known = schema.make.DESCRIPTOR.fields_by_name
+        fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
+        drawn = {name: value for name, value in fields if name in known}
+        data = schema.make(**drawn).SerializeToString()
+        self._add(f"view/{_vehicle_id(heard)}/{name}", schema, heard.arrived_ns, data)
+
+
 class RecordingWriter:
     """Writes one recording; used by one thread. OSError from any call where the disk is full."""
 
     def __init__(self, path: Path) -> None:
         """Make the file; UserError where it exists already."""
         self.messages = 0
+        self._copies = ViewerCopies(self._add_copy)
         self._file = FlushedFile(path)
         self._mcap = start_mcap(self._file)
         self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
@@ -145,18 +208,14 @@ class RecordingWriter:
     def write(self, heard: Heard, with_view: bool = True) -> None:
         """Add one message; ``with_view`` False leaves out the copy for viewers."""
         self.messages += 1
+        is_kept = heard.size == len(heard.payload)
         if heard.topic in TOKEN_TOPICS:
-            here = heard.payload == b"\x01"
-            text = b'{"here": true}' if here else b'{"here": false}'
+            text = b'{"here": true}' if heard.payload == b"\x01" else b'{"here": false}'
             self._add(heard.key, "json", heard.arrived_ns, text)
-            who = "edge runtime" if heard.topic == "alive" else "simulator"
-            self._event(heard, Level.INFO, f"{who} {'is here' if here else 'has gone'}")
-        elif heard.size > len(heard.payload):
-            self._event(heard, Level.WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
-        else:
+        elif is_kept:
             self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
-            if with_view:
-                self._view(heard)
+        if with_view or heard.topic in TOKEN_TOPICS or not is_kept:
+            self._copies.write(heard)
 
     def flush(self) -> None:
         """End the chunk: from here on a kill does not lose what has been written."""
@@ -174,39 +233,11 @@ class RecordingWriter:
         """Close the file, finished or not."""
         self._file.close()
 
-    def _view(self, heard: Heard) -> None:
-        message = DECODERS[heard.topic](heard.payload)
-        if message is None or isinstance(message, wire.Rejection):
-            why = message.detail if message else "not a scene"
-            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")
-            return
-        try:
-            self._copy(heard, heard.topic, message)
-        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
-            self._event(heard, Level.WARNING, f"{heard.topic} not drawn: {error}")
-            return
-        if isinstance(message, wire.State):
-            # The frames lie one after the other: in memory that is one picture, twice as high.
-            count, height, width = wire.FRAMES_SHAPE
-            size, at = (width, count * height), _stamp(heard.arrived_ns)
-            picture = RawImage(at, *size, "mono8", width, message.frames, _vehicle_id(heard))
-            self._copy(heard, "frames", picture)
-
-    def _event(self, heard: Heard, level: Level, text: str) -> None:
-        self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
-
-    def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
-        """Add what viewers can draw, to the vehicle's topic of that name."""
-        schema = describe(type(values))
+    def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
         if schema.name not in self._schema_ids:
             schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
             self._schema_ids[schema.name] = schema_id
-        known = schema.make.DESCRIPTOR.fields_by_name
-        fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
-        drawn = {name: value for name, value in fields if name in known}
-        data = schema.make(**drawn).SerializeToString()
-        topic, schema_id = f"view/{_vehicle_id(heard)}/{name}", self._schema_ids[schema.name]
-        self._add(topic, "protobuf", heard.arrived_ns, data, schema_id)
+        self._add(topic, "protobuf", now_ns, data, self._schema_ids[schema.name])
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
         if topic not in self._channels:
@@ -364,14 +395,16 @@ def _add_struct(message: Any, kind: type[msgspec.Struct], package: str) -> None:
         origin, inner = typing.get_origin(hint), typing.get_args(hint)
         if origin in (dict, list, Sequence):
             field.label, hint = Field.LABEL_REPEATED, inner[0]
-        if origin is dict:
+        if origin is dict and inner[1] not in _SCALARS:  # an observation's bytes
+            del message.field[-1]
+        elif origin is dict:
             field.type = Field.TYPE_MESSAGE
             field.type_name = f".{path}.{_add_map_entry(message, name, inner)}"
         elif hint in _SCALARS:
             field.type = _SCALARS[hint]
         elif hint == Time:
             field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
-        elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        elif isinstance(hint, type) and issubclass(hint, msgspec.Struct) and hint is not Task:
             _add_struct(message.nested_type.add(), hint, path)
             field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
         elif hint is Level:
@@ -400,7 +433,7 @@ def _add_repair_arguments(parser: Any) -> None:
     text = "the recording; where more than a torn end is left out of it, the file as it was is"
     parser.add_argument("recording", metavar="F.mcap", help=f"{text} kept as F.mcap{KEPT}")
     out = "write here instead of over the recording itself; it must not exist yet"
-    parser.add_argument("--out", metavar="G.mcap", type=_new, help=out)
+    parser.add_argument("--out", metavar="G.mcap", type=new_recording, help=out)
 
 
 def _run_repair(arguments: Any) -> int:

@@ -19,9 +19,16 @@ from bridge.virtual_link import Decision
 from edge_runtime.util import counted, printable
 from edge_runtime.wire import Command, Feedback
 
-GOAL = "goal"
+GOAL, FAILED = "goal", "failed"
+UNKNOWN = "ended"
+"""An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
 COLLISION = "collision"
 OUTCOMES = (GOAL, COLLISION, "timeout", "off_road")
+
+
+def failed(outcome: str) -> bool:
+    """Whether an episode missed its goal; where no goal is known none is missed."""
+    return outcome not in (GOAL, UNKNOWN)
 
 
 @dataclass
@@ -29,8 +36,8 @@ class EpisodeResult:
     """One driven episode.
 
     `outcome` is one of OUTCOMES for this repository's environments; another environment may
-    report its own word. Accelerations are the mean of |a| over the episode's steps. `actions`
-    holds one action (a list of floats in [-1, 1]) for each step.
+    report its own word, FAILED or UNKNOWN. Accelerations are the mean of |a| over the episode's
+    steps. `actions` holds for each step the action that the environment was given, as floats.
     """
 
     seed: int
@@ -66,7 +73,7 @@ def summarise(
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": outcomes[GOAL] / len(results),
+        "success_rate": success_rate(outcomes),
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
             key: {"mean": float(np.mean(values)), "std": float(np.std(values))}
@@ -75,6 +82,12 @@ def summarise(
         "policy_id": policy_id,
         "seed": seed,
     }
+
+
+def success_rate(outcomes: Counter[str]) -> float | None:
+    """The share of goals; None where the environment says of no episode how it has ended."""
+    known = outcomes.total() - outcomes[UNKNOWN]
+    return outcomes[GOAL] / outcomes.total() if known else None
 
 
 STANDSTILL_MPS = 0.05
@@ -193,10 +206,14 @@ def summary_line(report: Mapping[str, Any]) -> str:
     times = "no command came"
     if latency["p50"] is not None:
         times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
-    outcomes = Counter({GOAL: 0})
-    outcomes.update(row["outcome"] for row in report["per_episode"])
     episodes = report["episodes"]
-    ends = ", ".join(f"{count} {name} ({count / episodes:.0%})" for name, count in outcomes.items())
+    if report["success_rate"] is None:
+        ends = "return {mean:.1f} +- {std:.1f}".format(**report["episode_reward"])
+    else:
+        outcomes = Counter({GOAL: 0})
+        outcomes.update(row["outcome"] for row in report["per_episode"])
+        shares = (f"{count} {name} ({count / episodes:.0%})" for name, count in outcomes.items())
+        ends = ", ".join(shares)
     stops = Counter(event["reason"] for event in report["safe_stop_events"])
     parts = [f"{counted(episodes, 'episode')}: {ends}", times, _reasons("safe stop", stops)]
     parts.append(_reasons("rejected message", report["rejected"]))

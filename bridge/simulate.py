@@ -8,39 +8,43 @@ from argparse import Namespace
 from collections import Counter
 from typing import Any
 
-import gymnasium
+import msgspec
 
 from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
-    SCENARIOS,
-    EpisodeRunner,
+    Environment,
+    describe,
     make_environment,
-    policy_action,
-    scenario_of,
-    task_of,
-    vehicle_action,
+    scenarios,
 )
+from bridge.episode import Apply, EpisodeRunner, policy_action, vehicle_action
 from bridge.inbound import CommandCheck, FeedbackCheck
+from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.virtual_link import Decision
-from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
+from edge_runtime.cli import (
+    ArgumentParser,
+    examples,
+    positive,
+    positive_number,
+    sigterm_as_interrupt,
+)
 from edge_runtime.files import write_json_out
-from edge_runtime.policy import Manifest
+from edge_runtime.manifest import Manifest, Task
 from edge_runtime.run import rearm_command
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT
 from edge_runtime.util import UserError, printable
-from edge_runtime.wire import CONTROL_PERIOD_S
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 EXAMPLE = examples(
-    "python -m bridge simulate --env left_turn --episodes 5 --clock realtime --latency 50ms+-10ms",
-    "python -m bridge simulate --env congestion --condition variant --episodes 20 --out r.json",
-    "python -m bridge simulate --env left_turn --clock realtime --loop vehicle \\\n"
+    "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime --latency 50ms+-10ms",
+    "python -m bridge simulate --env SCENARIO --condition variant --episodes 20 --out r.json",
+    "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle \\\n"
     "    --connect tcp/127.0.0.1:7447 --vehicle-id car-a",
 )
 
@@ -48,7 +52,7 @@ EXAMPLE = examples(
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    env = f"scenario ({', '.join(SCENARIOS)}), gymnasium id or module:id"
+    env = f"scenario ({', '.join(scenarios())}), gymnasium id or module:id"
     scene = "scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items())
     clock = "lockstep waits for each command; realtime waits for nobody"
     loop = "the car does what the policy commands, or (realtime only) what the vehicle behind"
@@ -57,6 +61,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
+    period = "seconds of a step, for an environment that does not say"
+    add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
     add("--standing", action="store_true", help=standing)
@@ -86,18 +92,18 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
     """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
     endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
-    action_size = (environment.action_space.shape or (1,))[0]
+    task = describe(environment, asked.period)
     with open_port(asked.listen, asked.vehicle_id, asked.tls, asked.connect, wait_s) as port:
-        check = CommandCheck(port.session, action_size)
+        check = CommandCheck(port.session, task)
         clock: Clock
         if asked.loop == VEHICLE:
-            feedback = FeedbackCheck(port.session, action_size)
-            clock = VehicleClock(port.publish_state, check, asked.latency, feedback)
+            feedback = FeedbackCheck(port.session, task)
+            clock = VehicleClock(port.publish_state, check, asked.latency, task, feedback)
         else:
-            clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency)
+            clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency, task)
         with contextlib.closing(clock), EpisodeBar("episodes", asked.episodes) as bar:
             bar.show("waiting for an edge runtime")
             port.hear("command", clock.receive)
@@ -106,20 +112,23 @@ def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, 
             if isinstance(clock, VehicleClock):
                 port.hear("feedback", clock.receive_feedback)
                 clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-            return _drive(asked, environment, port, clock, check, bar, manifest)
+            return _drive(asked, environment, port, clock, check, bar, task, manifest)
 
 
 def _drive(
     asked: Namespace,
-    environment: gymnasium.Env[Any, Any],
+    environment: Environment,
     port: SimulatorPort,
     clock: Clock,
     check: CommandCheck,
     bar: EpisodeBar,
+    task: Task,
     manifest: Manifest | None,
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
-    action_names = [action.name for action in manifest.action] if manifest else []
+    action_names = [action.name for action in task.action]
+    if manifest is not None and manifest.text == task.text:
+        task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
     rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
     edge = port.edge_counts
 
@@ -133,15 +142,15 @@ def _drive(
         port.session,
         port.publish_scene,
         on_tick,
-        apply=vehicle_action(action_names) if vehicle else policy_action,
+        task,
+        apply=_vehicle_action(environment, action_names) if vehicle else policy_action,
         standing=asked.standing,
+        origin=_origin(asked, port.session),
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
-        task=task_of(environment, asked.env),
     )
     if manifest is not None:  # else the edge runtime compares by itself what the states say
-        task = task_of(environment, asked.env, manifest)
-        _refuse_another_task(asked, runner, manifest.task, task)
+        _refuse_another_task(asked, runner, manifest.text)
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
@@ -163,12 +172,13 @@ def _drive(
         clock.latencies_ms,
         runner.command_ages_ms,
         facts={
-            "scenario": scenario_of(asked.env),
+            "scenario": task.task,
             **{name: getattr(asked, name) for name in ("condition", "seed", "clock", "loop")},
             "standing": asked.standing,
             "latency_spec": str(asked.latency),
             "policy_ids": check.policy_ids,
             "deadline_misses": runner.deadline_misses,
+            "ridden_steps": runner.ridden_steps,
             "tick_overruns": clock.tick_overruns,
             "missed_ticks": clock.missed_ticks,
             "wall_clock_stalls": clock.wall_clock_stalls,
@@ -180,11 +190,23 @@ def _drive(
     )
 
 
-def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str, ours: str) -> None:
+def _origin(asked: Namespace, session: str) -> Origin:
+    """What is told of the drive, so that it can be driven again."""
+    names = ("condition", "seed", "standing", "clock", "loop")
+    told = {name: getattr(asked, name) for name in names}
+    return Origin(session=session, environment=asked.env, latency=str(asked.latency), **told)
+
+
+def _vehicle_action(environment: Environment, action_names: list[str]) -> Apply:
+    return vehicle_action(action_names, getattr(environment.unwrapped, "pedal_for_speed", None))
+
+
+def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str) -> None:
     """Raise UserError where the edge runtime's policy is for another task."""
+    ours = runner.task.text
     if theirs != ours:
         runner.show_task(asked.seed)
-        time.sleep(CONTROL_PERIOD_S)  # Its safe stop still finds this end of the wire.
+        time.sleep(runner.task.control_period_s)  # Its safe stop still finds this end of the wire.
         raise UserError(
             f"the edge runtime's policy is for another task ({theirs!r}) than --env"
             f" {asked.env} ({ours!r}); start it with a policy of this, or choose another --env"

@@ -7,7 +7,7 @@ listen to.
 
 `VirtualLink` is shared by lock-step and by training under latency. Tick n stands at virtual time
 n T. Its state arrives at the edge runtime after the uplink's delay; the answer takes no time, and
-arrives at the vehicle after the downlink's; the tick is decided at n T + 25 ms from what has
+arrives at the vehicle after the downlink's; the tick is decided at n T + T / 4 from what has
 arrived by then. The caller gives the answers: those of a real edge runtime, or of a function.
 
 The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
@@ -24,7 +24,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from bridge.network import EventHeap, LatencySpec, make_link
+from bridge.network import EventHeap, LatencySpec, Link, make_link
 from edge_runtime.safety import (
     Mode,
     Safety,
@@ -33,10 +33,10 @@ from edge_runtime.safety import (
     classify_fresh,
     note_arrival,
 )
-from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command
+from edge_runtime.wire import DRIVE, SAFE_STOP, Command
 
-SILENCE_LIMIT_S = 2 * CONTROL_PERIOD_S
-COMMAND_WINDOW_S = 0.025  # A command that arrives within this time after the tick still acts in it
+SILENCE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
+COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
 ROUNDING_S = 1e-9
 """Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
 
@@ -56,12 +56,15 @@ class Decision:
     """Time since the newest ``drive`` command arrived (since the episode began, if none has)."""
     command_age_s: float | None = None
     """From the sending of the state that the obeyed command answers; None where none is obeyed."""
+    ridden: int = 0
+    """Which action of its plan ``command`` has in the place of its own; 0: its own."""
 
 
 class CommandHold:
-    """The newest command of one episode, and its age."""
+    """The newest command of one episode, and its age; ``period_s`` is T."""
 
-    def __init__(self, now_s: float) -> None:
+    def __init__(self, now_s: float, period_s: float) -> None:
+        self._period_s, self._silence_s = period_s, SILENCE_PERIODS * period_s
         self.newest: Command | None = None
         self._heard_s = now_s
         self._driven_s = now_s
@@ -87,7 +90,7 @@ class CommandHold:
             return False
         self.newest = command
         self._heard_s, self._sent_s = now_s, sent_s
-        if command.mode == "drive":
+        if command.mode == DRIVE:
             self._driven_s = now_s
         self._fresh = True
         return True
@@ -98,24 +101,32 @@ class CommandHold:
         ``edge_silence_s`` is given when lock-step has waited in vain: virtual time stood still
         meanwhile, so the wall time without an answer (s) counts in its place.
         """
-        brake_reason = ""
-        if edge_silence_s is not None or now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S:
+        brake_reason, command, ridden = "", self.newest, 0
+        plan = command.plan or [] if command is not None and command.mode == DRIVE else []
+        silent_s = now_s - self._heard_s
+        ride_s = len(plan) * self._period_s
+        if edge_silence_s is not None or silent_s > self._silence_s + ride_s + ROUNDING_S:
             brake_reason = NO_COMMAND
-        elif self.newest is not None and self.newest.mode == SAFE_STOP:
-            brake_reason = self.newest.reason or UNKNOWN_SAFE_STOP
-        obeys = self.newest is not None and not brake_reason
+        elif command is not None and command.mode == SAFE_STOP:
+            brake_reason = command.reason or UNKNOWN_SAFE_STOP
+        obeys = command is not None and not brake_reason
+        if command is not None and obeys and plan:
+            ridden = min(int((silent_s + ROUNDING_S) / self._period_s), len(plan))
+            action = plan[ridden - 1] if ridden else command.action
+            command = msgspec.structs.replace(command, action=action)
         decision = Decision(
-            command=self.newest,
+            command=command,
             fresh=self._fresh,
             brake_reason=brake_reason,
             undriven_s=now_s - self._driven_s if edge_silence_s is None else edge_silence_s,
             command_age_s=now_s - self._sent_s if obeys else None,
+            ridden=ridden,
         )
         self._fresh = False
         return decision
 
 
-STATE_BYTES = 7322
+STATE_BYTES = 122  # Besides its observation
 COMMAND_BYTES = 217
 """What the messages take on the wire, for links of limited rate: the same for every message, so
 that a longer session name or another digit does not change a drive."""
@@ -147,33 +158,44 @@ class VirtualLink(Generic[Message]):
     For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``.
 
     Args:
-        spec: delays, losses and the like.
+        spec: delays, losses and the like; or a link that is made already, for this episode alone.
         seed: of the episode.
+        period_s: the control period T.
+        observation_bytes: what a state carries.
         on_heard: called with each newest answer's latency in s, state sent to command received.
         on_stale: called for each answer that is not newer than the newest.
+        on_command: called for each answer's command, whatever its age.
     """
 
     def __init__(
         self,
-        spec: LatencySpec,
+        spec: LatencySpec | Link,
         seed: int,
+        period_s: float,
+        observation_bytes: int,
         on_heard: Callable[[float], None] = lambda latency_s: None,
         on_stale: Callable[[], None] = lambda: None,
+        on_command: Callable[[Command], None] = lambda command: None,
     ) -> None:
-        self.hold = CommandHold(now_s=0.0)
+        self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
+        self.hold = CommandHold(0.0, period_s)
         self._link = make_link(spec, seed)
-        self._on_heard, self._on_stale = on_heard, on_stale
+        self._on_heard, self._on_stale, self._on_command = on_heard, on_stale, on_command
         self._under_way: EventHeap[tuple[int, Message] | _Answer] = EventHeap()
         self._newest_at_edge = -1
-        self._safety = Safety()
-        self._step, self._window_end_s = 0, COMMAND_WINDOW_S
+        self._safety = Safety(period_s)
+        self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
         self._admitted_s = 0.0
+
+    def change(self, spec: LatencySpec, seed: int) -> None:
+        """Let another network carry what is sent from now on; what is under way arrives."""
+        self._link = make_link(spec, seed)
 
     def send_state(self, step: int, message: Message) -> None:
         """Begin tick ``step``: its state leaves the vehicle."""
-        tick_s = step * CONTROL_PERIOD_S
-        self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW_S
-        for arrival_s in self._link.up.arrivals(tick_s, STATE_BYTES):
+        tick_s = step * self._period_s
+        self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
+        for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
             self._under_way.push(arrival_s, (step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
@@ -197,7 +219,10 @@ class VirtualLink(Generic[Message]):
         """Send the answer to the newest state back; ``computing_s`` is reported only."""
         if self._safety.mode is Mode.SAFE_STOP:
             command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
-        answer = _Answer(command, arrival.step * CONTROL_PERIOD_S, computing_s)
+        if command.plan:  # as long as the edge runtime's own silence
+            ride_s = len(command.plan) * self._period_s
+            self._safety = self._safety._replace(ride_s=ride_s)
+        answer = _Answer(command, arrival.step * self._period_s, computing_s)
         for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
             self._under_way.push(arrival_s, answer)
 
@@ -219,6 +244,7 @@ class VirtualLink(Generic[Message]):
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
         answered_step = self.hold.newest_step
+        self._on_command(answer.command)
         if not self.hold.admit(answer.command, now_s, answer.sent_s):
             self._on_stale()
             return

@@ -9,6 +9,7 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 COMMANDS = {
     "keys": ("deploy.certs:KEYS", "make a key pair that signs policies and bundles"),
     "certs": ("deploy.certs:CERTS", "make an authority and certificates for TLS"),
+    "policy": ("bridge.policy_file:POLICY", "make a policy file of any ONNX model"),
     "bundle": ("deploy.bundle:BUNDLE", "make one signed archive for one board and vehicle"),
     "lock": ("deploy.bundle:LOCK", "write the hashes of a board's wheels anew"),
     "push": ("deploy.push", "bring a bundle to a board and install it"),

@@ -9,6 +9,7 @@ bundle made from a full folder needs no network. After a change of versions in a
 from __future__ import annotations
 
 import argparse
+import configparser
 import contextlib
 import functools
 import hashlib
@@ -36,10 +37,12 @@ from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
 from edge_runtime import tls
 from edge_runtime.cli import Command, examples
-from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.config import BUILT_IN, NONE, Config, load_config
+from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
+from edge_runtime.vehicles import GROUP, vehicle_limits
 
 NAME = "install.pyz"
 DEFAULT_OUT = "build/bundles"
@@ -79,7 +82,7 @@ _EPOCH_S = 315532800
 class Inputs(NamedTuple):
     """What a bundle is made of: a policy with its signature beside it and the signer's public key,
     the private key that signs the bundle, settings of `run` (None for its defaults), the vehicle's
-    folder of `deploy certs`, and all wheels.
+    folder of `deploy certs`, and all wheels, a vehicle's driver among them.
     """
 
     policy: Path
@@ -107,6 +110,10 @@ def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
     add = functools.partial(parser.add_argument, type=Path, metavar="DIR")
     add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
+    driver = "a wheel to install besides, like a vehicle's driver; may be repeated"
+    parser.add_argument(
+        "--with", dest="more", action="append", type=Path, default=[], metavar="WHEEL", help=driver
+    )
     add("--wheels", default=DEFAULT_FOLDER, help="wheels are kept here")
     add("--out", default=DEFAULT_OUT, help="where the archive goes")
 
@@ -115,10 +122,10 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
     target, out = TARGETS[arguments.target], arguments.out
     given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
-    inputs = Inputs(**given, wheels=[])
+    inputs = Inputs(**given, wheels=arguments.more)
     check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
     check_writable(out / "bundle.tar")
-    wheels = gather(target, lock_path(target), arguments.wheels / target.name)
+    wheels = arguments.more + gather(target, lock_path(target), arguments.wheels / target.name)
     with tempfile.TemporaryDirectory() as place:
         wheels.append(build_edge_wheel(Path(place)))
         made = make_bundle(inputs._replace(wheels=wheels), target, out)
@@ -154,6 +161,8 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
     for path in inputs.wheels:
         # NAME-VERSION: the tags were pip's concern, and make some names too long for a tar.
         name = "-".join(path.name.split("-")[:2])
+        if f"{WHEELS}{name}.whl" in contents:
+            raise UserError(f"wheel {path}: the bundle has another {name}")
         contents[f"{WHEELS}{name}.whl"] = path.read_bytes()
     if inputs.tls is not None:  # The party's three files, and none that may stand beside them.
         for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
@@ -178,9 +187,42 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
         )
     policy = load_policy(inputs.policy, inputs.public_key)
     config, text = _config(inputs)
+    _check_vehicle(config, policy, inputs.wheels)
     if inputs.tls is not None:
         tls.check_name(tls.load_tls(inputs.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
     return key, policy, config, text
+
+
+def _check_vehicle(config: Config, policy: Policy, wheels: list[Path]) -> None:
+    """Raise UserError for a vehicle that the board could not load, or whose settings do not hold.
+
+    Those of another package's driver are not read: it need not be installed here.
+    """
+    name = config.vehicle.partition(":")[0]
+    if name in (NONE, *BUILT_IN):
+        limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
+        shared_limits(policy.manifest.action, limits)
+    elif not any(name in _drivers_in(path) for path in wheels):
+        known = ", ".join((NONE, *BUILT_IN))
+        raise UserError(
+            f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
+            f" --with, or choose from {known}"
+        )
+
+
+def _drivers_in(path: Path) -> set[str]:
+    """The vehicles that a wheel names in its entry points, and all of its modules."""
+    data = io.BytesIO(read_bytes(path, "wheel"))
+    try:
+        with zipfile.ZipFile(data) as wheel:
+            names = wheel.namelist()
+            read = [wheel.read(one) for one in names if one.endswith(".dist-info/entry_points.txt")]
+        points = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+        points.read_string("\n".join(text.decode() for text in read))
+    except (zipfile.BadZipFile, configparser.Error, ValueError) as error:
+        raise UserError(f"wheel {path} cannot be read: {error}") from None
+    modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") for one in names}
+    return modules | (set(points[GROUP]) if GROUP in points else set())
 
 
 def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: str) -> Manifest:
@@ -390,7 +432,9 @@ BUNDLE = Command(
     examples(
         "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
         "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
-        "    --config edge.toml --tls certs/edge-hunter01"
+        "    --config edge.toml --tls certs/edge-hunter01",
+        "python -m deploy bundle --policy my.onnx --target jetpack5 --config edge.toml \\\n"
+        "    --with my_vehicle-0.1.0-py3-none-any.whl",
     ),
     _add_bundle_arguments,
     _run_bundle,

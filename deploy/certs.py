@@ -35,7 +35,7 @@ from edge_runtime import tls
 from edge_runtime.cli import Command, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id
 
 DEFAULT_KEY = str(DEFAULT_PUBLIC_KEY.with_suffix(".key"))
 CA_KEY_FILE = "ca.key.pem"
@@ -47,8 +47,8 @@ MAX_NAME_CHARS = 64  # The longest common name of a certificate (RFC 5280)
 SESSIONS_PER_VEHICLE = 4
 """Edge runtime, simulator, an operator's command, and the edge runtime's look at its start."""
 SPARE_SESSIONS = 1000  # Viewers; Zenoh's own default
-MAX_MESSAGE_BYTES = 256 * 1024
-"""Four times what an edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
+MAX_MESSAGE_BYTES = 2 * MAX_STATE_BYTES
+"""Twice what any edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
 _NO_USE = dict.fromkeys(

@@ -8,10 +8,7 @@ from typing import List
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS = {
-    "check": (
-        "edge_runtime.commands:CHECK",
-        "say whether a policy may drive, and how fast it is",
-    ),
+    "check": ("edge_runtime.commands:CHECK", "say whether a policy may drive, and how fast it is"),
     "run": ("edge_runtime.run", "answer states with commands until a signal ends it"),
     "status": ("edge_runtime.commands:STATUS", "print how a running edge runtime is"),
     "rearm": ("edge_runtime.commands:REARM", "let a vehicle drive again after a safe stop"),
@@ -20,7 +17,7 @@ COMMANDS = {
 
 def main(argv: List[str]) -> int:
     """Run one of the commands and return its exit status."""
-    trusted = "results/policies/left_turn.onnx \\\n    --public-key results/policies/policy.pub"
+    trusted = "my.onnx \\\n    --public-key keys/policy.pub"
     parser = ArgumentParser(
         prog="python -m edge_runtime",
         description="Drives a verified policy over Zenoh, and stops safely when in doubt.",

@@ -12,12 +12,12 @@ import msgspec
 from edge_runtime.cli import Command, examples
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.policy import infer, load_policy, probe_frames
+from edge_runtime.policy import infer, load_policy, probes
 from edge_runtime.service import LatencyWindow
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.util import UserError, parse_json, printable
-from edge_runtime.wire import CONTROL_PERIOD_S, key
+from edge_runtime.wire import key
 
 _RUNS = 300
 _TIMEOUT_S = 2.0
@@ -35,9 +35,9 @@ def _check(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     window = LatencyWindow()
-    for frames in itertools.islice(itertools.cycle(probe_frames()), _RUNS):
-        window.add(infer(policy, frames)[1])
-    inference_ms, limit_ms = window.summary_ms(), CONTROL_PERIOD_S * 1000
+    for seen in itertools.islice(itertools.cycle(probes(policy.layout)), _RUNS):
+        window.add(infer(policy, seen)[1])
+    inference_ms, limit_ms = window.summary_ms(), policy.manifest.control_period_s * 1000
     if inference_ms["p99"] > limit_ms:
         raise UserError(
             f"policy {arguments.policy} may not drive: its inference takes"
@@ -124,12 +124,13 @@ _ROWS: List[Tuple[str, Callable[[Dict[str, Any]], str]]] = [
     ("mode", lambda s: _mode(s)),
     ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),
     ("vehicle fault", lambda s: s.get("vehicle_fault") or "none"),
+    ("link", lambda s: link_words(s.get("link", {}), s.get("envelope", {}))),
     ("rejected", lambda s: _counts(s["rejected"])),
     ("safe stops", lambda s: str(s["safe_stops"])),
     ("deadline misses", lambda s: str(s["deadline_misses"])),
     ("inference", lambda s: _quantiles(s["inference_ms"])),
     ("state to command", lambda s: _quantiles(s.get("command_ms", {}))),
-    ("policy", lambda s: f"{s['policy_id'][:12]} ({s['manifest']['scenario']})"),
+    ("policy", lambda s: f"{s['policy_id'][:12]} ({s['manifest']['task']})"),
     ("uptime", lambda s: f"{s['uptime_s']:.0f} s"),
     ("temperature", lambda s: _temperature(s.get("temperature_c"))),
     ("load", lambda s: f"{s.get('load_1min', 0.0):.2f} over 1 min"),
@@ -151,6 +152,15 @@ def _mode(status: Dict[str, Any]) -> str:
     return f"{status['mode']}{reason}{rearm}"
 
 
+def link_words(link: Dict[str, float], limits: Dict[str, float]) -> str:
+    """The live link beside the policy's envelope; the delay each way can be off by its error."""
+    if not (link and limits):
+        return "not known yet" if limits else "the policy has no envelope"
+    axes = (f"{name} {link[name]:.3g} of {limit:g}" for name, limit in limits.items())
+    ways = "delay {up_ms:.1f} ms up, {down_ms:.1f} down, +-{error_ms:.1f}".format(**link)
+    return f"at {link['load']:.2f} of the envelope: {', '.join(axes)}; {ways}"
+
+
 def _counts(counts: Dict[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
 
@@ -165,8 +175,7 @@ def _temperature(value_c: Any) -> str:
 
 CHECK = Command(
     examples(
-        "python -m edge_runtime check results/policies/left_turn.onnx \\\n"
-        "    --public-key results/policies/policy.pub",
+        "python -m edge_runtime check my.onnx \\\n    --public-key keys/policy.pub",
         "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
     ),
     _add_check,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Type, TypeVar
 
 import msgspec
 
@@ -17,51 +17,27 @@ from edge_runtime.util import PathLike, UserError, read_toml
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 NONE = "none"
-VEHICLE_NAMES = (NONE, "mock", "hunter", "ros2")
-DEFAULT_BUS = "socketcan:can0"
+BUILT_IN = {
+    "mock": "edge_runtime.vehicles.mock:MockVehicle",
+    "hunter": "edge_runtime.vehicles.hunter:HunterVehicle",
+    "ros2": "edge_runtime.vehicles.ros2:Ros2Vehicle",
+}
+"""The vehicles of this package, by name; those of others are entry points."""
 MAX_PRIORITY = 99  # of SCHED_FIFO
+_S = TypeVar("_S", bound=msgspec.Struct)
 
 
-class HunterSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which chassis it is: a row of mapping.SPECS, and one of hunter/protocol.PROFILES."""
+class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[ride_through]: for so long the last plan is played where nothing newer comes; 0: off."""
 
-    model: str = "2.0"
-    profile: str = "v2"
-
-
-class CarSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The car of a scenario that is not this repository's; the fields of mapping.ScenarioCar."""
-
-    throttle_mps2: float
-    brake_mps2: float
-    max_speed_mps: float
-    full_steering_rad: float
-    wheelbase_m: float
-
-
-class SimilaritySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`scale`: metres of the vehicle for one of the scenario; None: top speed is top speed."""
-
-    scale: Optional[float] = None
-    car: Optional[CarSettings] = None
-
-
-class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`config.example.toml` documents each key. A topic that is empty is not published."""
-
-    model: str = "2.0"
-    listen: Optional[str] = None
-    connect: Optional[str] = None
-    namespace: str = "/"
-    twist_topic: str = "cmd_vel"
-    twist_angular: str = "yaw_rate"
-    ackermann_topic: str = ""
-    odometry_topic: str = "odom"
-    odometry_angular: str = "yaw_rate"
+    max_s: float = 0.0
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All settings of `run`. Relative paths start at the working directory."""
+    """All settings of `run`. Relative paths start at the working directory.
+
+    `vehicle_settings` are the tables [vehicle.NAME], by name; what they hold is the driver's.
+    """
 
     policy: Optional[str] = None
     connect: str = DEFAULT_ENDPOINT
@@ -72,15 +48,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     allow_unsigned: bool = False
     armed_at_start: bool = True
     hold: Optional[str] = None
+    ride_through: RideThrough = RideThrough()
     log_level: str = "info"
     log_format: str = "text"
     realtime_priority: int = 0
     cpus: List[int] = msgspec.field(default_factory=list)
     lock_memory: bool = False
-    bus: str = DEFAULT_BUS
-    hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
-    similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
-    ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
+    vehicle_settings: Dict[str, Dict[str, Any]] = msgspec.field(default_factory=dict)
 
 
 # The settings that are flags as well: metavar and help.
@@ -89,7 +63,7 @@ _FLAGS: Dict[str, Tuple[str, str]] = {
     "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
     "tls": ("DIR", "this party's ca.pem, cert.pem, key.pem (deploy certs); endpoint tls/..."),
     "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
-    "vehicle": ("|".join(VEHICLE_NAMES), "the vehicle to move besides"),
+    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to move besides"),
     "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
     "log_level": ("|".join(log.LEVELS), "least level that goes to stderr"),
     "log_format": ("|".join(log.FORMATS), "a line of words, or a JSON object a line"),
@@ -100,7 +74,7 @@ def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
     """The flags of these settings, or of all. One that is not given is None: the file has it."""
     for name in names or _FLAGS:
         metavar, text = _FLAGS[name]
-        default = getattr(Config(), name)
+        default = getattr(Config(), name, None)
         shown = f"{text} (default: {default})" if default else text
         parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, help=shown)
 
@@ -114,48 +88,60 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
-_TABLES: Dict[str, Type[msgspec.Struct]] = {
-    "": Config,
-    "hunter": HunterSettings,
-    "similarity": SimilaritySettings,
-    "similarity.car": CarSettings,
-    "ros2": Ros2Settings,
-}
-
-
 def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     """The file's settings with the given flags (those that are not None) in their place.
 
     Raises UserError for a file that is no TOML, an unknown key, and a value out of range; where
-    the value stands in the file, the error names it.
+    the value stands in the file, the error names it. The vehicle's driver checks its own table.
     """
     given = {name: value for name, value in flags.items() if value is not None}
     from_file = Config()
     if path is not None:
         try:
-            from_file = msgspec.convert(read_toml(path, "config file"), Config)
-        except msgspec.ValidationError as error:
-            raise UserError(f"config file {path}: {_explain(str(error))}") from None
-    config = msgspec.structs.replace(from_file, **given)
+            tables = _split_vehicle(read_toml(path, "config file"))
+            from_file = convert(tables, Config)
+        except UserError as error:
+            raise UserError(f"config file {path}: {error}") from None
+    bus = given.pop("bus", None)
+    config = convert({**msgspec.structs.asdict(from_file), **given}, Config)
     try:
         _check(config)
     except UserError as error:
         if path is None or _is_valid(from_file):
             raise  # the flag is wrong, not the file
         raise UserError(f"config file {path}: {error}") from None
-    # `--bus` on the command line needs a vehicle; in the file it may be set while that is off.
-    if "bus" in given and config.vehicle != "hunter":
+    if bus is None:
+        return config
+    if config.vehicle != "hunter":
         raise UserError(f"--bus needs --vehicle hunter; the vehicle is {config.vehicle}")
-    return config
+    tables = {**config.vehicle_settings}
+    tables["hunter"] = {**tables.get("hunter", {}), "bus": bus}
+    return msgspec.structs.replace(config, vehicle_settings=tables)
 
 
-def _explain(text: str) -> str:
-    """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
-    sentence, _, place = text.partition(" - at ")
-    table = place.strip("`").replace("$.", "")
-    if "unknown field" in text:
-        sentence += f"; known are {', '.join(_TABLES[table].__struct_fields__)}"
-    return f"{table}: {sentence}" if table else sentence
+def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
+    """`vehicle` is a driver, or a table: `driver`, and a table of settings for each vehicle."""
+    given = tables.get("vehicle")
+    if not isinstance(given, dict):
+        return tables
+    for name, table in given.items():
+        if name != "driver" and not isinstance(table, dict):
+            raise UserError(f"vehicle: {name} is no table, and not `driver`; write [vehicle.NAME]")
+    driver = given.pop("driver", NONE)
+    return {**tables, "vehicle": driver, "vehicle_settings": given}
+
+
+def convert(settings: Mapping[str, Any], kind: Type[_S], table: str = "") -> _S:
+    """A table's settings as a struct. Raises UserError that names the key, and the known ones."""
+    try:
+        return msgspec.convert(settings, kind)
+    except msgspec.ValidationError as error:
+        sentence, _, place = str(error).partition(" - at ")
+        inner = place.strip("`").replace("$.", "").replace("$", "")
+        if "unknown field" in sentence and not inner:
+            sentence += f"; known are {', '.join(kind.__struct_fields__)}"
+        where = ".".join(filter(None, (table, inner)))
+        raise UserError(f"{where}: {sentence}" if where else sentence) from None
 
 
 def _is_valid(config: Config) -> bool:
@@ -170,12 +156,6 @@ def _check(config: Config) -> None:
         raise UserError("no policy to drive: name it with --policy, or as policy in --config")
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
-    check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
-    of_vehicles = ("bus", "hunter", "similarity", "ros2")
-    if any(getattr(config, name) != getattr(Config(), name) for name in of_vehicles):
-        from edge_runtime.vehicles import check_settings  # The defaults need no check.
-
-        check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
     priority = config.realtime_priority

@@ -7,26 +7,32 @@ seconds. The caller serialises the calls (loop.py holds one lock). Contract, sec
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Sequence
+from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Sequence, Union
 
+import msgspec
 import numpy as np
-from msgspec import UNSET
 
 from edge_runtime import safety as rules
 from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State
+from edge_runtime.wire import DRIVE, SAFE_STOP, State, is_foreign
 
 if TYPE_CHECKING:
-    from edge_runtime.policy import Action
+    from edge_runtime.link_quality import LinkQuality
+    from edge_runtime.manifest import Action
+    from edge_runtime.ride import Ride
 
 
 class ActionLimit(NamedTuple):
-    """What one action may be: its range, and the fastest change (inf: at once)."""
+    """What one action may be: its range, and the fastest change (inf: at once).
+
+    `stop` is its value in a safe stop, None to hold the last one: the policy's, no vehicle's.
+    """
 
     low: float
     high: float
-    slew_per_s: float
+    slew_per_s: float = math.inf
+    stop: Optional[float] = None
 
 
 Limits = Dict[str, ActionLimit]  # by the action's name
@@ -39,14 +45,17 @@ def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
     Raises UserError where a vehicle lacks an action of the policy.
     """
     limits = {}
-    for name, low, high in ((action.name, action.low, action.high) for action in actions):
-        if vehicle and name not in vehicle:
-            has = ", ".join(sorted(vehicle))
-            raise UserError(f"the vehicle has no {name!r}, which the policy acts on; it has {has}")
-        limit = vehicle.get(name) or ActionLimit(low, high, math.inf)
-        limits[name] = limit._replace(low=max(low, limit.low), high=min(high, limit.high))
-        if limits[name].low > limits[name].high:
-            raise UserError(f"the policy's and the vehicle's range of {name!r} do not meet")
+    for row in actions:
+        if vehicle and row.name not in vehicle:
+            has, its = ", ".join(sorted(vehicle)), f"{row.name!r}, which the policy acts on"
+            raise UserError(f"the vehicle has no {its}; it has {has}")
+        theirs = vehicle.get(row.name) or ActionLimit(row.low, row.high)
+        low, high = max(row.low, theirs.low), min(row.high, theirs.high)
+        if low > high:
+            raise UserError(f"the policy's and the vehicle's range of {row.name!r} do not meet")
+        slew_per_s = min(row.slew_per_s or math.inf, theirs.slew_per_s)
+        stop = None if row.stop is None else min(max(row.stop, low), high)
+        limits[row.name] = ActionLimit(low, high, slew_per_s, stop)
     return limits
 
 
@@ -55,10 +64,8 @@ def limit_action(
 ) -> List[float]:
     """`wanted` within each range, and as near to `last` as the time between them demands.
 
-    More than a control period counts as one: a vehicle need not leap after a pause. A limit that
-    does not bite leaves the number as it is, to the last bit.
+    A limit that does not bite leaves the number as it is, to the last bit.
     """
-    elapsed_s = min(max(elapsed_s, 0.0), CONTROL_PERIOD_S)
     limited = []
     for value, previous, limit in zip(wanted, last, limits.values()):
         if limit.slew_per_s < math.inf:
@@ -74,9 +81,9 @@ def neutral_action(limits: Limits) -> List[float]:
 
 
 def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
-    """Full brake at once for a pedal; the last value for a steering."""
-    pairs = zip(limits.items(), last)
-    return [limit.low if name == "pedal" else value for (name, limit), value in pairs]
+    """Each action's stop, at once; the last value of one that has none, like a steering."""
+    pairs = zip(limits.values(), last)
+    return [value if limit.stop is None else limit.stop for limit, value in pairs]
 
 
 class Received(NamedTuple):
@@ -88,13 +95,15 @@ class Received(NamedTuple):
 
 
 class Order(NamedTuple):
-    """A command to send: all of it but the stamps of the sender."""
+    """A command to send, but for the sender's stamps; a `ridden` one to this end's vehicle only."""
 
     answers: Received
     mode: str
     action: List[float]
     reason: str
     inference_ns: int
+    plan: Union[List[List[float]], msgspec.UnsetType] = msgspec.UNSET
+    ridden: bool = False
 
 
 class Controller:
@@ -104,12 +113,22 @@ class Controller:
     """
 
     def __init__(
-        self, limits: Limits, needs_rearm: bool, armed_at_start: bool = True, task: str = ""
+        self,
+        limits: Limits,
+        control_period_s: float,
+        needs_rearm: bool,
+        armed_at_start: bool = True,
+        task: str = "",
+        ride: Optional[Ride] = None,
+        link: Optional[LinkQuality] = None,
     ) -> None:
-        self.safety = Safety()
+        self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
+        self._ride = ride
+        self.link = link  # of a policy with an envelope; the shell notes what comes and goes
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._policy_is_dead = False
+        self._period_s = control_period_s
         self._task = task  # the policy's; states that name another one are a fault
         self._latched_fault = ""  # what stopped it, until it is re-armed
         self._limits = limits
@@ -153,12 +172,15 @@ class Controller:
         """
         if self._begun_s is None or self._newest is None:
             return None
-        overdue = now_s - self._begun_s > rules.MAX_INFERENCE_S
+        overdue = now_s - self._begun_s > self._period_s
         # A process that was stopped in between would drive on what the road was then.
-        if overdue or rules.is_silent(self.safety, now_s):
+        if overdue or now_s - self._newest.arrived_s > self.safety.answer_s:
             return self._give_up(now_s)
         self._begun_s = None
-        if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
+        held_up = self._ride is not None and self._ride.is_held_up(self._newest)
+        if held_up and self.safety.mode is Mode.DRIVE and not self._newest.state.final:
+            return None  # newer ones follow: it rides until then
+        if now_s - self._newest.arrived_s > self._period_s:
             self.deadline_misses += 1
         wanted: List[float] = []
         form = (np.float32, (len(self._limits),))
@@ -166,15 +188,15 @@ class Controller:
             wanted = output.tolist()
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
-            self._next_stop_s = now_s + CONTROL_PERIOD_S
+            self._next_stop_s = now_s + self._period_s
             return self._stop_order(inference_ns, now_s)
         if self._needs_rearm and self._newest.state.final:
             # A vehicle that is told to drive on would do so until its own watchdog ends it.
             return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
-        elapsed_s = now_s - self._ordered_s
-        self._last_action = limit_action(wanted, self._last_action, self._limits, elapsed_s)
-        self._ordered_s = now_s
-        return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
+        order = self._drive_order(self._newest, wanted, inference_ns, now_s)
+        if self._ride is None or self.safety.mode is not Mode.DRIVE:
+            return order
+        return order._replace(plan=self._ride.begin(wanted, order.action, now_s))
 
     def policy_died(self) -> None:
         """Nobody finishes what was begun, or begins again. It stops for good; `tick` is due."""
@@ -186,7 +208,7 @@ class Controller:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
         if self._newest is None:
             return None  # before the first state there is nobody to tell
-        if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
+        if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
         was = self.safety.mode
         if self._policy_is_dead:
@@ -196,7 +218,10 @@ class Controller:
         elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
             self._apply(Event.VEHICLE)  # it may be over before the next state
         if self.safety.mode is not Mode.SAFE_STOP:
-            return None
+            ridden = self._ride.play(now_s) if self._ride else None
+            if ridden is None:
+                return None
+            return self._drive_order(self._newest, ridden, 0, now_s)._replace(ridden=True)
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
             return None
         self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
@@ -206,11 +231,12 @@ class Controller:
         """When `tick` must be called next; None while nothing is due by time alone."""
         due = []
         if self._begun_s is not None:
-            due.append(self._begun_s + rules.MAX_INFERENCE_S)
+            due.append(self._begun_s + self._period_s)
         if self.safety.mode is Mode.SAFE_STOP and self._newest is not None:
             due.append(self._next_stop_s)
         elif self.safety.mode is Mode.DRIVE and self.safety.last_fresh_s is not None:
-            due.append(self.safety.last_fresh_s + rules.SILENCE_S)
+            due.append(self.safety.last_fresh_s + self.safety.silence_s)
+            due += [self._ride.due_s] if self._ride else []
         return min(due) if due else None
 
     def rearm(self, now_s: float) -> str:
@@ -226,6 +252,8 @@ class Controller:
         if rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
+        if self.link is not None and (refusal := self.link.refusal()):
+            return refusal
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)
         return ""
@@ -239,7 +267,7 @@ class Controller:
     def _event_of(self, wanted: List[float]) -> Event:
         """Which event an answer is; `wanted` is empty where it has another form."""
         assert self._newest is not None
-        if self._task and self._newest.state.task not in (UNSET, self._task):
+        if self._task and is_foreign(self._newest.state, self._task):
             return Event.OTHER_TASK
         if not wanted:
             return Event.FAILED
@@ -248,6 +276,8 @@ class Controller:
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
+        if self.link is not None and self.link.outside:
+            return Event.OUTSIDE
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 
     def _give_up(self, now_s: float) -> Order:
@@ -260,11 +290,22 @@ class Controller:
 
     def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
         """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
-        grid_s = self._next_stop_s + CONTROL_PERIOD_S
-        self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + CONTROL_PERIOD_S
+        grid_s = self._next_stop_s + self._period_s
+        self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + self._period_s
+
+    def _drive_order(
+        self, answers: Received, wanted: List[float], inference_ns: int, now_s: float
+    ) -> Order:
+        # More than a control period counts as one: a vehicle need not leap after a pause.
+        elapsed_s = min(max(now_s - self._ordered_s, 0.0), self._period_s)
+        self._last_action = limit_action(wanted, self._last_action, self._limits, elapsed_s)
+        self._ordered_s = now_s
+        return Order(answers, DRIVE, self._last_action, "", inference_ns)
 
     def _stop_order(self, inference_ns: int, now_s: float) -> Order:
         assert self._newest is not None  # a safe stop is an answer to a state
+        if self._ride:
+            self._ride.end()
         self._last_action = stop_action(self._last_action, self._limits)
         self._ordered_s = now_s
         return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)

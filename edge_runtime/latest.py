@@ -11,9 +11,9 @@ import math
 from collections import OrderedDict
 from typing import Dict, NamedTuple, Optional, Set, Tuple
 
-from edge_runtime.wire import CONTROL_PERIOD_S, Reason, Rejection, State
+from edge_runtime.wire import Reason, Rejection, State
 
-TAKEOVER_SILENCE_S = 2 * CONTROL_PERIOD_S
+TAKEOVER_PERIODS = 2
 # So many past sessions are remembered with their position: they may come back with newer states.
 # All sessions before them are known to be over, by a hash of 8 bytes.
 _REMEMBERED_SESSIONS = 16
@@ -23,7 +23,7 @@ MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after th
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
 SKIPPED_EPISODES_PER_S = 1.0
-SKIPPED_STEPS_PER_S = 100.0
+SKIPPED_STEPS_PER_PERIOD = 10.0
 
 Position = Tuple[int, int]  # (episode, step): what "newer" compares within a session
 
@@ -38,7 +38,8 @@ class _Last(NamedTuple):
 class LatestState:
     """Accepts or rejects each state in order of arrival, and counts both."""
 
-    def __init__(self) -> None:
+    def __init__(self, control_period_s: float) -> None:
+        self._period_s = control_period_s
         self.accepted = 0
         self.rejected: Dict[str, int] = {}
         self._session: Optional[str] = None
@@ -71,12 +72,13 @@ class LatestState:
         if session == self._session:
             # Even a stale message shows that this simulator is there.
             self._heard_s = now_s
-        elif now_s - self._heard_s < TAKEOVER_SILENCE_S:
+        elif now_s - self._heard_s < TAKEOVER_PERIODS * self._period_s:
             words = f"session {session!r} while {self._session!r} is not silent"
             return Rejection(Reason.FOREIGN_SESSION, words)
         last = self._lasts.get(session)
         if last is not None:
-            return _judge_position((state.episode, state.step), last, now_s)
+            elapsed_s = now_s - last.accepted_s
+            return _judge_position((state.episode, state.step), last, elapsed_s, self._period_s)
         if hash(session) in self._forgotten:
             return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
         if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over
@@ -85,16 +87,17 @@ class LatestState:
         return None
 
 
-def _judge_position(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:
+def _judge_position(
+    position: Position, last: _Last, elapsed_s: float, period_s: float
+) -> Optional[Rejection]:
     """Reject what is not newer, and what no simulator can have reached since its last state."""
-    elapsed_s = now_s - last.accepted_s
     episodes = position[0] - last.position[0]
     steps = position[1] - (last.position[1] if episodes == 0 else 0)
     if position <= last.position:
         reason = Reason.DUPLICATE if position == last.position else Reason.STALE
     elif (
         episodes > MAX_SKIPPED_EPISODES + SKIPPED_EPISODES_PER_S * elapsed_s
-        or steps > MAX_SKIPPED_STEPS + SKIPPED_STEPS_PER_S * elapsed_s
+        or steps > MAX_SKIPPED_STEPS + SKIPPED_STEPS_PER_PERIOD * elapsed_s / period_s
     ):
         reason = Reason.FUTURE
     else:

@@ -21,10 +21,10 @@ import zenoh
 from edge_runtime import __version__, log
 from edge_runtime.transport import LEASE_MS, only_own
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
+from edge_runtime.wire import Health, Message, encode, key
 
 if TYPE_CHECKING:
-    from edge_runtime.policy import Manifest
+    from edge_runtime.manifest import Manifest
 
 OpenClient = Callable[[], zenoh.Session]
 
@@ -62,13 +62,14 @@ class Link:
         on_state: Callable[[bytes], None],
         health: Callable[[], Health],
         rearm: Callable[[], str],
+        max_state_bytes: int,
     ) -> None:
         """Listen to states and answer queries. Call `appear` next, when it can answer."""
 
         def state_came(sample: zenoh.Sample) -> None:
             # One byte too many is enough to be rejected; a huge message is not copied.
-            is_huge = len(sample.payload) > MAX_PAYLOAD_BYTES
-            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if is_huge else bytes(sample.payload))
+            is_huge = len(sample.payload) > max_state_bytes
+            on_state(bytes(max_state_bytes + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
             about = {"version": __version__, "manifest": self._manifest}

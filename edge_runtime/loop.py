@@ -17,19 +17,20 @@ import queue
 import threading
 import time
 import traceback
-from typing import TYPE_CHECKING, Optional
+from typing import TYPE_CHECKING, Optional, Tuple
 
-from edge_runtime import log
+from edge_runtime import log, wire
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
-from edge_runtime.log import Flood
 from edge_runtime.policy import Policy, infer
-from edge_runtime.safety import MAX_INFERENCE_S, Event, Mode, Safety
+from edge_runtime.safety import Event, Mode
 from edge_runtime.service import BoardWatch, LatencyWindow, Notifier
-from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Rejection, decode_state
+from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Reason, Rejection, State
 
 if TYPE_CHECKING:  # Loaded only where they are used.
+    import numpy as np
+
     from edge_runtime.files import Hold
     from edge_runtime.vehicles.base import VehicleRunner
 
@@ -56,13 +57,16 @@ class ControlLoop:
         self._policy, self._controller, self._link = policy, controller, link
         self._vehicle, self._notifier = vehicle, notifier
         self._hold, self._rearm_command = hold, rearm_command
-        self._board, self._latest, self._flood = BoardWatch(), LatestState(), Flood()
+        self._link_quality = controller.link
+        self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
+        self._board, self._flood = BoardWatch(), log.Flood()
+        self._latest = LatestState(self._period_s)
         self._inference_window, self._command_window = LatencyWindow(), LatencyWindow()
         self._busy_since_s: Optional[float] = None
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged, self._logged_wait = Safety(), False
+        self._logged, self._logged_wait = controller.safety, False
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -77,7 +81,8 @@ class ControlLoop:
         self._worker.start()
         if self._vehicle is not None:
             self._vehicle.on_fault = self._vehicle_failed
-        self._link.declare(self._on_state, self.health, self._rearm)
+        limit = self._layout.max_payload_bytes
+        self._link.declare(self._on_state, self.health, self._rearm, limit)
 
     def run(self) -> None:
         """Be the watchdog until `stop` is called."""
@@ -141,16 +146,19 @@ class ControlLoop:
                 rivals=self._link.rivals,
                 vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
+                **(self._link_quality.health() if self._link_quality else {}),
             )
 
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
-        state = decode_state(payload)
+        state = wire.decode_state(payload, self._layout)
         with self._lock:
             if isinstance(state, Rejection):
                 self._log_rejection(self._latest.reject(state), arrived_s)
                 return
             rejection = self._latest.offer(state, arrived_s)
+            if self._link_quality and (not rejection or rejection.reason is Reason.STALE):
+                self._link_quality.note_state(state, arrived_ns)
             if rejection is not None:
                 self._log_rejection(rejection, arrived_s)
                 return
@@ -181,7 +189,7 @@ class ControlLoop:
                 received, self._slot = self._slot, None
                 self._busy_since_s = time.monotonic()
                 self._controller.begin(received, self._busy_since_s)
-            output, inference_ns = infer(self._policy, received.state.frames_array())
+            output, inference_ns = self._infer(received.state)
             with self._lock:
                 self._busy_since_s = None
                 self._inference_window.add(inference_ns)
@@ -192,6 +200,13 @@ class ControlLoop:
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s
                     self._command_window.add(int(took_s * 1e9))
+                if self._link_quality:  # Now: no command waits for it.
+                    self._link_quality.judge()
+
+    def _infer(self, state: State) -> Tuple[Optional[np.ndarray], int]:
+        if wire.is_foreign(state, self._layout.task_text):
+            return None, 0  # nobody has looked whether its observation fits
+        return infer(self._policy, self._layout.arrays(state.observation))
 
     def _is_hung(self, now_s: float) -> bool:
         """Whether policy or driver keep or lost their thread: only a new process may help."""
@@ -233,7 +248,7 @@ class ControlLoop:
         if self._vehicle is not None and not self._controller.vehicle_fault:
             until_s = min(until_s, self._vehicle.silent_at_s)
         # Never longer than the policy may take: so nobody need wake it when the policy starts.
-        pause_s = min(until_s - time.monotonic(), MAX_INFERENCE_S)
+        pause_s = min(until_s - time.monotonic(), self._period_s)
         if pause_s > 0:
             self._timer.wait(pause_s)
 
@@ -253,8 +268,12 @@ class ControlLoop:
             inference_ns=order.inference_ns,
             sent_ns=time.time_ns(),
             reason=order.reason,
+            plan=order.plan,
         )
-        self._link.send("command", command)
+        if not order.ridden:
+            self._link.send("command", command)
+            if self._link_quality:
+                self._link_quality.note_command(command.episode, command.sent_ns)
         if self._vehicle is not None:
             # The end of an episode is no fault; and a stop that is repeated between the re-arm
             # and the first fresh state must not take back what the re-arm has given.

@@ -1,9 +1,9 @@
-"""A policy file: signed, whole in itself, with a manifest that fits us; and the network in it.
+"""A policy file: signed, whole in itself, with a manifest that fits it; and the network in it.
 
 The signature is Ed25519 over the whole file: `POLICY.onnx.sig`, 64 raw bytes; keys are PEM. Before
 onnxruntime loads the file it is walked field by field, without the onnx package: whatever could
-keep weights where nobody looks is refused. The manifest is JSON in its metadata under MANIFEST_KEY:
-what the policy sees, does, and where it comes from. Contract, section 4.
+keep weights where nobody looks, or take a time that hangs on the picture, is refused. The manifest
+(manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ import hashlib
 import io
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import TYPE_CHECKING, Any, Iterator, Mapping, NamedTuple, Optional, Sequence
 
-import msgspec
 import numpy as np
 
 from edge_runtime import log
+from edge_runtime.manifest import MANIFEST_KEY, Layout, Manifest, Task, decode_manifest
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, PathLike, UserError, read_bytes
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, MAX_TEXT_CHARS
 
 if TYPE_CHECKING:  # `deploy` and an operator's commands need no onnxruntime.
     import onnxruntime
@@ -32,97 +31,10 @@ BESIDE = "signed by the key beside it"
 UNVERIFIED = "signed, not verified"
 UNSIGNED = "unsigned"
 
-MANIFEST_KEY = "phil.manifest"
-MANIFEST_SCHEMA = 1
-# The runtime must know how to stop each action safely (controller.py), so it takes only these.
-ACTION_NAMES = ("pedal", "steering")
-FULL_BRAKE = -1.0
-
-OPSET = 17
-MAX_IR_VERSION = 8
-INPUT, OUTPUT = "frames", "action"
-_RANGE_TOLERANCE = 1e-5
-
-
-class Observation(msgspec.Struct, frozen=True, kw_only=True):
-    """The network's input. `order` says which frame is the newer one."""
-
-    name: str = "frames"
-    shape: List[int] = msgspec.field(default_factory=lambda: list(FRAMES_SHAPE))
-    dtype: str = "uint8"
-    order: str = "[t-1, t]"
-
-
-class Action(msgspec.Struct, frozen=True, kw_only=True):
-    """One number of the network's output, its physical meaning, unit and range."""
-
-    name: str
-    meaning: str
-    unit: str
-    low: float
-    high: float
-
-
-class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """All of it. `training` holds at least seed, episodes, config and source revision.
-
-    `created` is ISO 8601 in UTC. A field that is not listed, like an earlier version's `policy_id`,
-    is not looked at.
-    """
-
-    scenario: str
-    algorithm: str
-    observation: Observation
-    action: List[Action]
-    training: Dict[str, Any]
-    created: str
-    control_period_s: float = CONTROL_PERIOD_S
-    schema: int = MANIFEST_SCHEMA
-
-    @property
-    def task(self) -> str:
-        """What the policy is for: what it is compared by when it meets a simulator."""
-        return task_text(self.scenario, [(row.name, row.low, row.high) for row in self.action])
-
-
-def task_text(scenario: str, actions: Sequence[Tuple[str, float, float]]) -> str:
-    """Scenario, and each action's name, low and high: `left_turn, pedal -1 to 1`."""
-    rows = (f"{name} {low:g} to {high:g}" for name, low, high in actions)
-    return ", ".join((scenario, *rows))[:MAX_TEXT_CHARS]
-
-
-def encode_manifest(manifest: Manifest) -> str:
-    """The JSON text that goes into the file."""
-    return msgspec.json.encode(manifest).decode()
-
-
-def decode_manifest(text: str) -> Manifest:
-    """The manifest of a policy file. Raises UserError where it is none, or none we can drive."""
-    try:
-        manifest = msgspec.json.decode(text.encode(), type=Manifest)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise UserError(f"the manifest in the policy file is not valid: {error}") from None
-    schema, period_s = manifest.schema, manifest.control_period_s
-    if schema != MANIFEST_SCHEMA:
-        raise UserError(f"the manifest has schema {schema}, this runtime reads {MANIFEST_SCHEMA}")
-    if period_s != CONTROL_PERIOD_S:
-        raise UserError(f"its control period is {period_s} s, this runtime's {CONTROL_PERIOD_S} s")
-    if manifest.observation != Observation():
-        found = f"{Observation()} is needed, {manifest.observation} was found"
-        raise UserError(f"the manifest's observation is not the wire's: {found}")
-    names = [action.name for action in manifest.action]
-    if not names or len(set(names)) != len(names):
-        found = f"an action twice: {', '.join(names)}" if names else "no action"
-        raise UserError(f"the manifest names {found}")
-    for name, low, high in ((action.name, action.low, action.high) for action in manifest.action):
-        if name not in ACTION_NAMES:
-            known = " and ".join(ACTION_NAMES)
-            raise UserError(f"the runtime does not know how to stop {name!r} safely, only {known}")
-        if not -1.0 <= low < high <= 1.0:  # nor is NaN
-            raise UserError(f"the range of {name} is {low} to {high}; it must lie in -1 to 1")
-        if name == "pedal" and low != FULL_BRAKE:
-            raise UserError(f"its pedal begins at {low}: it could not brake fully in a safe stop")
-    return manifest
+OPSETS = range(13, 22)
+MAX_IR_VERSION = 10
+OUTPUT = "action"
+_RANGE_TOLERANCE = 1e-5  # Of an action's whole range: the last bits of a network's tanh
 
 
 class Policy(NamedTuple):
@@ -130,16 +42,18 @@ class Policy(NamedTuple):
 
     session: onnxruntime.InferenceSession
     manifest: Manifest
+    layout: Layout
     trust: str
     policy_id: str
 
-    def act(self, frames: np.ndarray) -> np.ndarray:
-        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it.
+    def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The action, float32 [n], for the arrays of `layout`. It may hold NaN: check it.
 
-        Raises UserError for another type or shape, which can depend on the picture, and whatever
+        Raises UserError for another type or shape, which can depend on what it sees, and whatever
         onnxruntime raises.
         """
-        answer: np.ndarray = self.session.run([OUTPUT], {INPUT: frames[np.newaxis]})[0]
+        inputs = {name: array[np.newaxis] for name, array in observation.items()}
+        answer: np.ndarray = self.session.run([OUTPUT], inputs)[0]
         if answer.dtype != np.float32 or answer.shape != (1, len(self.manifest.action)):
             raise UserError(f"the policy answers with {answer.dtype} {list(answer.shape)}")
         return answer[0]
@@ -158,22 +72,42 @@ def load_policy(
     data = read_bytes(path, "policy file")
     trust = check_trust(path, data, public_key, allow_unsigned)
     try:
-        ir_version, opset, metadata = read_onnx(data)
-        if opset != OPSET or ir_version > MAX_IR_VERSION:
-            needs = f"it needs opset {OPSET} and at most IR version {MAX_IR_VERSION}"
-            raise UserError(f"it has opset {opset} and IR version {ir_version}; {needs}")
-        if MANIFEST_KEY not in metadata:
-            raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
-        manifest = decode_manifest(metadata[MANIFEST_KEY])
-        session = _open(data)
-        _check_tensor("input", session.get_inputs(), INPUT, "tensor(uint8)", FRAMES_SHAPE)
-        actions = (len(manifest.action),)
-        _check_tensor("output", session.get_outputs(), OUTPUT, "tensor(float)", actions)
-        policy = Policy(session, manifest, trust, policy_id_of(data))
-        _probe(policy)
+        return open_policy(data, trust)
     except UserError as error:
         raise UserError(f"policy {Path(path)} may not drive: {error}") from None
+
+
+def open_policy(data: bytes, trust: str) -> Policy:
+    """The policy in a file's bytes, checked and probed but for its signature. Raises UserError."""
+    metadata = check_graph(data)
+    if MANIFEST_KEY not in metadata:
+        raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
+    manifest = decode_manifest(metadata[MANIFEST_KEY])
+    policy = Policy(open_network(data), manifest, Layout(manifest), trust, policy_id_of(data))
+    check_tensors(policy.session, manifest)
+    _probe(policy)
     return policy
+
+
+def check_graph(data: bytes) -> dict[str, str]:
+    """The metadata of a whole ONNX file that the board can run. Raises UserError for others."""
+    ir_version, opset, metadata = read_onnx(data)
+    if opset not in OPSETS or ir_version > MAX_IR_VERSION:
+        needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
+        raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
+    return metadata
+
+
+def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
+    """Raise UserError unless the network's inputs and output are the task's."""
+    inputs = {each.name: each for each in session.get_inputs()}
+    for name, entry in task.observation.items():
+        found = [inputs.pop(name)] if name in inputs else session.get_inputs()
+        kind = "float" if entry.dtype == "float32" else entry.dtype
+        _check_tensor("input", found, name, f"tensor({kind})", entry.shape)
+    if inputs:
+        raise UserError(f"its input {next(iter(inputs))} is not in the manifest's observation")
+    _check_tensor("output", session.get_outputs(), OUTPUT, "tensor(float)", (len(task.action),))
 
 
 def policy_id_of(data: bytes) -> str:
@@ -181,7 +115,7 @@ def policy_id_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _check_tensor(what: str, found: List, name: str, kind: str, shape: Sequence[int]) -> None:
+def _check_tensor(what: str, found: list, name: str, kind: str, shape: Sequence[int]) -> None:
     """Raise UserError unless it is one tensor like this behind a batch that is 1 or open."""
     fits = (
         len(found) == 1
@@ -191,13 +125,12 @@ def _check_tensor(what: str, found: List, name: str, kind: str, shape: Sequence[
     )
     if not fits:
         shown = ", ".join(f"{each.name} {each.type} {each.shape}" for each in found)
-        dims = ", ".join(map(str, shape))
-        raise UserError(
-            f"its {what} must be {name} {kind} [batch, {dims}], it is {shown or 'none'}"
-        )
+        dims = ", ".join(["batch", *map(str, shape)])
+        raise UserError(f"its {what} must be {name} {kind} [{dims}], it is {shown or 'none'}")
 
 
-def _open(data: bytes) -> onnxruntime.InferenceSession:
+def open_network(data: bytes) -> onnxruntime.InferenceSession:
+    """The network in an ONNX file's bytes, on one thread. Raises UserError where it is none."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -214,41 +147,55 @@ def _open(data: bytes) -> onnxruntime.InferenceSession:
         raise UserError(f"onnxruntime does not load it: {error}") from None
 
 
-def probe_frames() -> Iterator[np.ndarray]:
-    """The pictures every policy must answer before it drives: black, grey, and seeded noise."""
-    yield np.full(FRAMES_SHAPE, 0, dtype=np.uint8)
-    yield np.full(FRAMES_SHAPE, 128, dtype=np.uint8)
-    yield np.random.RandomState(0).randint(0, 256, FRAMES_SHAPE).astype(np.uint8)
+def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
+    """What every policy must answer before it drives: zeros, middling values, seeded noise.
+
+    Bytes over their range, other numbers from 0 to 1.
+    """
+    random = np.random.RandomState(0)
+    for make in (np.zeros, lambda shape: np.full(shape, 0.5), random.random_sample):
+        yield {
+            name: np.asarray(make(shape) * (256 if dtype.kind == "u" else 1)).astype(dtype)
+            for name, dtype, shape, _ in layout.parts
+        }
 
 
 def _probe(policy: Policy) -> None:
     """Warm it up, too. Raises UserError for an unfit answer."""
-    for frames in probe_frames():
+    for seen in probes(policy.layout):
         try:
-            action = policy.act(frames)
-        except Exception as error:  # as in _open
+            action = policy.act(seen)
+        except Exception as error:  # as in open_network
             raise UserError(f"onnxruntime does not run it: {error}") from None
-        words = "it answers a probe picture with"
-        if not np.all(np.isfinite(action)):
-            raise UserError(f"{words} {action.tolist()}, not finite")
-        for row, value in zip(policy.manifest.action, action.tolist()):
-            if not row.low - _RANGE_TOLERANCE <= value <= row.high + _RANGE_TOLERANCE:
-                outside = f"outside its manifest's {row.low} to {row.high}"
-                raise UserError(f"{words} {row.name} {value:.3f}, {outside}")
+        check_answer(action, policy.manifest, "a probe")
     for _ in range(10):
-        policy.act(frames)
+        policy.act(seen)
 
 
-def infer(policy: Policy, frames: np.ndarray) -> Tuple[Optional[np.ndarray], int]:
-    """The action, float32 [n], for frames uint8 [2, 45, 80], and how long it took in nanoseconds.
+def check_answer(action: np.ndarray, task: Task, what: str) -> None:
+    """Raise UserError unless the answer to `what` is finite and within the manifest's ranges."""
+    words = f"it answers {what} with"
+    if not np.all(np.isfinite(action)):
+        raise UserError(f"{words} {action.tolist()}, not finite")
+    for row, value in zip(task.action, action.tolist()):
+        slack = _RANGE_TOLERANCE * (row.high - row.low)
+        if not row.low - slack <= value <= row.high + slack:
+            outside = f"outside its manifest's {row.low} to {row.high}"
+            raise UserError(f"{words} {row.name} {value:.3f}, {outside}")
+
+
+def infer(
+    policy: Policy, observation: Mapping[str, np.ndarray]
+) -> tuple[Optional[np.ndarray], int]:
+    """The action, float32 [n], for an observation, and how long it took in nanoseconds.
 
     Where the policy raises, the answer is None.
     """
     begun_ns = time.perf_counter_ns()
     output: Optional[np.ndarray] = None
     try:
-        output = policy.act(frames)
-    except Exception as error:  # as in _open
+        output = policy.act(observation)
+    except Exception as error:  # as in open_network
         log.event("error", "inference_failed", detail=error)
     return output, time.perf_counter_ns() - begun_ns
 
@@ -319,7 +266,9 @@ def check_trust(
 # fields, messages by field, and what is refused by name. Any other field is refused, too: it could
 # keep weights where nobody looks, or in a file that nobody has signed.
 _SPARSE, _OUTSIDE = "sparse weights", "weights in another file (export it in one file)"
-_KINDS: Dict[str, Tuple[Tuple[int, ...], Dict[int, str], Dict[int, str]]] = {
+# A loop may take any time, and a branch a time that no probe has met.
+_FLOW = "control flow (a Loop, an If or a Scan)"
+_KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
     "model": (
         (1, 2, 3, 4, 5, 6, 8, 14),
         {7: "graph"},
@@ -329,15 +278,14 @@ _KINDS: Dict[str, Tuple[Tuple[int, ...], Dict[int, str], Dict[int, str]]] = {
     "node": ((1, 2, 3, 4, 6, 7, 8, 9), {5: "attribute"}, {}),
     "attribute": (
         (1, 2, 3, 4, 7, 8, 9, 13, 14, 15, 20),
-        {5: "tensor", 6: "graph", 10: "tensor", 11: "graph"},
-        {22: _SPARSE, 23: _SPARSE},
+        {5: "tensor", 10: "tensor"},
+        {6: _FLOW, 11: _FLOW, 22: _SPARSE, 23: _SPARSE},
     ),
     "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
-_MAX_DEPTH = 64  # a policy nests its graphs two or three deep; Python's stack would end soon after
 
 
-def read_onnx(data: bytes) -> Tuple[int, int, Dict[str, str]]:
+def read_onnx(data: bytes) -> tuple[int, int, dict[str, str]]:
     """IR version, operator set and metadata of a whole ONNX file: onnxruntime does not tell them.
 
     Raises UserError for truncated or foreign bytes, and for weights anywhere but in plain tensors
@@ -362,16 +310,14 @@ def read_onnx(data: bytes) -> Tuple[int, int, Dict[str, str]]:
     return versions[-1], max(numbers), metadata
 
 
-def _checked(message: memoryview, kind: str, depth: int = 0) -> List[Tuple[int, Any]]:
+def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:
     """The fields of a message, when it and all within it hold nothing that is refused."""
-    if depth > _MAX_DEPTH:
-        raise ValueError(f"messages nest deeper than {_MAX_DEPTH}")
     plain, nested, refused = _KINDS[kind]
     fields = list(_fields(message))
     for number, value in fields:
         what = ""
         if number in nested:
-            _checked(_bytes(value), nested[number], depth + 1)
+            _checked(_bytes(value), nested[number])
         elif number not in plain:
             what = refused.get(number, f"an unknown field {number}")
         elif (kind, number) == ("tensor", 14) and value != 0:  # data_location; 0 is inside
@@ -381,7 +327,7 @@ def _checked(message: memoryview, kind: str, depth: int = 0) -> List[Tuple[int, 
     return fields
 
 
-def _fields(message: memoryview) -> Iterator[Tuple[int, Any]]:
+def _fields(message: memoryview) -> Iterator[tuple[int, Any]]:
     """Number and value (int or memoryview) of each field.
 
     See https://protobuf.dev/programming-guides/encoding/.
@@ -408,7 +354,7 @@ def _fields(message: memoryview) -> Iterator[Tuple[int, Any]]:
         position += length
 
 
-def _varint(message: memoryview, position: int) -> Tuple[int, int]:
+def _varint(message: memoryview, position: int) -> tuple[int, int]:
     """A number and where it ends."""
     result = 0
     for index, byte in enumerate(message[position : position + 10]):

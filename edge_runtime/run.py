@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, Optional
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Union
 
 import zenoh
 
@@ -21,8 +21,8 @@ from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
-from edge_runtime.transport import is_tls, look, open_session
-from edge_runtime.util import ending_signals
+from edge_runtime.transport import is_tls, open_session
+from edge_runtime.util import PathLike, ending_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
@@ -37,20 +37,32 @@ _POLL_S = 0.1
 class _StopSignal:
     """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
 
-    def __init__(self) -> None:
+    def __init__(self, until: Optional[threading.Event]) -> None:
         self.came = False
         self.on_stop: Callable[[], None] = lambda: None
-        for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
-            signal.signal(number, self._handle)
+        self._before: Dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():  # no other one may take signals
+            for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
+                self._before[number] = signal.signal(number, self._handle)
+        if until is not None:
+            threading.Thread(target=self._wait, args=(until,), daemon=True).start()
 
-    def _handle(self, number: int, frame: Any) -> None:
+    def restore(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _wait(self, until: threading.Event) -> None:
+        until.wait()
+        self._handle()
+
+    def _handle(self, *_: Any) -> None:
         self.came = True
         self.on_stop()
 
 
 EXAMPLE = r"""examples:
-  python -m edge_runtime run --policy results/policies/left_turn.onnx \
-      --public-key results/policies/policy.pub
+  python -m edge_runtime run --policy my.onnx --public-key keys/policy.pub
   python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \
       --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01
   python -m edge_runtime run --config edge.toml --log-format json"""
@@ -64,21 +76,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
-    flags = {name: getattr(arguments, name, None) for name in Config.__struct_fields__}
-    config = load_config(arguments.config, flags)
-    log.configure(config.log_level, config.log_format)
-    try:
-        if not _drive(config, _StopSignal()):
-            # The policy's thread hangs in native code, and would hold the interpreter's exit.
-            log.close()
-            os._exit(0)
-    finally:
-        log.close()
+    """`drive` with the command line's settings."""
+    flags = {name: getattr(arguments, name, None) for name in (*Config.__struct_fields__, "bus")}
+    ended = drive(config=arguments.config, **flags)
+    for number in ending_signals():  # a second one must not change how it has ended
+        signal.signal(number, signal.SIG_IGN)
+    if not ended:
+        # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        os._exit(0)
     return 0
 
 
-def _drive(config: Config, stop: _StopSignal) -> bool:
+def drive(
+    policy: Optional[PathLike] = None,
+    *,
+    connect: Optional[str] = None,
+    vehicle: Union[Vehicle, str, None] = None,
+    config: Optional[PathLike] = None,
+    until: Optional[threading.Event] = None,
+    **settings: Any,
+) -> bool:
+    """Verify a policy, connect, drive until a signal comes or `until` is set: `run`, from Python.
+
+    `vehicle` is a driver, or what `--vehicle` takes; a driver is closed in the end. `config` is a
+    TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
+    it in the main thread only. Returns False where the policy's thread hangs and would hold the
+    interpreter's exit. Raises UserError where it cannot begin, and where it gave way to another
+    runtime of the same vehicle id.
+    """
+    driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
+    if driver is not None:
+        from edge_runtime.vehicles import check_driver
+
+        check_driver(driver)
+    flags = {"policy": policy and str(policy), "connect": connect, **settings}
+    try:
+        loaded = load_config(config, {**flags, "vehicle": NONE if driver else vehicle})
+        log.configure(loaded.log_level, loaded.log_format)
+        stop = _StopSignal(until)
+        try:
+            return _drive(loaded, stop, driver)
+        finally:
+            stop.restore()
+            log.close()
+    except BaseException:
+        if driver is not None:
+            driver.close()
+        raise
+
+
+def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None) -> bool:
     """Drive until it is told to stop; False where a thread hangs.
 
     Raises UserError, and leaves nothing open, where the run cannot be made, and where it gave way.
@@ -91,23 +138,39 @@ def _drive(config: Config, stop: _StopSignal) -> bool:
         tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
         check_name(tls.name, common_name(EDGE, config.vehicle_id))
         log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
-    service.claim_resources(config.realtime_priority, config.cpus, config.lock_memory)
+    if config.vehicle != NONE:
+        from edge_runtime.vehicles import find_vehicle, make_vehicle
+
+        find_vehicle(config.vehicle)  # now: nobody need wait for the policy to hear of a misprint
+    claim = (config.realtime_priority, config.cpus, config.lock_memory)
+    if any(claim):
+        from edge_runtime.realtime import claim_resources
+
+        claim_resources(*claim)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
     # Both of its sessions hear only what this vehicle's edge may hear.
     connected = partial(open_session, connect=config.connect, tls=tls, access=access)
     open_client = partial(connected, mode="client")
     notifier = service.Notifier()
     with contextlib.ExitStack() as undo:
-        vehicle: Optional[Vehicle] = None
+        period_s = policy.manifest.control_period_s
         if config.vehicle != NONE:
-            from edge_runtime.vehicles import make_vehicle
-
-            vehicle = make_vehicle(config.vehicle, config, policy.manifest.scenario)
+            vehicle = make_vehicle(config.vehicle, config.vehicle_settings, policy.manifest)
+        if vehicle is not None:
             undo.callback(vehicle.close)
+            vehicle.control_period_s = period_s
         limits = shared_limits(policy.manifest.action, vehicle.limits if vehicle else {})
-        controller = Controller(
-            limits, vehicle is not None, config.armed_at_start, policy.manifest.task
-        )
+        ride, quality, armed = None, None, config.armed_at_start
+        if config.ride_through.max_s:
+            from edge_runtime.ride import Ride
+
+            ride = Ride(config.ride_through.max_s, period_s, limits, plays=vehicle is not None)
+        if policy.manifest.envelope is not None:
+            from edge_runtime.link_quality import LinkQuality
+
+            quality, armed = LinkQuality(policy.manifest), False  # nobody knows the link yet
+        task, needs_rearm = policy.layout.task_text, vehicle is not None
+        controller = Controller(limits, period_s, needs_rearm, armed, task, ride, quality)
         hold: Optional[Hold] = None
         if config.hold is not None:
             from edge_runtime.files import Hold
@@ -133,7 +196,7 @@ def _drive(config: Config, stop: _StopSignal) -> bool:
     gc.freeze()
     try:
         if runner is not None:
-            runner.start(config.armed_at_start)
+            runner.start(armed)
         loop.start()
         if has_router:
             wait_for_router(session)
@@ -141,7 +204,7 @@ def _drive(config: Config, stop: _StopSignal) -> bool:
         if policy.trust != VERIFIED:
             log.event("warning", "policy_not_verified", trust=policy.trust)
         print(
-            f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+            f"ready vehicle_id={config.vehicle_id} vehicle={vehicle.name if vehicle else NONE}"
             f" connect={config.connect} policy_id={policy.policy_id}",
             flush=True,
         )
@@ -209,6 +272,8 @@ def why_no_state(
     session: zenoh.Session, connect: str, vehicle_id: str, tls: Optional[TlsFiles]
 ) -> str:
     """What keeps states away, on one line."""
+    from edge_runtime.reach import look  # Here: mostly the simulator is there first.
+
     if not session.info.routers_zid():
         _, refusal = look(connect, tls)
         if not session.info.routers_zid():  # it may have come meanwhile

@@ -1,6 +1,7 @@
 """When the policy may drive: a pure state machine over (mode, event, time). Contract, section 5.
 
-TRANSITIONS is all of it; the functions below it only decide which event a moment is.
+TRANSITIONS is all of it; the functions below it only decide which event a moment is. T is the
+control period of the policy that drives.
 """
 
 from __future__ import annotations
@@ -8,13 +9,9 @@ from __future__ import annotations
 from enum import Enum
 from typing import Dict, NamedTuple, Optional, Tuple
 
-from edge_runtime.wire import CONTROL_PERIOD_S
-
 # One lost state leaves a gap of exactly 2 T. Without a little patience the jitter of the sender's
-# clock would decide whether it costs one step or a stop; 2 T + 50 ms is the promise.
-GRACE_S = 0.02
-SILENCE_S = 2 * CONTROL_PERIOD_S + GRACE_S
-MAX_INFERENCE_S = CONTROL_PERIOD_S
+# clock would decide whether it costs one step or a stop; 2 T + T / 2 is the promise.
+SILENCE_PERIODS = 2.2
 FRESH_STATES_TO_RECOVER = 5
 # Between two episodes of one drive a simulator resets in seconds. After a longer pause nobody
 # may still be beside the vehicle.
@@ -35,16 +32,17 @@ class Event(str, Enum):
     FRESH = "fresh_state"
     RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
     FINAL = "final_state"  # the episode ends with it
-    SILENT = "no_fresh_state"  # for longer than SILENCE_S
+    SILENT = "no_fresh_state"  # for longer than silence_s
     NOT_FINITE = "output_not_finite"
     FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
     DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps
-    TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
+    TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than answer_s
     PAUSED = "pause_too_long"  # a vehicle had leave to drive and did not for MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
     OTHER_TASK = "other_task"  # the state is of another task than the policy
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
+    OUTSIDE = "outside_envelope"  # the link is where the policy was never shown to be safe
     REARM = "rearm"  # an operator allows driving again
 
 
@@ -65,6 +63,7 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
     Event.OTHER_TASK: (_X, _X, _X),
     Event.NOT_ARMED: (_X, _X, _X),
     Event.VEHICLE: (_X, _X, _X),
+    Event.OUTSIDE: (_X, _X, _X),
     Event.REARM: (_S, _D, _X),  # a fresh state must follow
 }
 TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
@@ -78,11 +77,14 @@ FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 class Safety(NamedTuple):
     """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
 
+    `control_period_s` is T. It never changes.
+
     `last_fresh_s` and `session` are the monotonic arrival of the newest state and the simulator
     that sent it, None before the first one. `permitted_s` is when it last drove or was re-armed,
-    or the arrival of the very first state.
+    or the arrival of the very first state. `ride_s` never changes; 0: no ride-through.
     """
 
+    control_period_s: float
     mode: Mode = Mode.STANDBY
     reason: str = ""
     fresh_in_a_row: int = 0
@@ -91,11 +93,22 @@ class Safety(NamedTuple):
     session: Optional[str] = None
     safe_stops: int = 0
     permitted_s: Optional[float] = None
+    ride_s: float = 0.0
+
+    @property
+    def answer_s(self) -> float:
+        """So long the newest state may be answered: 2 T, and a fifth of T as grace."""
+        return SILENCE_PERIODS * self.control_period_s
+
+    @property
+    def silence_s(self) -> float:
+        """So long no state need come. What drives has its last plan for `ride_s` more."""
+        return SILENCE_PERIODS * self.control_period_s + self.ride_s * (self.mode is Mode.DRIVE)
 
 
 def is_silent(safety: Safety, now_s: float) -> bool:
-    """Whether the newest state is older than SILENCE_S (or there was none)."""
-    return safety.last_fresh_s is None or now_s - safety.last_fresh_s > SILENCE_S
+    """Whether the newest state is older than silence_s (or there was none)."""
+    return safety.last_fresh_s is None or now_s - safety.last_fresh_s > safety.silence_s
 
 
 def classify_arrival(
@@ -105,7 +118,7 @@ def classify_arrival(
     if safety.last_fresh_s is None:
         return None
     if session != safety.session:
-        # It was let in because the one before was silent for 2 T, whatever GRACE_S says.
+        # It was let in because the one before was silent for 2 T, whatever the grace says.
         return Event.OTHER_SESSION if needs_rearm else Event.SILENT
     may_drive = needs_rearm and (safety.mode is Mode.STANDBY or safety.rearmed)
     # Not from the last state: final ones may come for hours, and nobody drives.

@@ -1,8 +1,8 @@
 """The wire: its keys, and its messages as MessagePack maps that are validated on arrival.
 
 Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection that
-says why it never reaches the policy. A field that came after schema 1 was first spoken has a
-default, so that both sides of a mixed pair go on understanding each other. Contract, section 3.
+says why it never reaches the policy. What an observation and an action must be, the policy's
+manifest says (manifest.py). Contract, section 3.
 """
 
 from __future__ import annotations
@@ -10,32 +10,34 @@ from __future__ import annotations
 import math
 import re
 from enum import Enum
-from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Tuple, Type, TypeVar, Union
+from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, TypeVar, Union
 
 import msgspec
-import numpy as np
 
 from edge_runtime.util import UserError
 
-CONTROL_PERIOD_S = 0.1
-SCHEMA = 1
-FRAMES_SHAPE = (2, 45, 80)
-FRAMES_BYTES = 2 * 45 * 80
+if TYPE_CHECKING:  # It needs the messages' limits, and says what an observation must be.
+    from edge_runtime.manifest import Layout
+
+SCHEMA = 2
 
 DRIVE = "drive"
 SAFE_STOP = "safe_stop"
 COMMAND_MODES = (DRIVE, SAFE_STOP)
 
 MAX_PAYLOAD_BYTES = 64 * 1024
+MAX_STATE_BYTES = 4 * 1024 * 1024
+"""Of any state; the policy's manifest sets a lower limit for the states it is sent."""
 MAX_TEXT_CHARS = 256
+MAX_PLAN, MAX_RIDE_S = 10, 1.0  # further actions of a command at most, and for how long
 
 DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
 
-# How often a second each of them is sent.
+# How often a second each of them is sent; 0: once a control period, or when it is asked for.
 TOPICS: Dict[str, float] = {
-    "state": 1 / CONTROL_PERIOD_S,  # simulator to edge
-    "command": 1 / CONTROL_PERIOD_S,  # edge to simulator and vehicle
+    "state": 0.0,  # simulator to edge
+    "command": 0.0,  # edge to simulator and vehicle
     "feedback": 20.0,  # vehicle to all
     "health": 2.0,  # edge to all
     "alive": 0.0,  # liveliness token of the edge
@@ -64,7 +66,7 @@ class Reason(str, Enum):
     OVERSIZED = "oversized"
     MALFORMED = "malformed"
     SCHEMA = "schema"
-    FRAMES_SIZE = "frames_size"
+    OBSERVATION = "observation"
     NOT_FINITE = "not_finite"
     STALE = "stale"
     DUPLICATE = "duplicate"
@@ -80,9 +82,11 @@ class Rejection(NamedTuple):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t].
+    """What the simulator sees at one step. `observation`: each array's bytes, in C order.
 
-    `task` is what its environment is for, as `manifest.task_text` says it; left out where unknown.
+    `speed_mps` is None where the environment has none. `task` is what the environment is for, as
+    `manifest.Task.text` says it; left out where unknown. `heard` counts the commands that came, no
+    copies; the last is stamped `heard_sent_ns`, and came at `heard_ns` by the sender's clock.
     """
 
     session: str
@@ -90,21 +94,21 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     step: int
     sim_time_s: float
     sent_ns: int
-    frames: bytes
-    speed_mps: float
+    observation: Dict[str, bytes]
+    speed_mps: Optional[float]
     final: bool
     task: Union[str, msgspec.UnsetType] = msgspec.UNSET
+    heard: Union[int, msgspec.UnsetType] = msgspec.UNSET
+    heard_sent_ns: Union[int, msgspec.UnsetType] = msgspec.UNSET
+    heard_ns: Union[int, msgspec.UnsetType] = msgspec.UNSET
     schema: int = SCHEMA
-
-    def frames_array(self) -> np.ndarray:
-        """The frames as a read-only uint8 array of shape [2, 45, 80], not copied."""
-        return np.frombuffer(self.frames, dtype=np.uint8).reshape(FRAMES_SHAPE)
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to the state (session, episode, step); it is its own heartbeat.
 
-    `received_ns` and `sent_ns` are the edge's wall clock, `inference_ns` is a duration.
+    `received_ns` and `sent_ns` are the edge's wall clock, `inference_ns` is a duration. `plan`
+    holds the actions of the next periods, for as long as nothing newer comes; mostly left out.
     """
 
     session: str
@@ -117,6 +121,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     inference_ns: int
     sent_ns: int
     reason: str = ""
+    plan: Union[List[List[float]], msgspec.UnsetType] = msgspec.UNSET
     schema: int = SCHEMA
 
 
@@ -153,7 +158,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
     `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
-    a re-arm; empty if nothing.
+    a re-arm; empty if nothing. `link` is `LinkQuality.summary`, `envelope` its limits; empty where
+    the policy has none.
     """
 
     vehicle_id: str
@@ -176,18 +182,22 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     rss_mb: float = 0.0
     rivals: int = 0
     vehicle_fault: str = ""
+    link: Dict[str, float] = msgspec.field(default_factory=dict)
+    envelope: Dict[str, float] = msgspec.field(default_factory=dict)
     schema: int = SCHEMA
 
 
 Message = Union[State, Command, Feedback, Health]
 
 
-class _Envelope(msgspec.Struct):
+class Envelope(msgspec.Struct):
+    """What every version of a message has."""
+
     schema: int
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
-_ENVELOPE = msgspec.msgpack.Decoder(_Envelope)
+_ENVELOPE = msgspec.msgpack.Decoder(Envelope)
 _DECODERS: Dict[Any, Any] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
 }
@@ -201,24 +211,38 @@ def encode(message: Message) -> bytes:
     return _ENCODER.encode(message)
 
 
-def decode_state(payload: bytes) -> Union[State, Rejection]:
-    """A State whose frames have the right size and whose numbers are finite, or why not."""
-    state = _decode(payload, State)
-    if isinstance(state, State) and len(state.frames) != FRAMES_BYTES:
-        detail = f"frames hold {len(state.frames)} bytes, not {FRAMES_BYTES}"
-        return Rejection(Reason.FRAMES_SIZE, detail)
-    return state
+def decode_state(payload: bytes, layout: Optional[Layout] = None) -> Union[State, Rejection]:
+    """A State with finite numbers, whose observation fits the layout, or why not.
+
+    Without a layout any observation is taken. A state that names another task is handed on as it
+    is, so that its sender can be told; the policy must not see it.
+    """
+    limit = layout.max_payload_bytes if layout is not None else MAX_STATE_BYTES
+    state = _decode(payload, State, limit)
+    if layout is None or isinstance(state, Rejection) or is_foreign(state, layout.task_text):
+        return state
+    return layout.refusal(state.observation) or state
+
+
+def is_foreign(state: State, task: str) -> bool:
+    """Whether a state says that it is of another task than this; both as `manifest.Task.text`."""
+    return state.task not in (msgspec.UNSET, task)
 
 
 def decode_command(payload: bytes) -> Union[Command, Rejection]:
-    """A Command of a known mode with at least one action, each in [-1, 1], or why not."""
+    """A Command of a known mode with at least one action, finite like its plan's, or why not."""
     command = _decode(payload, Command)
     if isinstance(command, Rejection):
         return command
     if command.mode not in COMMAND_MODES:
         return Rejection(Reason.MALFORMED, f"mode {command.mode!r} is neither drive nor safe_stop")
-    if not command.action or any(abs(value) > 1.0 for value in command.action):
-        return Rejection(Reason.MALFORMED, "action is empty or leaves [-1, 1]")
+    if not command.action:
+        return Rejection(Reason.MALFORMED, "action is empty")
+    plan = command.plan or []
+    if len(plan) > MAX_PLAN or any(len(row) != len(command.action) for row in plan):
+        return Rejection(Reason.MALFORMED, f"plan: {len(plan)} actions, or of another length")
+    if not all(math.isfinite(value) for row in plan for value in row):
+        return Rejection(Reason.NOT_FINITE, "plan holds a number that is not finite")
     return command
 
 
@@ -232,9 +256,11 @@ def decode_health(payload: bytes) -> Union[Health, Rejection]:
     return _decode(payload, Health)
 
 
-def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        detail = f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
+def _decode(
+    payload: bytes, kind: type[_M], max_bytes: int = MAX_PAYLOAD_BYTES
+) -> Union[_M, Rejection]:
+    if len(payload) > max_bytes:
+        detail = f"{len(payload)} bytes, at most {max_bytes} are read"
         return Rejection(Reason.OVERSIZED, detail)
     try:
         # The schema first: another schema's fields need not fit, and that is no malformed message.
@@ -244,27 +270,26 @@ def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
         message: _M = _DECODERS[kind].decode(payload)
     except _DECODE_ERRORS as error:
         return Rejection(Reason.MALFORMED, str(error))
-    # Finite floats, short texts and no negative counts, for every field of every message.
     least = -1 if kind is Feedback else 0  # before its first command a vehicle reports step -1
-    for name, value in _leaves(message):
-        if isinstance(value, float) and not math.isfinite(value):
-            return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
-        if isinstance(value, str) and len(value) > MAX_TEXT_CHARS:
-            detail = f"{name} is longer than {MAX_TEXT_CHARS} characters"
-            return Rejection(Reason.MALFORMED, detail)
-        if isinstance(value, int) and value < least:
-            return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
+    for name, value in zip(message.__struct_fields__, msgspec.structs.astuple(message)):
+        refusal = _refusal(name, value, least)
+        if refusal is not None:
+            return refusal
     return message
 
 
-def _leaves(message: Message) -> Iterator[Tuple[str, Any]]:
-    for name in message.__struct_fields__:
-        value = getattr(message, name)
-        if isinstance(value, dict):
-            for label, item in value.items():
-                yield f"{name}.{label}", item
-        elif isinstance(value, list):
-            for index, item in enumerate(value):
-                yield f"{name}[{index}]", item
-        else:
-            yield name, value
+def _refusal(name: str, value: Any, least: int) -> Optional[Rejection]:
+    """None for finite floats, short texts and no counts below `least`, also in maps and lists."""
+    kind = type(value)  # much quicker than isinstance, and each state comes by here
+    if kind is int and value < least:
+        return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
+    if kind is float and not math.isfinite(value):
+        return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
+    if kind is str and len(value) > MAX_TEXT_CHARS:
+        return Rejection(Reason.MALFORMED, f"{name} is longer than {MAX_TEXT_CHARS} characters")
+    if kind is dict or kind is list:
+        for place, item in value.items() if kind is dict else enumerate(value):
+            refusal = _refusal(f"{name}.{place}", item, least)
+            if refusal is not None:
+                return refusal
+    return None

@@ -10,21 +10,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("hil_tests.doctor", "what this machine can and cannot do, and how to get the rest"),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "pictures": ("hil_tests.pictures:PICTURES_COMMAND", "every picture of the READMEs"),
-    "campaign": ("hil_tests.campaign:CAMPAIGN", "every fault, every latency row, one report"),
-    "mock_hunter": (
-        "hil_tests.mock_hunter.process",
-        "a Hunter on a CAN bus, with a switch for each fault",
-    ),
-    "vehicle": (
-        "hil_tests.campaign:VEHICLES",
-        "policy in the loop against vehicle in the loop, and the lag it may have",
-    ),
+    "campaign": ("hil_tests.campaign", "every fault, every latency row, one report"),
+    "envelope": ("hil_tests.envelope", "the smallest networks that break a policy"),
+    "mock_hunter": ("hil_tests.mock_hunter.process", "a Hunter on a CAN bus, with all its faults"),
+    "conformance": ("hil_tests.conformance", "a vehicle's driver against the rules that stop it"),
     "bench": ("hil_tests.bench_loop", "the loop against the least that could answer"),
-    "recording": (
-        "hil_tests.pictures:RECORDING_COMMAND",
-        "drive and record anew what the next release is replayed against",
-    ),
-    "board": ("hil_tests.board", "a bundle installed and driven on emulated boards; needs root"),
+    "obey": ("hil_tests.obey", "whether the edge runtime knows its link, and stops in time"),
+    "recording": ("hil_tests.pictures:RECORDING_COMMAND", "record what the next release replays"),
 }
 
 

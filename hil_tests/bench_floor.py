@@ -16,7 +16,7 @@ import onnxruntime
 import zenoh
 
 from edge_runtime.transport import open_session
-from edge_runtime.wire import DRIVE, FRAMES_SHAPE, Command, State, encode, key
+from edge_runtime.wire import DRIVE, Command, State, encode, key
 
 
 def main(policy: str, connect: str, vehicle_id: str) -> None:
@@ -30,7 +30,7 @@ def main(policy: str, connect: str, vehicle_id: str) -> None:
 
     def on_state(sample: zenoh.Sample) -> None:
         state = decode(bytes(sample.payload))
-        frames = np.frombuffer(state.frames, np.uint8).reshape(1, *FRAMES_SHAPE)
+        frames = np.frombuffer(state.observation["frames"], np.uint8).reshape(1, 2, 45, 80)
         (actions,) = network.run(["action"], {"frames": frames})
         command = Command(
             session=state.session, episode=state.episode, step=state.step, mode=DRIVE,

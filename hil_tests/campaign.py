@@ -1,41 +1,45 @@
-"""``python -m hil_tests campaign`` and ``vehicle``: reports of many drives.
+"""``python -m hil_tests campaign``: every fault, and every network of the axes, in one report.
 
-The first does every fault, and drives every network of the axes through real edge runtimes. The
-second says what the actuators of a vehicle cost and what they may cost: `compare` drives the same
-seeds in real time, once with the policy in the loop and once with a mock Hunter; `sweep` drives
-every lag of a table in virtual time.
+The report is JSON, and beside it Markdown for people, with tables and pictures.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from bridge.environments import CONDITIONS, NOMINAL
 from bridge.progress import ProgressBar
-from edge_runtime.cli import Command, add_public_key, examples, not_negative, positive, share
+from bridge.report import markdown_table
+from edge_runtime.cli import add_public_key, examples, not_negative, positive, share
+from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests import report, sweep
+from hil_tests import sweep
 from hil_tests.faults.run import choose_rows, run_faults
-from hil_tests.mock_hunter.hunter import make_parameters, read_changes
+from hil_tests.sweep import Found
 from trainer.options import add_scenario
+from trainer.pictures import write_figure
 from trainer.util import cores
 
-PART_EPISODES, LOOP_EPISODES = 50, 5
-"""Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the
-same time."""
-LONGEST_EPISODE_S = 60.0  # With the wait for a stand before it; the scenarios time out after 30 s
+PART_EPISODES = 50  # Of a network
 SHOWN_WRONG = 5
+COLUMNS = 3
+EXAMPLE = examples(
+    "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
+    "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
+)
 
 
-def _add_shared(
-    parser: argparse.ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
-) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
     parser.add_argument("--out", required=True, metavar="R.json", help=out)
     default = "policy file (default: results/policies/SCENARIO.onnx)"
@@ -43,14 +47,20 @@ def _add_shared(
     add_public_key(parser)
     add_scenario(parser)
     parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    parser.add_argument("--only", choices=parts, help="one part (default: both)")
     for name, kind, value, text in (
-        ("--runs", _several, runs, of_what),
+        ("--runs", _several, 100, "episodes of each row, the same seeds"),
         ("--seed", not_negative, 0, "of the first episode"),
-        ("--target", share, target, "success that is asked for"),
-        ("--jobs", not_negative, 0, "drives or faults side by side; 0: one a core"),
+        ("--target", share, 0.98, "success that is asked for"),
     ):
         parser.add_argument(name, type=kind, default=value, help=text)
+    only = "one part (default: both)"
+    parser.add_argument("--only", choices=("latency", "faults"), help=only)
+    jobs = "drives or faults side by side; 0: one a core"
+    parser.add_argument("--jobs", type=not_negative, default=0, help=jobs)
+    axes = ", ".join(axis.name for axis in sweep.NETWORK_AXES)
+    rows = f"only these latency axes ({axes}) and faults, by name or pattern (hunter_*)"
+    parser.add_argument("--rows", metavar="NAME,...", help=rows)
+    parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
 def _several(text: str) -> int:
@@ -60,19 +70,10 @@ def _several(text: str) -> int:
     return count
 
 
-def _add_campaign_arguments(parser: argparse.ArgumentParser) -> None:
-    runs_help = "episodes of each row, the same seeds"
-    _add_shared(parser, ("latency", "faults"), 100, runs_help, 0.98)
-    axes = ", ".join(axis.name for axis in sweep.NETWORK_AXES)
-    rows = f"only these latency axes ({axes}) and faults, by name or pattern (hunter_*)"
-    parser.add_argument("--rows", metavar="NAME,...", help=rows)
-    parser.add_argument("--tries", type=positive, default=10, help="of each fault")
-
-
-def _run_campaign(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
-    report.check_report(out)
+    check_report(out)
     axes, faults = _choose(arguments)
     jobs = arguments.jobs or cores()
     result: dict[str, Any] = {"command": _this_command()}
@@ -81,7 +82,7 @@ def _run_campaign(arguments: argparse.Namespace) -> int:
     if axes:
         latency = run_latency(_task(arguments), axes, arguments.target, jobs, out)
         result["latency"] = latency
-        text += ["## Latency", "", report.render_latency(latency)]
+        text += ["## Latency", "", render_latency(latency)]
         print(latency["budget"]["sentence"])
     if faults is not None:
         with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
@@ -90,13 +91,13 @@ def _run_campaign(arguments: argparse.Namespace) -> int:
                 lambda row: bar.advance({"row": row}), jobs, arguments.public_key,
             )  # fmt: skip
         result["faults"] = found
-        text += ["## Faults", "", report.render_faults(found)]
+        text += ["## Faults", "", render_faults(found)]
         for row in found["rows"]:
             for kind in ("wrong", "unsafe", "crashes"):
                 for what in row[kind][:SHOWN_WRONG]:
                     print(f"{row['name']}: {kind}: {what}")
         print("Every fault was met." if found["passed"] else "Not every fault was met.")
-    report.write_report(out, result, text)
+    write_report(out, result, text)
     return 0 if faults is None or result["faults"]["passed"] else 1
 
 
@@ -117,13 +118,13 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] 
     return axes, None if without_faults else faults
 
 
-def _task(arguments: argparse.Namespace, changes: dict[str, float] | None = None) -> sweep.Task:
+def _task(arguments: argparse.Namespace) -> sweep.Task:
     """UserError where the policy does not load; its signature is the edge runtime's to check."""
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
     return sweep.Task(
         policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
-        arguments.runs, arguments.public_key, changes or {},
+        arguments.runs, arguments.public_key,
     )  # fmt: skip
 
 
@@ -131,17 +132,13 @@ def _this_command() -> str:
     return "python -m hil_tests " + shlex.join(sys.argv[1:])
 
 
-def _rows_beside(out: Path) -> Path:
-    return out.with_name(f"{out.stem}_rows")
-
-
 def run_latency(
     task: sweep.Task, axes: Sequence[sweep.Axis], target: float, jobs: int, out: Path
 ) -> dict[str, Any]:
     """Drive every network of the axes; the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
-    drive, keep = sweep.drive_network, _rows_beside(out)
-    found = sweep.drive_all(task, specs, PART_EPISODES, drive, jobs, keep)
+    keep = out.with_name(f"{out.stem}_rows")
+    found = sweep.drive_all(task, specs, PART_EPISODES, sweep.drive_network, jobs, keep)
     rows = {spec: sweep.make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
     told = ("name", "title", "unit", "values", "specs")
@@ -153,95 +150,142 @@ def run_latency(
         "budget": sweep.budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
     }
-    return {**latency, "figures": report.write_figures(out, latency)}
+    return {**latency, "figures": write_figures(out, latency)}
 
 
-def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
-    runs_help = "episodes of each loop and of each lag"
-    _add_shared(parser, ("compare", "sweep"), 50, runs_help, 0.95)
-    rigs = "simulators in real time side by side, each with a vehicle of its own"
-    parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
-    mock = "a parameter of the mock Hunter, as in python -m hil_tests mock_hunter"
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=mock)
-    only = "only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)"
-    shape = "DEAD+CONSTANT,..."
-    parser.add_argument("--lags", type=_lags, default=sweep.LAGS, metavar=shape, help=only)
+def check_report(out: Path) -> None:
+    """Raise UserError now, before the long work, if `write_report` would fail after it."""
+    if out.suffix == ".md":
+        raise UserError(f"--out {out} is for the JSON; the Markdown is written beside it")
+    check_writable(out)
+    check_writable(out.with_suffix(".md"))
 
 
-def _lags(text: str) -> list[sweep.Lag]:
-    lags = []
-    for point in text.split(","):
-        dead, _, constant = point.partition("+")
-        if not (dead.isdecimal() and constant.isdecimal() and int(constant) > 0):
-            raise argparse.ArgumentTypeError(
-                f"{point!r} is no lag: write DEAD+CONSTANT in ms, as in 50+100"
+def write_report(out: Path, report: Found, lines: Sequence[str]) -> None:
+    """Write ``out`` and, with its ``lines``, the Markdown beside it; say where."""
+    write_json_out(out, report)
+    markdown = out.with_suffix(".md")
+    write_atomic(markdown, ("\n".join(lines).rstrip() + "\n").encode())
+    print(f"{out} and {markdown}")
+
+
+def render_faults(report: Found) -> str:
+    """A row for each fault; reaction and recovery as min / median / max over its tries."""
+    head = ("fault", "expected", "tries", "reaction, ms", "limit", "recovery, ms", "limit",
+            "verdict")  # fmt: skip
+    rows = []
+    for row in report["rows"]:
+        again = f" (+{row['disturbed']} again)" if row["disturbed"] else ""
+        rows.append((
+            row["done"], row["expected"], f"{row['tries']}{again}",
+            _numbers(row["reaction_ms"], 0), _number(row["reaction_limit_ms"], 0),
+            _numbers(row["recovery_ms"], 0), _number(row["recovery_limit_ms"], 0),
+            fault_verdict(row),
+        ))  # fmt: skip
+    end = (
+        f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
+        "over the whole campaign."
+    )
+    return "\n".join([*markdown_table(head, rows), end])
+
+
+def fault_verdict(row: Found) -> str:
+    """``met``, or what was not."""
+    late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
+    faults = [f"{count} {name} late" for name, count in late.items() if count]
+    faults += [f"{len(row[name])} {name}" for name in ("unsafe", "crashes", "wrong") if row[name]]
+    counted = sum(row["rejected"].values())
+    met = f"met, {counted:,} rejected and counted" if counted else "met"
+    return "MISSED: " + ", ".join(faults) if faults else met
+
+
+Cells = Mapping[str, Callable[[Found], str]]  # What is said of something, and how it is read
+_OF_A_ROW: Cells = {
+    "episodes": lambda row: str(row["episodes"]),
+    "success (95 %)": lambda row: _share(row["success"]),
+    "collisions": lambda row: f"{row['collision_rate']:.0%}",
+    "surviving distance, m (95 %)": lambda row: _interval(row["surviving_distance_m"]),
+    "time, s": lambda row: f"{row['episode_time_s']:.2f}",
+    "latency p50 / p99, ms": lambda row: _numbers(row["latency_ms"], 1),
+    "safe stops an episode": lambda row: f"{row['safe_stops_per_episode']:.2f}",
+    "ticks without a new command": lambda row: f"{row['ticks_without_new_command']:.0%}",
+}
+
+
+def render_latency(latency: Found) -> str:
+    """The budget's sentence, pictures, and a table for each axis."""
+    lines = [
+        latency["budget"]["sentence"],
+        "",
+        "A limit is the largest tested value up to which, at every tested value, the share of "
+        f"successes over {latency['runs']} episodes (the same seeds in every row) is at the "
+        f"target; nothing is interpolated. Clock: {latency['clock']}, "
+        f"{latency['faster_than_real_time']:.1f} times real time in each worker, the start of "
+        "each simulator included.",
+        "",
+        *(f"![{name}]({path})\n" for name, path in latency["figures"].items()),
+    ]
+    for axis in latency["axes"]:
+        rows = [
+            (
+                f"{value:g} {axis['unit']}",
+                *(tell(latency["rows"][spec]) for tell in _OF_A_ROW.values()),
             )
-        lags.append(sweep.Lag(int(dead), int(constant)))
-    return list(dict.fromkeys(lags))
+            for value, spec in zip(axis["values"], axis["specs"], strict=True)
+        ]
+        title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
+        lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
+    return "\n".join(lines)
 
 
-def _run_vehicle(arguments: argparse.Namespace) -> int:
-    """Run the parts; 0, or 1 where the vehicle in the loop is below the target."""
-    out, target, holds = Path(arguments.out), arguments.target, True
-    report.check_report(out)
-    task = _task(arguments, read_changes(arguments.set))
-    make_parameters(sweep.MODEL, task.changes)  # refuses what the mock does not know
-    result: dict[str, Any] = {"command": _this_command(), "policy_id": task.policy_id}
-    title = f"# Vehicle in the loop: {task.policy.name}, {arguments.scenario}"
-    text = [title, "", f"`{_this_command()}`"]
-    if arguments.only != "sweep":
-        result["comparison"] = found = run_comparison(task, target, arguments.rigs, out)
-        text += ["", "## In real time", "", report.render_comparison(found)]
-        print(report.comparison_verdict(found))
-        holds = found["holds"]
-    if arguments.only != "compare":
-        jobs, keep, drive = arguments.jobs or cores(), _rows_beside(out), sweep.drive_lag
-        parts = sweep.drive_all(task, arguments.lags, task.runs, drive, jobs, keep, processes=True)
-        rows = {lag.spec: row for lag, (row,) in parts.items()}
-        lag_budget = sweep.lag_budget(list(rows.values()), target)
-        found = {**task.facts(), "mock": task.changes, "rows": rows, "lag_budget": lag_budget}
-        result["sweep"] = found
-        text += ["", "## Lag, in virtual time", "", report.render_sweep(found)]
-        print(report.lag_sentence(found))
-    report.write_report(out, result, text)
-    return 0 if holds else 1
+def _share(estimate: Mapping[str, float]) -> str:
+    """As in "95 % (83 to 99)"."""
+    return f"{estimate['value']:.0%} ({estimate['low']:.0%} to {estimate['high']:.0%})"
 
 
-def drive_loop(task: sweep.Task, part: sweep.Part) -> list[dict[str, Any]]:
-    """Drive a part in real time from a stand, with or without a mock Hunter in the loop."""
-    options = ("--clock", "realtime", "--loop", part.point, "--standing")
-    limit_s = LONGEST_EPISODE_S * (1 + part.runs)
-    driven = sweep.run_rig(task, part, limit_s, *options, hunter=part.point == sweep.VEHICLE)
-    return [sweep.worth_keeping(driven)]
+def _interval(estimate: Mapping[str, float]) -> str:
+    value, low, high = (f"{estimate[name]:.2f}" for name in ("value", "low", "high"))
+    return f"{value} ({low} to {high})"
 
 
-def run_comparison(task: sweep.Task, target: float, rigs: int, out: Path) -> dict[str, Any]:
-    """Drive both loops, ``rigs`` at a time; the report's part ``comparison``."""
-    found = sweep.drive_all(task, sweep.LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
-    rows = {loop: sweep.make_row(loop, parts) for loop, parts in found.items()}
-    return {
-        **task.facts(),
-        "mock": task.changes,
-        "rows": rows,
-        "cost": sweep.cost(rows[sweep.POLICY]["per_episode"], rows[sweep.VEHICLE]["per_episode"]),
-        "target_success": target,
-        "holds": rows[sweep.VEHICLE]["success"]["value"] >= target,
-    }
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
-CAMPAIGN = Command(
-    examples(
-        "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
-        "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
-    ),
-    _add_campaign_arguments,
-    _run_campaign,
-)
-VEHICLES = Command(
-    examples(
-        "python -m hil_tests vehicle --out runs/vehicle.json",
-        "python -m hil_tests vehicle --only sweep --lags 50+100,200+300 --out runs/lags.json",
-    ),
-    _add_vehicle_arguments,
-    _run_vehicle,
-)
+def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
+    return " / ".join(_number(value, digits) for value in found.values()) if found else "-"
+
+
+def write_figures(out: Path, swept: Found) -> dict[str, str]:
+    """Write a PNG beside ``out``, with a panel for each axis of a report's part; its name."""
+    name = f"{out.stem}_success.png"
+    write_figure(_draw_axes(swept), out.with_name(name))
+    return {"success": name}
+
+
+def _draw_axes(swept: Found) -> Figure:
+    axes, name = swept["axes"], Path(swept["policy"]).stem
+    rows, columns = math.ceil(len(axes) / COLUMNS), min(COLUMNS, len(axes))
+    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
+    for panel, axis in zip(panels, axes, strict=False):
+        values = axis["values"]
+        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
+        panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5, label=name)
+        low, high = ([each[end] for each in estimates] for end in ("low", "high"))
+        panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
+        panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
+        panel.grid(alpha=0.3)
+        target = swept["budget"]["target_success"]
+        panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
+        panel.set_ylim(-0.03, 1.03)
+    for panel in panels[len(axes) :]:
+        panel.set_visible(False)
+    figure.supylabel("success")
+    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
+    handles, title = (
+        figure.axes[0].get_legend_handles_labels(),
+        f"{drives}; bands: Wilson's 95 % interval",
+    )
+    figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
+    return figure

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,11 @@ GOOD_SUCCESS = 0.8  # What the drives without latency should reach
 FIRST_SEED = 0
 RECORDED_RUNS = 2
 TRAINING_STEPS = 1500
-HUMAN_MINUTES = 1.5
-"""With them, a demo takes eight at most, on a slow machine, too."""
+HUMAN_MINUTES = 1.5  # With them, a demo takes eight at most, on a slow machine, too
 TRAINING_MINUTES = 4.5
 
 EXAMPLE = examples(
-    "python -m hil_tests demo",
-    "python -m hil_tests demo --fresh --minutes 10 --out runs/demo",
+    "python -m hil_tests demo", "python -m hil_tests demo --fresh --minutes 10 --out runs/demo"
 )
 
 
@@ -61,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     began_s = time.monotonic()
     demo = Demo(Path(arguments.out), arguments.runs)
     demo.claim_directory()
-    if arguments.fresh or not demo.offer_kept():
+    if arguments.fresh or not demo.has_kept():
         demo.train(arguments)
     demo.drive()
     demo.record()
@@ -103,21 +100,15 @@ class Demo:
         except OSError as error:
             raise UserError(f"--out {self.directory}: {error.strerror}") from None
 
-    def offer_kept(self) -> bool:
-        """Whether a trained policy is there and the person (if one is asked) wants it."""
+    def has_kept(self) -> bool:
+        """Whether a trained policy with its signature is there; says that it is used."""
         signature = Path(f"{self.policy}.sig")
         if not all(path.exists() for path in (self.policy, signature, self.public_key)):
             return False
         made = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.policy.stat().st_mtime))
         print(f"A policy trained by an earlier demo ({made}) is kept in {self.directory}/.")
-        if not sys.stdin.isatty():
-            print("Using it; --fresh trains anew.")
-            return True
-        try:
-            answer = input("Use it? [Y/n] ")
-        except EOFError:  # ^D: nothing said, and nothing thrown away for it
-            answer = ""
-        return answer.strip().lower() in ("", "y", "yes")
+        print("Using it; --fresh trains anew.")
+        return True
 
     def train(self, arguments: argparse.Namespace) -> None:
         """Human model, PHIL-TD3 with its guidance, export with signature."""

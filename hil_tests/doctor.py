@@ -12,7 +12,6 @@ import os
 import platform
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -38,8 +37,6 @@ DISK_GB = 2
 """A training run with its checkpoint takes some 0.5 GB, recordings and pictures come on top."""
 MEMORY_GB = 2  # A full replay buffer and torch take 1.2 GB.
 ARRIVAL_S = 5.0
-LOOPBACK = "127.0.0.1"
-_CAN_DEVICE = "280"  # ARPHRD_CAN of linux/if_arp.h.
 _KERNEL = """
 import os, sys, torch
 from trainer.learner.kernel import load
@@ -199,7 +196,8 @@ def _installed(name: str) -> str | None:
 
 
 def _loopback() -> str:
-    from edge_runtime.transport import free_endpoint, open_session
+    from edge_runtime.reach import free_endpoint
+    from edge_runtime.transport import open_session
 
     came = threading.Event()
     endpoint = free_endpoint()
@@ -233,32 +231,6 @@ def _enough(size: int, wanted_gb: int, what: str) -> str:
     return said
 
 
-def _chromium() -> str:
-    from trainer.util import CHROMIUM, find_chromium
-
-    if (path := find_chromium()) is None:
-        raise UserError(f"none of {', '.join(CHROMIUM)} is installed")
-    return program_says(path, "--version")
-
-
-def _viewer() -> str:
-    from hil_tests.processes import headless_viewer
-
-    with headless_viewer() as client:
-        picture = client.take_screenshot()
-    return f"came up and drew a picture of {len(picture) / 1000:.0f} kB"
-
-
-def port(number: int) -> str:
-    """Listen on a port of loopback."""
-    with socket.socket() as listener:
-        # As a server does: links of one that has just ended are no bar.
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((LOOPBACK, number))
-        listener.listen()
-    return f"{LOOPBACK}:{number} is free"
-
-
 def _can_over_udp() -> str:
     import can
 
@@ -274,36 +246,11 @@ def _can_over_udp() -> str:
     return "a frame went through UDP multicast on loopback"
 
 
-def _can_interface() -> str:
-    socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()  # the kernel has them
-    kinds = {path.parent.name: path.read_text() for path in Path("/sys/class/net").glob("*/type")}
-    found = sorted(name for name, kind in kinds.items() if kind.strip() == _CAN_DEVICE)
-    if not found:
-        raise UserError("there is no CAN interface")
-    return ", ".join(found)
-
-
-def _virtual_can() -> str:
-    # In a network namespace, which goes with the command.
-    mine = () if os.geteuid() == 0 else ("--user", "--map-root-user")
-    words = ("ip", "link", "add", "dev", "doctor0", "type", "vcan")
-    program_says("unshare", *mine, "--net", *words)
-    return "a vcan device could be made"
-
-
 def _realtime_priority() -> str:
     # The thread keeps the priority to itself, and ends with it.
     with ThreadPoolExecutor(1) as thread:
         thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
     return "SCHED_FIFO was given to a thread"
-
-
-def _board(name: str) -> str:
-    from hil_tests.board import why_not
-
-    if reason := why_not(name):
-        raise UserError(reason)
-    return f"hil_tests board --boards {name} can run"
 
 
 def python_says(script: str) -> str:
@@ -357,42 +304,11 @@ CHECKS = (
     Check("person", "gamepad or wheel", partial(python_says, _CONTROLLERS),
           "no `--human gamepad`, no `--human wheel`",
           "plug one in; if it is: the right to read /dev/input/* (group input)"),
-    Check("person", "Xvfb", partial(program_says, "Xvfb", "-help"),
-          "tests and pictures of the window skip", "apt install xvfb"),
-    Check("person", "xdotool", partial(program_says, "xdotool", "--version"),
-          "tests that press real keys skip", "apt install xdotool"),
-    Check("person", "Chromium", _chromium,
-          "tests of the browser cockpit skip, no picture of it",
-          "apt install chromium; any browser shows the cockpit"),
-    Check("seeing", "rerun's viewer", _viewer,
-          "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
-          "a graphics card with Vulkan, or apt install mesa-vulkan-drivers"),
-    Check("ports", "7447", partial(port, 7447),
-          "no `bridge simulate`, no `bridge router` without options",
-          "end who listens there, or give --listen and --connect another port"),
-    Check("ports", "7448", partial(port, 7448), "no `bridge ros2` without options",
-          "end who listens there, or give --ros2-listen another port"),
-    *(Check("ports", str(number), partial(port, number), "no --serve, no --spawn",
-            "end the other rerun") for number in (9876, 9090)),
     Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
           "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
-    Check("vehicle", "CAN interface", _can_interface,
-          "no `edge_runtime run --bus socketcan:can0`",
-          "a CAN adapter: `ip link set can0 up type can bitrate 500000`"),
-    Check("vehicle", "virtual CAN", _virtual_can,
-          "no `--bus socketcan:vcan0`; udp_multicast does it",
-          "root, and `modprobe vcan`: `ip link add vcan0 type vcan`"),
     Check("vehicle", "real-time priority", _realtime_priority,
           "`edge_runtime run`, but a busy machine may make its commands late",
           "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)"),
-    Check("board", "ssh", partial(program_says, "ssh", "-V"), "no `deploy push`",
-          "apt install openssh-client"),
-    Check("board", "aarch64", partial(_board, "aarch64"),
-          "no `hil_tests board --boards aarch64`",
-          "root, apt install debootstrap qemu-user-static qemu-system-arm qemu-utils"),
-    Check("board", "Python 3.8", partial(_board, "python38"),
-          "no `hil_tests board --boards python38`",
-          "root, and a python3.8 (pyenv install 3.8)"),
 )  # fmt: skip
 """In the order of the output. Nothing much works without the basics."""
 GROUPS = tuple(dict.fromkeys(check.group for check in CHECKS))

@@ -8,40 +8,42 @@ edge runtime must go into safe stop, and drive again after five states.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shutil
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from bridge.recording import Recording
+from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
 from edge_runtime.cli import Command, examples
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.transport import free_endpoint
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, read_bytes, read_json
+from hil_tests.campaign import write_figures
 from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
     Process,
     drive_shown,
-    headless_viewer,
     run_command,
     wait_until,
 )
-from hil_tests.report import write_figures, write_png
-from trainer.drivers import load_driver, make_environment
+from trainer.drivers import load_driver
+from trainer.environments import make_environment
+from trainer.pictures import write_figure
 from trainer.training.metrics import read_metrics
 
 MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}  # Scenario -> seed and time, s
-FILM_POLICY, FILM_SEED = "constant:0.3", "40"
-"""Always the same throttle, and a drive in which it would meet a car, once: the guide brakes, hands
-the wheel back when the car stands, and the next gap is wide enough."""
 SHIPPED = Path("results/latency/left_turn/shipped.json")
+WINDOW = "1400x900"
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
 TRAINING = ("--episodes", "40", "--seed", "1", "--set", "batch_size=32",
@@ -90,14 +92,10 @@ def _run_pictures(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _by_command(*words: str) -> Make:
-    return lambda out, _work: run_command(*words, "--out", str(out))
-
-
 def _from_above(scenario: str) -> Make:
     seed, time_s = MOMENTS[scenario]
-    moment = ("--scenario", scenario, "--seed", seed, "--time", time_s)
-    return _by_command("trainer", "picture", "expert", *moment)
+    words = ("trainer", "picture", "expert", "--scenario", scenario, "--seed", seed)
+    return lambda out, _work: run_command(*words, "--time", time_s, "--out", str(out))
 
 
 def policy_sees(out: Path, _work: Path) -> None:
@@ -115,7 +113,7 @@ def policy_sees(out: Path, _work: Path) -> None:
             panel.imshow(np.asarray(frame), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
             panel.set_title(f"{scenario.replace('_', ' ')}, {when}: 80 x 45 pixels", fontsize=10)
             panel.set_axis_off()
-    write_png(out, figure)
+    write_figure(figure, out)
 
 
 def success_against_latency(out: Path, work: Path) -> None:
@@ -160,14 +158,31 @@ def screenshot(rrd: Path, timeline: str, **moment: float) -> bytes:
         return picture
 
 
+@contextlib.contextmanager
+def headless_viewer() -> Iterator[Any]:
+    """Rerun's viewer without a screen, as a ``ViewerClient`` that asks it for pictures.
+
+    Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
+    Raises UserError where it does not start here, or ends as soon as it is to draw.
+    """
+    from rerun.experimental import ViewerClient
+
+    port = free_port()
+    options = ["--headless", "--hide-welcome-screen", "--window-size", WINDOW]
+    with contextlib.ExitStack() as stack:
+        try:
+            viewer = Viewer([*options, "--port", str(port)], [port])
+            stack.callback(viewer.end)
+            yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        except (ConnectionError, ViewerGone) as error:
+            needs = "it needs Vulkan, in software with apt install mesa-vulkan-drivers"
+            raise UserError(f"rerun's viewer does not draw here ({error}): {needs}") from None
+
+
 PICTURES: dict[str, Make] = {
     "left_turn.png": _from_above("left_turn"),
     "congestion.png": _from_above("congestion"),
     "policy_sees.png": policy_sees,
-    # The same throttle throughout, and the scripted expert brakes for a car.
-    "take_over.gif": _by_command(
-        "trainer", "picture", FILM_POLICY, "--human", "expert", "--seed", FILM_SEED, "--time", "15"
-    ),
     # In the middle of a take-over; needs Chromium.
     "cockpit.png": lambda out, _work: run_command(
         "trainer.person.tests.browser", "--picture", str(out)
@@ -236,7 +251,7 @@ def _wait_for_simulators(out: Path, count: int) -> None:
 PICTURES_COMMAND = Command(
     examples(
         "python -m hil_tests pictures --out docs",
-        "python -m hil_tests pictures take_over.gif rerun.png --out runs",
+        "python -m hil_tests pictures cockpit.png rerun.png --out runs",
     ),
     _add_pictures_arguments,
     _run_pictures,

@@ -1,4 +1,4 @@
-"""The repository's own commands as processes, the operator beside a drive, rerun's viewer.
+"""The repository's own commands as processes, and the operator beside a drive.
 
 `run_command` is what a person types; `Process` runs beside us, says why it failed, and stamps every
 line that it prints.
@@ -7,7 +7,6 @@ line that it prints.
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import shlex
 import signal
@@ -16,13 +15,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from edge_runtime.commands import ask
-from edge_runtime.transport import free_endpoint
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 
 Item = TypeVar("Item")
@@ -33,9 +31,6 @@ PATIENCE_S = 30.0
 STOP_TIMEOUT_S = 10.0
 POLL_S = 0.002
 OPERATOR_LOOKS_EVERY_S = 0.5
-VIEWER_SIZE = "1400x900"
-VIEWER_START_S, VIEWER_LOOK_S = 60.0, 0.5
-VIEWER_NEEDS = "it needs Vulkan, in software with apt install mesa-vulkan-drivers"
 _LAST_WORDS_S = 1.0
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
 
@@ -249,41 +244,24 @@ def in_parallel(
     items: Sequence[Item],
     jobs: int,
     on_done: Callable[[Item, Result], None],
-    processes: bool = False,
 ) -> None:
     """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
 
-    In threads, which suits work that waits for processes, or in processes. After a failure, and on
-    ^C, what has not begun is not begun any more, and every process that this one has started is
-    asked to end. Raises UserError where a worker process died.
+    In threads, which suits work that waits for processes. After a failure, and on ^C, what has not
+    begun is not begun any more, and every process that this one has started is asked to end.
     """
-    jobs = min(jobs, len(items)) or 1
-    pool: Executor = ThreadPoolExecutor(jobs)
-    if processes:
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(jobs, context, initializer=_follow_the_parent)
-    with pool:
+    with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
         futures = {pool.submit(work, item): item for item in items}
         try:
             for future in as_completed(futures):
                 on_done(futures[future], future.result())
-        except BaseException as error:
+        except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for children in Path("/proc/self/task").glob("*/children"):  # whichever thread waits
                 for child in children.read_text().split():
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(int(child), signal.SIGTERM)
-            if isinstance(error, BrokenProcessPool):
-                raise UserError("a worker process died; use fewer --jobs") from error
             raise
-
-
-def _follow_the_parent() -> None:
-    """Leave ^C to the parent, and end where it is killed."""
-    from trainer.util import die_with_parent
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
@@ -294,46 +272,6 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
             return value
         time.sleep(POLL_S)
     raise TimeoutError(f"not within {timeout_s:g} s: {what}")
-
-
-@contextlib.contextmanager
-def headless_viewer() -> Iterator[Any]:
-    """Rerun's viewer without a screen, as a ``ViewerClient`` that asks it for pictures.
-
-    Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
-    Raises UserError where it does not start here, or ends as soon as it is to draw.
-    """
-    host, _, port = free_endpoint().removeprefix("tcp/").rpartition(":")
-    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--bind", host, "--port", port, "--window-size", VIEWER_SIZE]
-    # A group of its own: the module starts the real viewer as a child, which must end with it.
-    viewer = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    try:
-        yield _connect_viewer(viewer, f"rerun+http://{host}:{port}/proxy")
-    except ConnectionError as error:
-        raise UserError(f"rerun's viewer ends as it draws ({error}): {VIEWER_NEEDS}") from None
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(viewer.pid, signal.SIGTERM)
-        viewer.wait()
-
-
-def _connect_viewer(viewer: subprocess.Popen[bytes], url: str) -> Any:
-    from rerun.experimental import ViewerClient
-
-    give_up_s = time.monotonic() + VIEWER_START_S
-    while True:
-        try:
-            client = ViewerClient.connect(url)
-            client.get_state()
-            return client
-        except Exception as error:
-            if viewer.poll() is not None or time.monotonic() > give_up_s:
-                said = f"rerun's viewer does not start here ({error}): {VIEWER_NEEDS}"
-                raise UserError(said) from None
-            time.sleep(VIEWER_LOOK_S)
 
 
 def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:

@@ -1,0 +1,32 @@
+"""Trains policies with human guidance. The commands are ``python -m trainer``; in Python it is::
+
+    from trainer import train, evaluate, export
+
+    run = train("my_pkg:MyEnv-v0", algorithm="phil_td3", human="web", episodes=100)
+    print(evaluate(run, runs=50).success_rate)
+    export(run, "my.onnx", key="keys/policy.key")
+
+Nothing is imported before it is asked for: torch takes two seconds.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trainer.evaluation import Evaluation, evaluate
+    from trainer.policy_file import Export, export
+    from trainer.training.command import Run, train
+
+__all__ = ["Evaluation", "Export", "Run", "evaluate", "export", "train"]
+_PLACES = {
+    "trainer.training.command": ("Run", "train"),
+    "trainer.evaluation": ("Evaluation", "evaluate"),
+    "trainer.policy_file": ("Export", "export"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _PLACES.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Measure learner, environments and training, beside Stable-Baselines3 and highway-env.
+"""Measure learner, environments and training, the learner beside Stable-Baselines3's.
 
 Contenders take turns within one run, so that the machine's noise hits all of them alike.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,32 +15,26 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import gymnasium
 import numpy as np
 import torch
-from highway_env.envs.common.observation import GrayscaleObservation
 from numpy.typing import NDArray
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from torch import nn
 
 from bridge.progress import ProgressBar
+from bridge.report import markdown_table
 from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_json_out
-from trainer.drivers import make_environment
-from trainer.export import real_observations
+from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 from trainer.options import add_threads, set_threads
+from trainer.policy_file import real_observations
 from trainer.scenarios import SCENARIOS
-from trainer.scenarios.picture import COLUMNS, ROWS
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -51,11 +44,9 @@ EXAMPLE = examples(
     "python -m trainer bench --quick --threads 1",
     "python -m trainer bench --threads 2 --out b.json",
 )
-OURS, FLOAT32, SB3, HIGHWAY = "ours", "ours_float32", "stable_baselines3", "highway_env_grayscale"
-PEERS = {FLOAT32: "the same in float32", SB3: "Stable-Baselines3 TD3",
-         HIGHWAY: "highway-env grayscale"}  # fmt: skip
-BARS = {"learner": (SB3, 4.0), "left_turn": (HIGHWAY, 10.0), "congestion": (HIGHWAY, 8.0)}
-"""Ours is to be at least so many times as fast as this peer."""
+OURS, FLOAT32, SB3 = "ours", "ours_float32", "stable_baselines3"
+PEERS = {FLOAT32: "the same in float32", SB3: "Stable-Baselines3 TD3"}
+BAR = 4.0  # Ours is to be at least so many times as fast as Stable-Baselines3's
 TRANSITIONS = 1000
 """In each learner's buffer, not the paper's 100,000: drawing from a full one costs no more."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
@@ -183,27 +174,17 @@ def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, 
     return {name: of(ours), "peers": peers}
 
 
-def driving(step: Callable[[NDArray[np.float32]], bool], reset: Callable[..., Any]) -> Work:
-    """Random actions, episode after episode: ``step`` takes one, [1], and says whether it ended."""
-    random, seeds = np.random.default_rng(0), count()  # All contenders drive the same episodes.
-    reset(seed=next(seeds))
+def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, Any]:
+    """The scenario's steps a second, with observation: random actions, episode after episode."""
+    env, random, seeds = make_environment(scenario), np.random.default_rng(0), count()
+    env.reset(seed=next(seeds))
 
     def drive() -> None:
-        if step(random.uniform(-1, 1, 1).astype(np.float32)):
-            reset(seed=next(seeds))
+        _, _, terminated, truncated, _ = env.step(random.uniform(-1, 1, 1).astype(np.float32))
+        if terminated or truncated:
+            env.reset(seed=next(seeds))
 
-    return drive
-
-
-def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, Any]:
-    """The scenario's steps a second with observation, and those of highway-env's picture of it."""
-    env, picture = make_environment(scenario), HighwayPicture(make_environment(scenario))
-    check_varies(picture)
-    contenders = {
-        OURS: driving(lambda action: any(env.step(action)[2:4]), env.reset),
-        HIGHWAY: driving(lambda action: picture.step(action)[1], picture.reset),
-    }
-    times = take_turns(contenders, effort.rounds, effort.steps_per_round, tick)
+    times = take_turns({OURS: drive}, effort.rounds, effort.steps_per_round, tick)
     return figures(times, "steps_per_s", lambda seconds: 1.0 / seconds)
 
 
@@ -236,32 +217,23 @@ def training_figures(episodes: Sequence[EpisodeMetrics], whole_s: float) -> dict
 def show(report: dict[str, Any]) -> None:
     """Print the table to stdout."""
     machine = report["machine"]
-    title = f"{machine['processor']}, {machine['cores']} cores, threads: {report['threads']}"
-    table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    for name in ("what", "ours", "peer", "ratio", "bar"):
-        number = name in ("ours", "ratio")
-        table.add_column(name, no_wrap=number, justify="right" if number else "left")
-    for row in rows(report):
-        table.add_row(*row)
-    width = None if sys.stdout.isatty() else 120  # a file has none; rich would fold at 80
-    Console(markup=False, highlight=False, width=width).print(table)
+    print(f"{machine['processor']}, {machine['cores']} cores, threads: {report['threads']}\n")
+    print("\n".join(markdown_table(("what", "ours", "peer", "ratio", "bar"), rows(report))))
 
 
 def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """The lines of what was measured: ours beside each peer's, and whether the bar is met."""
     learner, seconds = report["learner"], report["training"]["s_per_10k_steps"]
-    what = f"PHIL-TD3 update, batch {learner['batch_size']}, ms"
-    measured = [("learner", what, learner, "ms_per_update")]
+    what, ours = f"PHIL-TD3 update, batch {learner['batch_size']}, ms", learner["ms_per_update"]
+    for peer, its in learner["peers"].items():
+        verdict = "met" if its["ratio"] >= BAR else "MISSED"
+        bar = f"≥ {BAR:g}  {verdict}" if peer == SB3 else ""
+        theirs = f"{its['ms_per_update']:.1f}  {PEERS[peer]}"
+        yield what, f"{ours:.1f}", theirs, f"{its['ratio']:.2f}", bar
+    if SB3 not in learner["peers"]:
+        yield what, f"{ours:.1f}", f"{PEERS[SB3]} is not installed", "", ""
     for name, found in report["environment"].items():
-        measured.append((name, f"{name} with observation, steps/s", found, "steps_per_s"))
-    for name, text, found, key in measured:
-        (rival, least), ours = BARS[name], f"{found[key]:.1f}"
-        for peer, its in found["peers"].items():
-            verdict = "met" if its["ratio"] >= least else "MISSED"
-            bar = f"≥ {least:g}  {verdict}" if peer == rival else ""
-            yield text, ours, f"{its[key]:.1f}  {PEERS[peer]}", f"{its['ratio']:.2f}", bar
-        if rival not in found["peers"]:
-            yield text, ours, f"{PEERS[rival]} is not installed", "", ""
+        yield f"{name} with observation, steps/s", f"{found['steps_per_s']:.1f}"
     yield "training, s per 10,000 steps", f"{seconds['total']:.1f}"
     yield from ((f"  of it {name}", f"{seconds[name]:.1f}") for name in PARTS)
 
@@ -330,69 +302,3 @@ def make_sb3_model(experience: Experience) -> Any:
         action, reward = experience.actions[i, None], experience.rewards[i, None]
         model.replay_buffer.add(before, after, action, reward, np.zeros(1), [{}])
     return model
-
-
-class HighwayPicture:
-    """A scenario of ours whose frames highway-env's GrayscaleObservation draws.
-
-    All else is the scenario's. Left out, in highway-env's favour: its own traffic step, and a new
-    viewer at each reset. The environment has no wrappers, and must not be used elsewhere.
-    """
-
-    action_type = observation_type = None
-    """As much of a highway-env environment as its viewer looks at, with ``config`` and ``road``."""
-
-    def __init__(self, env: Any) -> None:
-        self.env = env
-        env._frame = lambda ego, cars: 0
-        self.config = {
-            "scaling": 1.0 / env.rasteriser.metres_per_pixel, "centering_position": [0.5, 0.5],
-            "render_agent": True, "simulation_frequency": 10, "offscreen_rendering": True,
-        }  # fmt: skip
-        env.reset(seed=0)
-        # SDL's "dummy" driver exists on every machine and needs no screen; but highway-env's
-        # viewer takes it for a wish not to draw at all.
-        with patch.dict(os.environ, {"SDL_VIDEODRIVER": "dummy"}):
-            grey = [0.2989, 0.5870, 0.1140]  # of red, green and blue, as its documentation has it
-            shape = (COLUMNS, ROWS)
-            self._drawn = GrayscaleObservation(self, shape, stack_size=2, weights=grey)
-        self._drawn.viewer.enabled = True
-
-    def reset(self, *, seed: int) -> NDArray[np.uint8]:
-        """Start an episode: the observation, uint8 [2, 80, 45] (highway-env has columns first)."""
-        self.env.reset(seed=seed)
-        self._drawn.obs[:] = self.observe()[-1]
-        return self._drawn.obs.copy()
-
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.uint8], bool]:
-        """One control interval: the observation, and whether the episode ended."""
-        _, _, terminated, truncated, _ = self.env.step(action)
-        return self.observe(), terminated or truncated
-
-    def observe(self) -> NDArray[np.uint8]:
-        """Draw what our rasteriser looks at."""
-        view = self.env.rasteriser
-        middle_m = self.env.view_corner_m + view.metres_per_pixel * np.array([COLUMNS, ROWS]) / 2
-        self._drawn.observer_vehicle = SimpleNamespace(position=middle_m)
-        return self._drawn.observe()
-
-    @property
-    def road(self) -> Any:
-        """Our road, with the ego car among the others: ours stands outside ``road.vehicles``."""
-        cars, network = [*self.env.traffic, self.env.ego], self.env.road.network
-        return SimpleNamespace(network=network, vehicles=cars, objects=[], record_history=False)
-
-
-def check_varies(picture: HighwayPicture) -> None:
-    """Drive one episode and look at every observation.
-
-    Raises:
-        RuntimeError: they are all alike. A viewer of highway-env 1.12 that is not enabled draws
-            nothing, without a warning, and would look fast.
-    """
-    first, moves, ended = picture.reset(seed=0), False, False
-    while not ended:
-        observation, ended = picture.step(np.zeros(1, np.float32))
-        moves = moves or not np.array_equal(observation[-1], first[-1])
-    if not (moves and first.min() < first.max()):
-        raise RuntimeError("highway-env draws the same picture all over: the figures are void")

@@ -1,120 +1,60 @@
-"""What can drive and what is driven: actions, test conditions, experts, and policies by name.
+"""What can drive, by its name.
 
-A name is the word expert, ``constant:ACTION``, an exported policy, a training run or a human model.
+A name is the word expert, ``module:Class`` of one, ``constant:ACTION``, an exported policy, a
+training run or a human model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import gymnasium
 import numpy as np
-import torch
 
-from edge_runtime.policy import Action as ActionEntry
+from bridge.network import parse_spec
+from edge_runtime.controller import limit_action, neutral_action, shared_limits
 from edge_runtime.util import UserError
-from trainer.human.congestion import CongestionExpert, CongestionTrigger
-from trainer.human.guide import Action, Driver, Observation, Trigger
-from trainer.human.left_turn import LeftTurnExpert, LeftTurnTrigger
+from trainer.environments import entries_of, expert_of, inner, make_environment, task_of
+from trainer.human.guide import Action, Driver, Observation
 from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.learner.networks import Actor
-from trainer.scenarios import SCENARIOS
-from trainer.scenarios.congestion import CongestionConfig
-from trainer.scenarios.environment import Scene
+from trainer.training.delayed import DelayAware
 from trainer.util import load_torch
 
-ACTIONS = {
-    "left_turn": ActionEntry(
-        name="pedal",
-        meaning="positive opens the throttle, negative brakes",
-        unit="aperture",
-        low=-1.0,
-        high=1.0,
-    ),
-    "congestion": ActionEntry(
-        name="steering",
-        meaning="positive turns right, negative left (eq. 29)",
-        unit=f"share of the front wheels' {CongestionConfig().lambda_rad:g} rad",
-        low=-1.0,
-        high=1.0,
-    ),
-}
-"""Scenario -> what its action means to a vehicle."""
-COMMAND_NOISE = 0.05 * 2.0
-"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 CONSTANT = "constant:"
 """Before an action that is kept throughout: what any policy should be better than."""
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
-EXPERTS: dict[str, Callable[[Any], Driver]] = {
-    "left_turn": LeftTurnExpert,
-    "congestion": CongestionExpert,
-}
-"""Scenario -> its scripted expert, made from the environment."""
-TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
-    "left_turn": LeftTurnTrigger,
-    "congestion": CongestionTrigger,
-}
-"""Scenario -> when a person would take over, made from that expert."""
-
-
-ActTogether = Callable[[Observation], Action]
-"""Many actions for many observations."""
-
-
-class Condition(NamedTuple):
-    """How test episodes are driven."""
-
-    scene: Scene
-    noise_std: float
-    """Standard deviation of the Gaussian noise on the command."""
-    meaning: str
-
-
-CONDITIONS = {
-    "nominal": Condition("nominal", 0.0, "the scene that is trained in"),
-    "noise": Condition(
-        "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
-    ),
-    "variant": Condition("variant", 0.0, "more vehicles, and other types of them"),
-    "dense": Condition("dense", 0.0, "closer and less even traffic"),
-}
-"""Only the first is trained and validated in."""
+ActTogether = Callable[[Observation], Action]  # Many actions for many observations
 
 
 class TogetherDriver(Driver):
     """Drives without a memory, one picture at a time or many at once.
 
-    ``act_together`` gives actions float32 [n, action size] for observations [n, 2, 45, 80].
+    ``act_together`` gives actions float32 [n, action size] for observations [n, ...]; ``aware`` is
+    what adds the actions under way to them.
     """
 
-    def __init__(self, act_together: ActTogether) -> None:
-        self.act_together = act_together
+    def __init__(self, act_together: ActTogether, aware: DelayAware | None = None) -> None:
+        self.act_together, self.aware = act_together, aware
 
     def act(self, observation: Observation) -> Action:
         """The action, float32 [action size]."""
         return self.act_together(observation[None])[0]
 
 
-def network_driver(actor: Actor) -> TogetherDriver:
+def network_driver(actor: Actor, aware: DelayAware | None = None) -> TogetherDriver:
     """A policy network that drives: pi(s)."""
-    device = next(actor.eval().parameters()).device
-
-    @torch.no_grad()
-    def act_together(observations: Observation) -> Action:
-        actions: Action = actor(torch.from_numpy(observations).to(device)).cpu().numpy()
-        return actions
-
-    return TogetherDriver(act_together)
+    return TogetherDriver(actor.eval().act, aware)
 
 
-def constant_driver(action: float) -> TogetherDriver:
-    """One action throughout, whatever the picture; ValueError unless it is from -1 to 1."""
+def constant_driver(action: float, size: int = 1) -> TogetherDriver:
+    """One action throughout, whatever is seen; ValueError unless it is from -1 to 1."""
     if not -1.0 <= action <= 1.0:
         raise ValueError(action)
-    return TogetherDriver(lambda seen: np.full((len(seen), 1), action, np.float32))
+    return TogetherDriver(lambda seen: np.full((len(seen), size), action, np.float32))
 
 
 class OnnxDriver(Driver):
@@ -124,32 +64,31 @@ class OnnxDriver(Driver):
         from edge_runtime.policy import load_policy
 
         self.policy = load_policy(str(path), public_key, allow_unsigned=True)
+        manifest = self.policy.manifest
+        self._plain, rows = next(iter(manifest.observation)), manifest.action
+        self._range = np.array([row.low for row in rows]), np.array([row.high for row in rows])
+        self._limits, self._period_s = shared_limits(rows, {}), manifest.control_period_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin where the edge's limits begin."""
+        self._last = neutral_action(self._limits)
 
     def act(self, observation: Observation) -> Action:
-        """The policy's action, float32 [action size], within its domain as the edge sends it.
+        """The policy's action, float32 [action size], from its own range brought to [-1, 1].
 
-        onnxruntime's tanh exceeds 1 by a last bit now and then.
+        Within the manifest's range and rate of change, as the edge sends it: onnxruntime's tanh
+        exceeds 1 by a last bit now and then. Each answer counts as a control period after the one
+        before; the edge measures the time, so behind jitter it may allow less.
         """
-        return np.clip(self.policy.act(observation), -1.0, 1.0)
+        wanted = self.policy.act(entries_of(observation, self._plain)).tolist()
+        self._last = limit_action(wanted, self._last, self._limits, self._period_s)
+        return inner(self._range, self._last)
 
 
-def make_environment(
-    scenario: str, condition: str = "nominal", printed_reward: bool = False
-) -> Any:
-    """The scenario's environment, without wrappers, in the scene of a test condition.
-
-    With ``printed_reward`` it pays what eq. 31 or 32 says, without the scenario's weight.
-
-    Raises:
-        UserError: no such scenario.
-    """
-    if scenario not in SCENARIOS:
-        raise UserError(f"unknown scenario {scenario!r}; there is {', '.join(SCENARIOS)}")
-    scene = CONDITIONS[condition].scene
-    env: Any = gymnasium.make(SCENARIOS[scenario], scene=scene).unwrapped
-    if printed_reward:
-        env.config = env.config.with_printed_reward()
-    return env
+def is_expert(word: str) -> bool:
+    """Whether this is the word expert, or ``module:Class`` of one."""
+    return word == "expert" or (bool(re.fullmatch(r"[\w.]+:\w+", word)) and CONSTANT not in word)
 
 
 def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[Driver, str]:
@@ -157,25 +96,23 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
 
     ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
 
-    Raises:
-        UserError: nothing there that drives.
+    Raises UserError: nothing there that drives.
     """
-    if policy == "expert":
-        return EXPERTS[env.scenario](env), "expert"
+    if is_expert(policy):
+        return expert_of(env, policy), policy
     if policy.startswith(CONSTANT):
         try:
-            return constant_driver(float(policy.removeprefix(CONSTANT))), policy
+            action, size = float(policy.removeprefix(CONSTANT)), env.action_space.shape[0]
+            return constant_driver(action, size), policy
         except ValueError:
             message = f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5"
             raise UserError(message) from None
     path = Path(policy)
     if path.suffix == ".onnx":
-        driver, wanted = OnnxDriver(path, public_key), ACTIONS[env.scenario].name
-        names = [action.name for action in driver.policy.manifest.action]
-        if names != [wanted]:
-            raise UserError(
-                f"{policy} answers with {', '.join(names)}, and {env.scenario} asks for {wanted}"
-            )
+        driver, wanted = OnnxDriver(path, public_key), task_of(env).text
+        if driver.policy.manifest.text != wanted:
+            found = driver.policy.manifest.text
+            raise UserError(f"{policy} is for {found}, and {env.scenario} asks for {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
         actor, about = load_human_model(path)
@@ -190,14 +127,21 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
         )
     if about["scenario"] != env.scenario:
         raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
-    return network_driver(actor), policy_id
+    return network_driver(actor, _awareness(env, about)), policy_id
+
+
+def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
+    """What the policy that a file is ``about`` sees beside the observation."""
+    spec = about.get("known_latency")
+    return DelayAware(env, parse_spec(spec)) if spec else None
 
 
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
     """A run's actor: the best on the validation seeds, or the last one where none was validated.
 
     Returns:
-        The network, and a dict with ``scenario``, ``algorithm``, ``seed``, ``episode``.
+        The network, and a dict with ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
+        knows a delay, ``known_latency``, too.
     """
     for name in (BEST_FILE, CHECKPOINT_FILE):
         if (run_dir / name).is_file():
@@ -210,10 +154,16 @@ def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
     try:
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]
         weights = networks[state.get("kept_actor", "actor")]
-        frames = weights["picture.trunk.conv1.weight"].shape[1]
-        actor = Actor(len(weights["head.output.bias"]), frames)
-        actor.load_state_dict(weights)
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
+        if "known_latency" in state:
+            label["known_latency"] = state["known_latency"]
+        env = make_environment(label["scenario"])
+        aware = _awareness(env, label)
+        space = aware.space if aware else env.observation_space
+        first = weights.get("picture.trunk.conv1.weight")
+        frames = 2 if first is None else first.shape[1]
+        actor = Actor(len(weights["head.output.bias"]), frames, space)
+        actor.load_state_dict(weights)
     except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise UserError(f"{path} is not a checkpoint of this project") from error
     return actor, label

@@ -25,11 +25,12 @@ Part = TypeVar("Part")
 Group = argparse.ArgumentParser | argparse._ArgumentGroup
 
 
-def add_scenario(parser: Group) -> None:
-    """``--scenario``."""
-    parser.add_argument(
-        "--scenario", choices=list(SCENARIOS), default="left_turn", help="what is driven"
-    )
+def add_scenario(parser: Group, default: str | None = "left_turn") -> None:
+    """``--scenario``; ``default`` None: what the policy was trained in."""
+    words = ", ".join(SCENARIOS)
+    what = f"what is driven: {words}, a gymnasium id, or module:id"
+    what += "" if default else " (default: what the run was trained in, else left_turn)"
+    parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
 
 
 def add_seed(parser: Group, what: str) -> None:
@@ -130,8 +131,7 @@ def check_suffix(out: str, what: str, *suffixes: str) -> None:
 def read_json(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file.
 
-    Raises:
-        UserError: no file, or something else in it.
+    Raises UserError: no file, or something else in it.
     """
     value = util.read_json(path, what)
     if not isinstance(value, dict):
@@ -142,8 +142,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 def existing_directory(path: str, what: str) -> Path:
     """A directory that is there.
 
-    Raises:
-        UserError: it is not.
+    Raises UserError: it is not.
     """
     directory = Path(path)
     if not directory.is_dir():

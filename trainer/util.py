@@ -13,7 +13,6 @@ import math
 import multiprocessing
 import os
 import platform
-import shutil
 import signal
 import socket
 import subprocess
@@ -31,12 +30,10 @@ import numpy as np
 from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
-LOCK_FILE = ".lock"
-"""In a directory that is claimed, for as long as it is."""
+LOCK_FILE = ".lock"  # In a directory that is claimed, for as long as it is
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 WRITTEN = ("results/paper",)
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
-CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
@@ -56,8 +53,7 @@ class Purpose(IntEnum):
     HUMAN_EPISODES = 4
     HUMAN_BATCHES = 5
     GUIDANCE = 6
-    SITTINGS = 7
-    """Episodes that a person drives without learning."""
+    SITTINGS = 7  # Episodes that a person drives without learning
 
 
 def episode_seed(run_seed: int, purpose: Purpose, episode: int) -> int:
@@ -99,8 +95,7 @@ def save_torch(path: Path, state: Any) -> None:
 def load_torch(path: Path) -> Any:
     """Read what ``save_torch`` wrote.
 
-    Raises:
-        UserError: not such a file. Only tensors and plain values are unpickled.
+    Raises UserError: not such a file. Only tensors and plain values are unpickled.
     """
     import torch
 
@@ -120,8 +115,7 @@ def claimed(directory: Path) -> Iterator[None]:
 
     It is made where it is not there, and goes again if nothing has come into it.
 
-    Raises:
-        UserError: another process trains there, or the directory cannot be made or written.
+    Raises UserError: another process trains there, or the directory cannot be made or written.
     """
     made = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
     make_directory(directory)
@@ -144,8 +138,7 @@ def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
     The lock is the kernel's: when a process dies, however it dies, its lock is gone with it, and
     the file that it leaves behind excludes no other process. Its directory must be there.
 
-    Raises:
-        UserError: the file cannot be written or locked.
+    Raises UserError: the file cannot be written or locked.
     """
     end_s, descriptor = time.monotonic() + patience_s, -1
     try:
@@ -288,8 +281,3 @@ def processor_model() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, "") or platform.processor() or platform.machine()
-
-
-def find_chromium() -> str | None:
-    """The path of the browser that the cockpit is tested with, or None where there is none."""
-    return next((path for name in CHROMIUM if (path := shutil.which(name))), None)

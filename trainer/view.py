@@ -1,14 +1,13 @@
 """Show a training in rerun as it goes on (``train --rerun``), or recorded sittings (``view``).
 
 The training loop only collects what must be taken while it is there, and never waits. A thread of
-its own draws: calls of rerun and of the critic take time. A recording of a sitting does not hold
+its own draws, because calls of rerun take time. A recording of a sitting does not hold
 the road: driving the same seed with the same actions again gives it back.
 """
 
 from __future__ import annotations
 
 import argparse
-import copy
 import math
 import queue
 import sys
@@ -19,10 +18,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from bridge.rerun import (
@@ -34,6 +32,7 @@ from bridge.rerun import (
     ViewerGone,
     add_sink,
     check_sink,
+    draw,
     flush,
     open_sink,
     read_sink,
@@ -45,28 +44,13 @@ import rerun.blueprint as rrb
 
 from bridge.messages import Pace, SeenScene, read_scene
 from bridge.report import GOAL
-from bridge.rerun.draw import (
-    ALL_OF_IT,
-    BLUE,
-    GREY,
-    ORANGE,
-    PICTURE_INTERVAL_S,
-    PURPLE,
-    Plot,
-    draw_cars,
-    draw_ground,
-    frames_view,
-    full_blueprint,
-    plot_view,
-    road_view,
-    style_lines,
-    style_points,
-)
+from bridge.rerun.draw import Plot
 from edge_runtime.cli import examples, sigterm_as_interrupt
-from edge_runtime.util import counted
-from trainer.drivers import make_environment
-from trainer.human.guide import Reason
-from trainer.learner.networks import Critic
+from edge_runtime.util import UserError, counted
+from trainer.environments import make_environment
+from trainer.human.guide import REASONS, Reason
+from trainer.learner.networks import PICTURES
+from trainer.person.controls import Amount, amount, vector
 from trainer.person.recording import Step, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun
@@ -77,27 +61,21 @@ EXAMPLE = examples(
 )
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
-STEPS_TOGETHER = 50
-"""Numbers are handed over with a picture, or when there are this many."""
-CORRECTIONS = 32
-"""The Q advantage is shown for this many steps of an episode, evenly spread: the critic is slow."""
+STEPS_TOGETHER = 50  # Numbers are handed over with a picture, or when there are this many
 MOST_WAITING = 500
 """Entries, some 50 s of pictures. A view that is slower loses some; the loop loses nothing."""
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
-RECENT_STEPS = 200
-"""Shown of what changes within an episode."""
-WINDOW = 20
-"""Episodes of the moving means."""
+RECENT_STEPS = 200  # Shown of what changes within an episode
+WINDOW = 20  # Episodes of the moving means
 EPISODES = (
     Plot("return", "Return of an episode, and the mean of 20"),
     Plot("success", "Success: mean of 20 episodes, and policy alone in validation", (-0.05, 1.05)),
     Plot("loss", "Losses, means of an episode"),
     Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
     Plot("human", "The human's share of the steps", (-0.05, 1.05)),
-    Plot("advantage", "Q advantage of the human's action, where it took over"),
+    Plot("cost", "So far: the human's seconds, take-overs, failures"),
 )
-"""The plots of a training, from top to bottom."""
 SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
 """The plots of recorded sittings, which hold nothing of a learner."""
 RECENT = (
@@ -105,21 +83,24 @@ RECENT = (
     Plot("speed", "Speed, m/s, the last 20 s"),
 )
 LINES = {
-    "return/episode": GREY,
-    "return/mean_of_20": BLUE,
-    "success/mean_of_20": BLUE,
-    "success/validation": ORANGE,
-    "loss/critic": PURPLE,
+    "return/episode": draw.GREY,
+    "return/mean_of_20": draw.BLUE,
+    "success/mean_of_20": draw.BLUE,
+    "success/validation": draw.ORANGE,
+    "loss/critic": draw.PURPLE,
     "loss/policy": POLICY,
     "loss/cloning": HUMAN,
     "priority/human": HUMAN,
     "priority/policy": POLICY,
     "human/share": HUMAN,
+    "cost/human_s": HUMAN,
+    "cost/takeovers": draw.ORANGE,
+    "cost/failures": draw.PURPLE,
     "action/policy": POLICY,
     "action/applied": APPLIED,
-    "speed/ego": BLUE,
+    "speed/ego": draw.BLUE,
 }
-DRIVERS = {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
+DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
 
 
@@ -161,23 +142,20 @@ def check_word(word: str) -> Sink:
 class StepEntry(NamedTuple):
     """The numbers of one control period."""
 
-    step: int
-    """Since the run began."""
-    policy_action: float
-    action: float
+    step: int  # Since the run began
+    policy_action: Amount
+    action: Amount
     speed_mps: float
-    reason: Reason | None
-    """Why the human acted; None where the policy did."""
+    reason: Reason | None  # Why the human acted; None where the policy did
 
 
 class Steps(NamedTuple):
     """Some control periods, and perhaps the picture of the last one: at most ten a second."""
 
     entries: list[StepEntry]
-    frames: NDArray[np.uint8] | None = None
-    """What the policy saw, [2, 45, 80]."""
-    scene: dict[str, Any] | None = None
-    """The environment's; None, too, where the road is not known."""
+    frames: NDArray[Any] | None = None  # What the policy saw; shown where it is [2, 45, 80]
+    scene: dict[str, Any] | NDArray[np.uint8] | None = None
+    """The environment's, or what it draws; None, too, where the road is not known."""
 
 
 class Episode(NamedTuple):
@@ -185,10 +163,6 @@ class Episode(NamedTuple):
 
     step: int
     metrics: EpisodeMetrics
-    corrections: Sequence[tuple[int, Seen]] = ()
-    """Steps at which the human acted, and what was seen there."""
-    critic: Critic | None = None
-    """A copy that is not trained; None without corrections."""
 
 
 Entry = Steps | Episode
@@ -223,34 +197,25 @@ class Watcher:
 
     def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put = run, put
-        self._pace = Pace(PICTURE_INTERVAL_S)
+        self._pace = Pace(draw.PICTURE_INTERVAL_S)
         self._step = run.learning.added
         self._entries: list[StepEntry] = []
-        self._corrections: list[tuple[int, Seen]] = []
 
     def on_step(self, seen: Seen) -> None:
         """Take a control period."""
-        reason = None
-        if seen.intervention is not None:
-            reason = seen.intervention.reason
-            self._corrections.append((self._step, seen))
-        actions = float(seen.policy_action[0]), float(seen.action[0])
+        reason = None if seen.intervention is None else seen.intervention.reason
+        actions = amount(seen.policy_action), amount(seen.action)
         self._entries.append(StepEntry(self._step, *actions, seen.speed_mps, reason))
         self._step += 1
         if self._pace.due(time.monotonic()):
-            self.hand_over(seen.observation, self._run.env.scene())
+            self.hand_over(seen.observation, _shown(self._run.env))
         elif len(self._entries) >= STEPS_TOGETHER:
             self.hand_over()
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
-        """Take an episode's end; no update is under way."""
+        """Take an episode's end."""
         self.hand_over()
-        corrections, self._corrections = self._corrections, []
-        critic = None
-        if corrections:
-            critic = copy.deepcopy(self._run.learning.learner.target_critics.first).cpu()
-        stride = -(-len(corrections) // CORRECTIONS) or 1
-        self._put(Episode(max(self._step - 1, 0), metrics, corrections[::stride], critic))
+        self._put(Episode(max(self._step - 1, 0), metrics))
 
     def hand_over(self, *picture: Any) -> None:
         """Pass on the steps so far, also those of an episode that was broken off."""
@@ -337,7 +302,7 @@ class Shown:
         self.without_road += not road
         self.episodes += 1
 
-    def _drive_again(self, episode: list[Step]) -> list[dict[str, Any]]:
+    def _drive_again(self, episode: list[Step]) -> list[Any]:
         """The scene at each step, by the same seed and the same actions; empty where it differs."""
         first, scenes = episode[0], []
         if first.step != 0:
@@ -347,22 +312,17 @@ class Shown:
         for step in episode:
             if not np.array_equal(observation, step.observation):
                 return []
-            scenes.append(env.scene())
-            observation, *_ = env.step(np.array([step.action], np.float32))
+            scenes.append(_shown(env))
+            observation, *_ = env.step(vector(step.action))
         return scenes
 
 
-@torch.no_grad()
-def q_advantage(critic: Critic, seen: Seen) -> float:
-    """Q'(s, a_human) - Q'(s, a_policy): eq. 21b's exponent, for the action that was overruled.
-
-    One picture at a time: that takes this thread alone, where a batch would bring a second pool of
-    threads beside the learner's.
-    """
-    picture = critic.embed(torch.from_numpy(seen.observation)[None])
-    actions = torch.tensor([seen.action.tolist(), seen.policy_action.tolist()])
-    human, policy = critic.value(picture.expand(2, -1), actions).tolist()
-    return human - policy
+def _shown(env: Any) -> Any:
+    """The scene, or what the environment draws where it has none; None where it draws nothing."""
+    scene = env.scene()
+    with suppress(UserError):
+        return env.render() if scene is None else scene
+    return None
 
 
 def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
@@ -372,18 +332,18 @@ def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blu
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     left = rrb.Vertical(
-        road_view(scene, "Road from above (blue: the policy drives, green: the human)"),
-        frames_view(),
+        draw.road_view(scene, "Road from above (blue: the policy drives, green: the human)"),
+        draw.frames_view(),
         rrb.StateTimelineView(
             origin="driver",
             name="Who drives: the policy, or the human, and why",
-            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+            time_view=rrb.TimeAxis(view_range=draw.ALL_OF_IT),
         ),
-        *(plot_view(plot, recent) for plot in RECENT),
+        *(draw.plot_view(plot, recent) for plot in RECENT),
         row_shares=[3, 1.6, 0.9, 1.2, 1.1],
     )
-    right = rrb.Vertical(*map(plot_view, episodes))
-    return full_blueprint(left, right, [1, 1], TIMELINE)
+    right = rrb.Vertical(*map(draw.plot_view, episodes))
+    return draw.full_blueprint(left, right, [1, 1], TIMELINE)
 
 
 class TrainingLog:
@@ -396,8 +356,7 @@ class TrainingLog:
         """What is drawn of the ground: recordings may be of several scenarios."""
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
-        style_lines(recording, LINES)
-        style_points(recording, {"advantage/of_the_human": HUMAN})
+        draw.style_lines(recording, LINES)
         names, colours = list(DRIVERS), list(DRIVERS.values())
         lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
         recording.log("driver", lanes, static=True)
@@ -408,8 +367,11 @@ class TrainingLog:
             self._draw_episode(entry)
             return
         steps, policy, applied, speeds, reasons = zip(*entry.entries, strict=True)
-        self._columns("action/policy", steps, policy)
-        self._columns("action/applied", steps, applied)
+        for name, actions in (("policy", policy), ("applied", applied)):
+            several = np.array(actions).reshape(len(steps), -1).T
+            for number, values in enumerate(several):
+                place = f"action/{name}" + f"/{number}" * (len(several) > 1)
+                self._columns(place, steps, values)
         self._columns("speed/ego", steps, speeds)
         for step, reason in zip(steps, reasons, strict=True):
             driver = reason or "policy"
@@ -419,18 +381,21 @@ class TrainingLog:
                 self._recording.log("driver", rr.StateChange(state=driver))
         if entry.frames is not None:
             self._stand_at(steps[-1])
-            if entry.scene is not None:
+            if isinstance(entry.scene, dict):
                 self._draw_road(read_scene(entry.scene))
-            for name, frame in zip(("before", "now"), entry.frames, strict=True):
-                self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
+            elif entry.scene is not None:
+                self._recording.log("road", rr.Image(entry.scene, color_model="RGB"))
+            if entry.frames.shape == PICTURES.shape:
+                for name, frame in zip(("before", "now"), entry.frames, strict=True):
+                    self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
 
     def _draw_road(self, scene: SeenScene) -> None:
         ground = (scene.roads, scene.path, scene.goal)
         if ground != self._ground:
             self._ground = ground
             self._recording.send_blueprint(make_blueprint(scene, self._episodes))
-            draw_ground(self._recording, scene)
-        draw_cars(self._recording, scene, DRIVERS[self._driver])
+            draw.draw_ground(self._recording, scene)
+        draw.draw_cars(self._recording, scene, DRIVERS.get(self._driver, HUMAN))
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics
@@ -449,18 +414,17 @@ class TrainingLog:
             "priority/human": metrics.human_priority,
             "priority/policy": metrics.policy_priority,
             "human/share": metrics.human_steps / metrics.steps,
+            "cost/human_s": metrics.total_human_s,
+            "cost/takeovers": metrics.total_takeovers,
+            "cost/failures": metrics.total_failures,
         }.items():
             if not math.isnan(value):
                 self._recording.log(path, rr.Scalars(value))
         self._recording.log("status", _status(metrics))
         self._recording.reset_time()
-        if episode.critic is not None:
-            steps = [step for step, _ in episode.corrections]
-            values = [q_advantage(episode.critic, seen) for _, seen in episode.corrections]
-            self._columns("advantage/of_the_human", steps, values)
         flush(self._recording)  # A viewer that is gone takes everything without a word.
 
-    def _columns(self, path: str, steps: Sequence[int], values: Sequence[float]) -> None:
+    def _columns(self, path: str, steps: Sequence[int], values: Any) -> None:
         """Log many numbers in one call: a call for each would cost as much as this one."""
         rr.send_columns(
             path,

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from edge_runtime.cli import sigterm_as_interrupt
@@ -82,8 +82,8 @@ def flush(recording: rr.RecordingStream) -> None:
         raise ViewerGone(str(error)) from None
 
 
-def add_sink(parser: argparse.ArgumentParser) -> None:
-    """``--spawn``, ``--serve`` or ``--save F.rrd``, kept as ``sink``; without any it is None."""
+def add_sink(parser: argparse.ArgumentParser) -> Any:
+    """The group of ``--spawn``, ``--serve``, ``--save F.rrd``: kept as ``sink``, None without."""
     where = parser.add_mutually_exclusive_group()
     page, window = "serve a web page on this machine's loopback only", "open a rerun window"
     for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
@@ -92,6 +92,7 @@ def add_sink(parser: argparse.ArgumentParser) -> None:
         )
     text = "write a recording instead of showing it"
     where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
+    return where
 
 
 def _file(path: str) -> Sink:

@@ -7,7 +7,7 @@ turned.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rerun as rr
@@ -125,6 +125,15 @@ def frames_view() -> rrb.Horizontal:
     )
 
 
+def numbers_view(array: str) -> rrb.Horizontal:
+    """The same for a policy that sees no picture: lines, or the ``array`` of many numbers."""
+    seen: Any = plot_view(Plot("observation", "Policy sees"))
+    if array:
+        seen = rrb.TensorView(origin=f"observation/{array}", name=f"Policy sees: {array}")
+    now = rrb.TextDocumentView(origin="status", name="Now")
+    return rrb.Horizontal(seen, now, column_shares=[2, 1])
+
+
 def full_blueprint(
     left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
 ) -> rrb.Blueprint:
@@ -158,17 +167,7 @@ def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesVie
 
 def style_lines(recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
     """Name and colour lines by their entities; the name is the path's last part."""
-    _style(recording, lines, lambda **style: rr.SeriesLines(widths=[2.0], **style))
-
-
-def style_points(recording: rr.RecordingStream, points: Mapping[str, Colour]) -> None:
-    """The same for what happens now and then: dots instead of a line."""
-    _style(recording, points, lambda **style: rr.SeriesPoints(marker_sizes=[4.0], **style))
-
-
-def _style(
-    recording: rr.RecordingStream, colours: Mapping[str, Colour], kind: Callable[..., Any]
-) -> None:
-    for path, colour in colours.items():
+    for path, colour in lines.items():
         name = path.rpartition("/")[2].replace("_", " ")
-        recording.log(path, kind(colors=[colour], names=[name]), static=True)
+        style = rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
+        recording.log(path, style, static=True)

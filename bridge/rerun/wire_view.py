@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,22 +13,27 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import DECODERS, Heard, Pace, Scene
+from bridge.messages import DECODERS, Heard, Pace, Scene, images_of, is_picture, period_of
 from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.recording import Recording, read_heard
 from bridge.rerun import APPLIED, POLICY, SERVE, Sink, add_sink, check_sink, draw, flush, open_sink
 from bridge.rerun.draw import Plot
-from bridge.virtual_link import SILENCE_LIMIT_S
+from bridge.virtual_link import SILENCE_PERIODS
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
-from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.wire import CONTROL_PERIOD_S, DEFAULT_VEHICLE_ID, Command, Feedback, Health, State
+from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt, whole_number
+from edge_runtime.commands import link_words
+from edge_runtime.manifest import Layout
+from edge_runtime.tls import tls_for
+from edge_runtime.util import UserError
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
+FOXGLOVE_PORT = 8765  # Where Foxglove looks first
 EXAMPLE = examples(
     "python -m bridge view --serve",
     "python -m bridge view --save drive.rrd --wait-s 60",
-    "python -m bridge view hil_tests/recordings/left_turn.mcap --save left_turn.rrd",
+    "python -m bridge view drive.mcap --save drive.rrd",
+    "python -m bridge view --foxglove",
 )
 
 
@@ -40,7 +45,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="F.mcap",
         help="show what bridge record has written, instead of listening",
     )
-    add_sink(parser)
+    text = f"serve Foxglove, on this machine's loopback only (port {FOXGLOVE_PORT} if none is said)"
+    port: dict[str, Any] = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
+    add_sink(parser).add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **port)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     help_text = (
         f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
@@ -50,11 +57,17 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    if arguments.foxglove and arguments.recording is not None:
+        raise UserError(f"Foxglove opens {arguments.recording} by itself")
+    if arguments.foxglove:
+        from bridge.foxglove_view import serve
+
+        return _watch(arguments, serve(arguments.foxglove))
     sink = check_sink(arguments.sink)
     if arguments.recording is not None:
         _show_recording(arguments, sink)
     else:
-        _watch(arguments, sink, tls_for(arguments.tls, arguments.connect))
+        _watch(arguments, _drawn(sink))
     if sink.path:
         print(f"wrote {sink.path}")
     return 0
@@ -81,28 +94,38 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
             wait_to_be_told()
 
 
-def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> None:
-    """Draw until there is a reason to stop."""
+@contextlib.contextmanager
+def _drawn(sink: Sink) -> Iterator[Callable[[Heard], None]]:
+    with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
+        yield WireLog(recording, draw.PICTURE_INTERVAL_S if sink.is_live else 0.0).write
+
+
+def _watch(
+    arguments: Any, opened: contextlib.AbstractContextManager[Callable[[Heard], None]]
+) -> int:
+    """Show until there is a reason to stop."""
     vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, arguments.connect)
     with (
         sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
-        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        opened as show,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
-        log = WireLog(recording, draw.PICTURE_INTERVAL_S if sink.is_live else 0.0)
         for heard in listener.until_gone(arguments.duration_s):
-            log.write(heard)
+            show(heard)
     if listener.dropped:
         print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
+    return 0
 
 
 # From top to bottom.
 PLOTS = (
-    Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
+    Plot("action", "Command: asked and achieved"),
     Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     Plot("latency", "Latency, ms: round trip, and its parts"),
+    Plot("link", "Link: parts of the policy's envelope, whose edge is 1 (where it has one)"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )
 SERIES = {
@@ -114,14 +137,21 @@ SERIES = {
     "latency/inference": draw.GREEN,
     "latency/downlink": draw.PURPLE,
     "latency/round_trip": draw.ORANGE,
+    "link/load": draw.RED,
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    shown = None if scene is None or scene.picture else scene  # A picture has its own bounds.
+    seen = {} if scene is None or scene.task is None else scene.task.observation
+    many = [name for name, entry in seen.items() if math.prod(entry.shape) > MOST_LINES]
+    pictures = not seen or any(map(is_picture, seen.values()))
     left = rrb.Vertical(
-        draw.road_view(scene, "Road from above"), draw.frames_view(), row_shares=[3, 1.4]
+        draw.road_view(shown, "Road from above" if shown or not seen else "From above"),
+        draw.frames_view() if pictures else draw.numbers_view(many[0] if many else ""),
+        row_shares=[3, 1.4],
     )
     right = rrb.Vertical(
         rrb.StateTimelineView(
@@ -135,16 +165,16 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
             name="Events: modes, rejections, episodes",
             columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
         ),
-        row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
+        row_shares=[2.2, 2, 2, 2, 1.6, 1.6, 1.8],
     )
     return draw.full_blueprint(left, right, [3, 2], "sim_time")
 
 
 SILENT = "no command"
 NOTHING_WRONG = "-"
+MOST_LINES = 16  # Numbers of an observation that a plot can show
 REMEMBERED_STATES = 64  # States whose sending time is kept, for the latency of their commands
 EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
-"""Colour of the ego car by what it is told."""
 ALL = "all"  # The sum over the reasons, which has a line from the start
 SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
 """The side that rejects, and the colour of all that it has rejected."""
@@ -161,8 +191,10 @@ class WireLog:
         self._recording = recording
         self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
         self._timeline = Timeline()
+        self._layout: Layout | None = None
         self._told, self._reason = "", ""
         self._heard_command_ns: int | None = None
+        self._plan_periods = 0
         self._sent_ns: dict[tuple[int, int], int] = {}
         self._answered_ns: dict[tuple[int, int], int] = {}
         """From the sending of a state to that of its command, by the stamps of both."""
@@ -193,13 +225,13 @@ class WireLog:
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
+        self._timeline.period_s = period_of(state) or self._timeline.period_s
         self._stand_at(state.episode, state.step)
         _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
-            before, now = state.frames_array()
-            self._recording.log("frames/before", rr.Image(before, color_model="L"))
-            self._recording.log("frames/now", rr.Image(now, color_model="L"))
-        self._scalar("speed/simulated", state.speed_mps)
+            self._draw_observation(state)
+        if state.speed_mps is not None:
+            self._scalar("speed/simulated", state.speed_mps)
         if state.step == 0:
             self._event(f"episode {state.episode} begins")
         if state.final:
@@ -207,7 +239,8 @@ class WireLog:
         if self._heard_command_ns is None:
             # A viewer that comes late has not yet had the time to hear one.
             self._heard_command_ns = arrived_ns
-        silent = arrived_ns - self._heard_command_ns > SILENCE_LIMIT_S * 1e9
+        periods = SILENCE_PERIODS + self._plan_periods
+        silent = arrived_ns - self._heard_command_ns > periods * self._timeline.period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
             self._scalar("action/asked", math.nan)  # A gap in the line: nothing is asked.
@@ -216,7 +249,7 @@ class WireLog:
     def write_command(self, command: Command, arrived_ns: int) -> None:
         """Draw what is asked, the mode, and where the time went."""
         self._stand_at(command.episode, command.step)
-        self._heard_command_ns = arrived_ns
+        self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
         self._recording.log("action/asked", rr.Scalars(list(command.action)))
         state = (command.episode, command.step)
         if (sent_ns := self._sent_ns.get(state)) is not None:
@@ -241,11 +274,20 @@ class WireLog:
                 self._event(f"edge rejected {new} states: {reason}", rr.TextLogLevel.WARN)
         self._edge_counts = dict(health.rejected)
         self._rejections("edge", health.rejected)
+        for name, limit in health.envelope.items() if health.link else ():
+            self._scalar(f"link/{name}", health.link[name] / limit)
+        if health.link:
+            self._scalar("link/load", health.link["load"])
         self._health = health
         self._write_status()
 
     def write_scene(self, scene: Scene, arrived_ns: int) -> None:
-        """Draw the road from above; the first scene also decides which ground is shown."""
+        """Draw the road from above, or the picture that is in its place.
+
+        The first scene also decides which ground is shown.
+        """
+        if scene.task is not None:
+            self._layout, self._timeline.period_s = Layout(scene.task), scene.task.control_period_s
         self._stand_at(scene.episode, scene.step)
         if self._drawn_episode < 0:
             self._recording.send_blueprint(make_blueprint(scene))
@@ -254,8 +296,31 @@ class WireLog:
             draw.draw_ground(self._recording, scene)
         self._round_trip(scene)
         self._rejections("simulator", scene.rejected)
-        if self._cars_pace.due(arrived_ns * 1e-9):
+        if scene.ridden and self._told == DRIVE:
+            self._tell(DRIVE, "rides on the plan", rr.TextLogLevel.WARN)
+        if not self._cars_pace.due(arrived_ns * 1e-9):
+            return
+        if scene.picture:
+            self._recording.log(
+                "road/picture", rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
+            )
+        else:
             draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
+
+    def _draw_observation(self, state: State) -> None:
+        """Its images, the newest last, and few numbers as lines."""
+        if self._layout is None or self._layout.refusal(state.observation) is not None:
+            return
+        for name, array in self._layout.arrays(state.observation).items():
+            images = images_of(array)
+            if images is not None:
+                for place, image in zip(("now", "before"), images[::-1], strict=False):
+                    model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
+                    self._recording.log(f"frames/{place}", rr.Image(image, color_model=model))
+            else:
+                few = array.size <= MOST_LINES
+                numbers = rr.Scalars(array.ravel()) if few else rr.Tensor(array)
+                self._recording.log(f"observation/{name}", numbers)
 
     def _stand_at(self, episode: int, step: int) -> None:
         recording, moment = self._recording, self._timeline.place(episode, step)
@@ -317,6 +382,8 @@ class WireLog:
                 f"states accepted {health.accepted}, rejected: {counts or 'none'}",
                 f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
             ]
+            if health.envelope:
+                lines.append(f"link: {link_words(health.link, health.envelope)}")
             if {"p50", "p99"} <= set(health.inference_ms):
                 times = "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms"
                 lines.append(times.format(**health.inference_ms))
@@ -352,10 +419,11 @@ class Timeline:
     def __init__(self) -> None:
         self._starts: dict[int, int] = {}
         self._end_step = 0
+        self.period_s = 0.0  # The control period, as soon as a message tells it
 
     def place(self, episode: int, step: int) -> Moment:
         """Return the moment of a step."""
         # A viewer that comes late begins at zero as well: its first step is the first it saw.
         total_step = self._starts.setdefault(episode, self._end_step) + step
         self._end_step = max(self._end_step, total_step + 1)
-        return Moment(episode, step * CONTROL_PERIOD_S, total_step, total_step * CONTROL_PERIOD_S)
+        return Moment(episode, step * self.period_s, total_step, total_step * self.period_s)

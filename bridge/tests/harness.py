@@ -121,11 +121,11 @@ def simulate_undisturbed(folder, endpoint, env, options, attempts=4) -> dict[str
 def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
     policy = load_policy(str(policy_path), allow_unsigned=True)
     environment = gymnasium.make(TOY)
-    frames, info = environment.reset(seed=seed)
+    seen, info = environment.reset(seed=seed)
     actions, ended = [], False
     while not ended:
-        actions.append(policy.act(frames))
-        frames, _, terminated, truncated, info = environment.step(actions[-1])
+        actions.append(policy.act({"frames": seen}))
+        seen, _, terminated, truncated, info = environment.step(actions[-1])
         ended = terminated or truncated
     return info["outcome"], np.array(actions)
 
@@ -135,7 +135,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def rerun(*arguments: str) -> str:
-    command = [sys.executable, "-m", "rerun", *arguments]
+    command = [sys.executable, "-m", "rerun_cli", *arguments]
     return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
 

@@ -22,10 +22,11 @@ from bridge.tests.harness import (
     start_simulate,
 )
 from bridge.virtual_link import NO_COMMAND
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
-from edge_runtime.transport import free_endpoint
+from edge_runtime.tests.policies import TASK, T
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S, Feedback, decode_feedback, encode
+from edge_runtime.wire import Feedback, decode_feedback, encode
 
 
 def test_what_an_action_raises_reaches_the_caller():
@@ -49,8 +50,8 @@ class Rig:
     """A clock whose publications are answered in the same call; ``answer`` None is a dead edge."""
 
     def __init__(self, spec="none", answer=obedient, kind=LockStepClock):
-        self.check: Any = CommandCheck("here", action_size=1)
-        self.clock = kind(self.publish, self.check, parse_spec(spec))
+        self.check: Any = CommandCheck("here", TASK)
+        self.clock = kind(self.publish, self.check, parse_spec(spec), TASK)
         self.published: list[int] = []
         self.answer = answer
 
@@ -150,6 +151,26 @@ def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
     assert [reason for reason in two if reason] == [NO_COMMAND, *["no_fresh_state"] * 4]
 
 
+def planned(step):
+    return make_command(step, action=[0.5], plan=[[k / 10] for k in range(1, 6)])
+
+
+def test_a_plan_carries_it_over_an_outage_of_its_length_and_not_of_more():
+    rig = Rig("outage=0.5s@1s", planned)
+    found = rig.drive(20)
+    assert not any(reasons(found))
+    assert [decision.ridden for decision in found[9:16]] == [0, 1, 2, 3, 4, 5, 0]
+    assert [one.command.action for one in found[9:12]] == [[0.5], [0.1], [0.2]]
+    # Up to 0.7 s after the last command it rides, on the last of its actions; then it recovers.
+    found = Rig("outage=0.8s@1s", planned).drive(26)
+    assert [one.ridden for one in found[10:17]] == [1, 2, 3, 4, 5, 5, 0]
+    assert [bool(reason) for reason in reasons(found)] == [16 <= step < 22 for step in range(26)]
+    # The edge runtime's own rule, when only states are lost.
+    found = reasons(Rig("up.outage=0.7s@1s", planned).drive(20))
+    assert {reason for reason in found if reason} == {NO_COMMAND, "no_fresh_state"}
+    assert not any(reasons(Rig("up.outage=0.6s@1s", planned).drive(20)))
+
+
 def test_a_machine_that_stalls_is_counted_apart_from_the_network():
     rig, late = Rig(), Rig("outage=0.5s@1s")
     rig.drive(3)
@@ -206,9 +227,9 @@ class VehicleRig(Rig):
 
     def __init__(self, spec="none", dead_s=0.03):
         self.dead_s, self.silent_from = dead_s, 99
-        self.check = FeedbackCheck("here", action_size=1)
-        commands = CommandCheck("here", action_size=1)
-        self.clock = VehicleClock(self.publish, commands, parse_spec(spec), self.check)
+        self.check = FeedbackCheck("here", TASK)
+        commands = CommandCheck("here", TASK)
+        self.clock = VehicleClock(self.publish, commands, parse_spec(spec), TASK, self.check)
         self.close = self.clock.close
 
     def publish(self, payload):
@@ -229,7 +250,7 @@ def test_each_tick_ends_with_what_the_vehicle_did_in_it():
     with contextlib.closing(VehicleRig()) as rig:
         began_s = time.monotonic()
         decisions = rig.drive(4)
-        assert time.monotonic() - began_s >= 4 * CONTROL_PERIOD_S
+        assert time.monotonic() - began_s >= 4 * T
     assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
     assert reasons(decisions) == [""] * 4
     assert all(0 < age_ms < 200 for age_ms in rig.clock.feedback_ages_ms)

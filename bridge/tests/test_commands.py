@@ -6,12 +6,14 @@ import pytest
 
 from bridge.ports import open_port
 from bridge.tests.harness import LEFT_TURN, TOY
-from edge_runtime.transport import free_endpoint
+from edge_runtime.reach import free_endpoint
 
 ROWS = [
     ("simulate --env phil/Nowhere-v0", "Nowhere"),
     ("simulate --env no_such_module:X-v0", "no_such_module"),
-    ("simulate --env CartPole-v1", "uint8"),
+    ("simulate --env CartPole-v1", "acts in Discrete(2); the wire carries a Box with bounds"),
+    ("simulate --env FrozenLake-v1", "observes Discrete(16); the wire carries Box or a flat Dict"),
+    ("simulate --env MountainCarContinuous-v0 --wait-edge-s 0", "no edge runtime after 0 s"),
     ("simulate --env somebody/Creep-v0", "somebody"),
     ("simulate --env somebody/Creep-v0", "a gymnasium id"),
     ("simulate --env bridge.tests.broken_module:X-v0", "RuntimeError: two"),
@@ -30,12 +32,6 @@ ROWS = [
     ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),
     ("simulate --env TOY --clock sundial", "sundial"),
     ("simulate --env TOY --loop vehicle", "--loop vehicle needs --clock realtime"),
-    ("relay --listen tcp/127.0.0.1:7001", "--connect"),
-    ("relay --listen here --connect tcp/127.0.0.1:7001", "endpoint"),
-    ("relay --listen tcp/127.0.0.1:7001 --connect tcp/127.0.0.1:7001", "circle"),
-    ("relay --listen tls/127.0.0.1:7001 --connect tcp/127.0.0.1:7002", "plain text only"),
-    ("relay --listen tcp/127.0.0.1:7001 --connect quic/127.0.0.1:7002", "plain text only"),
-    ("relay --listen tcp/127.0.0.1:7001 --connect udp/127.0.0.1:7001 --latency 5", "latency"),
     ("router --listen FREE --config router.json5", "goes with no other option"),
     ("record --out there.mcap", "exists"),
     ("record --out /dev/null/a.mcap", "Not a directory"),
@@ -55,19 +51,6 @@ ROWS = [
     ("replay LEFT_TURN --policy a.onnx --out /dev/null/r.json", "Not a directory"),
     ("replay missing.mcap --policy p.onnx", "No such file"),
     ("replay there.mcap --policy p.onnx", "no MCAP recording"),
-    ("ros2 --connect FREE --ros2-listen FREE --wait-s 0", "nobody answers"),
-    ("ros2 --connect FREE --vehicle-id a/b", "vehicle id"),
-    ("ros2 --connect FREE --namespace 9/x", "namespace '9/x'"),
-    ("ros2 --connect FREE --namespace ''", "empty value after --namespace"),
-    ("ros2 --connect FREE --ros2-listen tls/127.0.0.1:7448", "plain text"),
-    ("ros2 --connect FREE --ros2-listen nowhere", "endpoint 'nowhere'"),
-    ("ros2 --connect FREE --ros2-listen BUSY", "is in use"),
-    ("ros2 --connect FREE --ros2-listen BUSY", "--ros2-listen"),
-    ("ros2 --connect FREE --ros2-listen tcp/a:1 --ros2-connect tcp/a:1", "not allowed with"),
-    ("ros2 --connect FREE --max-rate-hz 0", "is not a rate"),
-    ("ros2 --connect FREE --max-rate-hz nan", "is not a rate"),
-    ("ros2 --connect FREE --out /dev/null/a.json", "Not a directory"),
-    ("ros2 --connect FREE --tls nowhere", "plain text despite --tls"),
     ("view --connect FREE --save never.rrd --wait-s 0", "nobody answers"),
     ("view --connect BUSY --save never.rrd --wait-s 0.2", "--vehicle-id"),
     ("view --connect FREE", "no display"),

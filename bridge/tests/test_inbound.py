@@ -3,43 +3,51 @@
 import msgspec
 import numpy as np
 import pytest
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge import inbound
-from bridge.environments import vehicle_action
+from bridge.episode import Actuators, vehicle_action
 from bridge.report import SafeStopLog, rejections
 from bridge.tests.harness import make_command, make_feedback
 from bridge.tests.toy import ToyEnv
 from bridge.virtual_link import NO_COMMAND, CommandHold
+from edge_runtime.tests.policies import TASK, T
 from edge_runtime.wire import Health, encode
 
 
 def checking():
-    check = inbound.CommandCheck("here", action_size=1)
+    check = inbound.CommandCheck("here", TASK)
     check.begin(0)
     check.sent(5)
     return check
 
 
 def checking_feedback():
-    check = inbound.FeedbackCheck("here", action_size=1)
+    check = inbound.FeedbackCheck("here", TASK)
     check.sent(0, 5)
     return check
 
 
 BOTH = [
-    ({"schema": 2}, "schema"),
+    ({"schema": 1}, "schema"),
+    ({"action": [1.5]}, "action_range"),
     ({"session": "elsewhere"}, "foreign_session"),
     ({"action": [0.1, 0.1]}, "action_size"),
     ({"step": 6}, "unknown_step"),
     ({"step": 0, "episode": 1}, "unknown_step"),
 ]
+PLANS = [
+    ({"plan": [[0.5], [1.5]]}, "action_range"),
+    ({"plan": [[0.5, 0.5]]}, "malformed"),
+    ({"plan": [[0.5]] * 11}, "malformed"),
+]
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
-    [*BOTH, ({"action": [float("nan")]}, "not_finite"), ({"action": [1.5]}, "malformed"),
+    [*BOTH, *PLANS, ({"action": [float("nan")]}, "not_finite"),
      ({"action": []}, "malformed"), (b"\x00", "malformed"), (bytes(70_000), "oversized")],
 )  # fmt: skip
 def test_a_command_that_answers_nothing_is_counted_by_reason(changes, reason):
@@ -60,7 +68,7 @@ def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
 
 
 def test_the_newest_command_is_held_for_2_periods_and_no_longer():
-    hold = CommandHold(now_s=0.0)
+    hold = CommandHold(0.0, T)
     assert hold.admit(make_command(0), now_s=0.01, sent_s=0.01)
     assert hold.decide(0.025).brake_reason == ""
     held, braking = hold.decide(0.2), hold.decide(0.22)
@@ -68,7 +76,7 @@ def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     assert (braking.brake_reason, braking.command_age_s) == (NO_COMMAND, None)  # It obeys none.
     assert braking.undriven_s == pytest.approx(0.21)
     # Without any command it brakes as late.
-    hold = CommandHold(now_s=5.0)
+    hold = CommandHold(5.0, T)
     assert [hold.decide(now_s).brake_reason for now_s in (5.2, 5.201)] == ["", NO_COMMAND]
     # A command is as old as the state that it answers.
     hold.admit(make_command(0), now_s=5.26, sent_s=5.2)
@@ -76,8 +84,42 @@ def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     assert ages_s == pytest.approx([0.125, 0.225])
 
 
+@given(plan=st.lists(st.floats(-1, 1), max_size=10), now_s=st.lists(st.floats(0, 3), max_size=40))
+def test_a_plan_is_played_period_by_period_and_no_longer_than_it_says(plan, now_s):
+    further = [[value] for value in plan]
+    hold = CommandHold(0.0, T)
+    hold.admit(make_command(0, action=[0.2], plan=further), now_s=0.0, sent_s=0.0)
+    for at_s in sorted(now_s):
+        found = hold.decide(at_s)
+        rides_s = 2 * T + len(plan) * T + 1e-9
+        assert (found.brake_reason == NO_COMMAND) == (at_s > rides_s)
+        if not found.brake_reason:
+            place = min(int((at_s + 1e-9) / T), len(plan))
+            assert found.ridden == place
+            assert found.command is not None
+            assert found.command.action == [[0.2], *further][place]
+    # Whatever it rides on, a stop and a newer command end it at once, and it waits for no plan.
+    last_s = max(now_s, default=0.0)
+    hold.admit(make_command(1, mode="safe_stop", reason="vehicle_fault", plan=further), last_s, 0.0)
+    stopped = hold.decide(last_s)
+    assert (stopped.brake_reason, stopped.ridden) == ("vehicle_fault", 0)
+    hold.admit(make_command(2, action=[-0.5]), last_s, 0.0)
+    newer, late = hold.decide(last_s), hold.decide(last_s + 2.1 * T)
+    assert newer.command == make_command(2, action=[-0.5])
+    assert (newer.ridden, late.brake_reason) == (0, NO_COMMAND)
+
+
+def test_a_plan_may_last_a_second_whatever_the_period():
+    task = msgspec.structs.replace(TASK, control_period_s=0.3)
+    check = inbound.CommandCheck("here", task)
+    check.begin(0)
+    check.sent(5)
+    taken = [check.read(encode(make_command(5, plan=[[0.1]] * n))) is not None for n in (3, 4)]
+    assert (taken, dict(check.rejected)) == ([True, False], {"plan_too_long": 1})
+
+
 def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
-    hold = CommandHold(now_s=0.0)
+    hold = CommandHold(0.0, T)
     stop = make_command(3, mode="safe_stop", reason="no_fresh_state")
     for command, now_s, is_taken in [
         (make_command(3), 0.0, True), (make_command(3), 0.1, False), (make_command(2), 0.1, False),
@@ -88,7 +130,7 @@ def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
 
 
 def test_lock_step_brakes_at_once_when_the_edge_is_silent():
-    hold = CommandHold(now_s=0.0)
+    hold = CommandHold(0.0, T)
     hold.admit(make_command(0), now_s=0.0, sent_s=0.0)
     decision = hold.decide(0.025, edge_silence_s=0.21)
     assert (decision.brake_reason, decision.undriven_s) == (NO_COMMAND, 0.21)
@@ -96,7 +138,7 @@ def test_lock_step_brakes_at_once_when_the_edge_is_silent():
 
 def decisions(*reasons):
     """Decisions of a hold that is silent in the ticks with a reason."""
-    hold = CommandHold(now_s=0.0)
+    hold = CommandHold(0.0, T)
     return [hold.decide(0.0, 0.25 if reason else None) for reason in reasons]
 
 
@@ -153,12 +195,12 @@ def test_after_silence_another_board_with_a_slow_clock_is_believed():
     assert dict(check.rejected) == {"stale": 1}
 
 
-HEARD = CommandHold(now_s=0.0).decide(0.0)
-STOPPED = CommandHold(now_s=0.0).decide(0.0, edge_silence_s=0.3)
+HEARD = CommandHold(0.0, T).decide(0.0)
+STOPPED = CommandHold(0.0, T).decide(0.0, edge_silence_s=0.3)
 
 
 def decide(feedback, after_s=0.05, heard=HEARD, received_s=1.0):
-    hold = inbound.FeedbackHold(now_s=0.0)
+    hold = inbound.FeedbackHold(0.0, T)
     hold.admit(feedback, received_s=received_s, now_s=1.0)
     return hold.decide(heard, 0, now_s=1.0 + after_s)
 
@@ -173,7 +215,7 @@ def test_feedback_holds_for_2_periods_and_no_longer():
     delayed = decide(make_feedback(3), received_s=0.7)
     assert (delayed.brake_reason, delayed.feedback_age_s) == ("", pytest.approx(0.35))
     # A command that nobody obeys has no age.
-    hold = CommandHold(now_s=0.0)
+    hold = CommandHold(0.0, T)
     hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
     heard, stopped = hold.decide(0.05), make_feedback(3, mode="safe_stop")
     assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
@@ -217,7 +259,10 @@ class PedalEnv(ToyEnv):
     ],
 )
 def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied):
-    action = vehicle_action(names.split())(environment(), decide(make_feedback(3, **changes)))
+    env, names = environment(), names.split()
+    env.action_space = spaces.Box(-1.0, 1.0, (len(names),), np.float32)
+    apply = vehicle_action(names, getattr(env, "pedal_for_speed", None))
+    action = apply(Actuators(env, [-1.0]), decide(make_feedback(3, **changes)))
     assert (action.dtype, action.tolist()) == (np.float32, pytest.approx(applied))
 
 
@@ -233,11 +278,12 @@ class SteeredEnv(ToyEnv):
 
 def test_a_steered_car_brakes_when_its_vehicle_does():
     environment, apply = SteeredEnv(), vehicle_action(["steering"])
+    actuators = Actuators(environment, [None])
     stop = decide(make_feedback(3, mode="safe_stop", action=[0.5]))
-    assert apply(environment, stop).tolist() == [0.5]
-    assert apply(environment, decide(make_feedback(3))).tolist() == [0.5]
+    assert apply(actuators, stop).tolist() == [0.5]
+    assert apply(actuators, decide(make_feedback(3))).tolist() == [0.5]
     silent = decide(make_feedback(3), after_s=1.0)
-    assert apply(environment, silent).tolist() == [pytest.approx(0.1)]
+    assert apply(actuators, silent).tolist() == [pytest.approx(0.1)]
     assert environment.pressed == [True, False, True]
 
 

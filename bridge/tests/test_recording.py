@@ -48,11 +48,16 @@ from bridge.tests.harness import (
 from bridge.tests.test_inbound import health
 from bridge.tests.test_replay import Hand
 from edge_runtime.config import Config
+from edge_runtime.manifest import Entry, Task
 from edge_runtime.policy import load_policy
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.tests.policies import SIZE, TASK
+from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, State, decode_state, encode
+from edge_runtime.wire import MAX_STATE_BYTES, State, decode_state, encode
+
+ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 
 
 def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
@@ -75,10 +80,12 @@ def writing(path: Path, dropped: int = 0):
 
 
 def test_the_picture_is_what_the_policy_saw(tmp_path):
-    frames = bytes(range(256)) * (FRAMES_BYTES // 256) + bytes(FRAMES_BYTES % 256)
+    frames = bytes(range(256)) * (SIZE // 256) + bytes(SIZE % 256)
     path = tmp_path / "runs" / "a.mcap"
     with writing(path) as writer:
-        state = encode(make_state(3, frames=frames))
+        told = encode_scene({}, Stamps(0, 3, 0.3, task=TASK))
+        writer.write(heard("scene", told))  # it says how to read the states
+        state = encode(make_state(3, observation={"frames": frames}))
         writer.write(heard("state", state, arrived_ns=5 * 10**9 + 7))
     (data,) = (data for topic, _, data in told_in(path) if topic == "view/v/frames")
     image = describe(RawImage).make.FromString(data)
@@ -90,14 +97,14 @@ def test_the_picture_is_what_the_policy_saw(tmp_path):
 def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
     with writing(tmp_path / "a.mcap", dropped=3) as writer:
         writer.write(heard("state", b"junk"))
-        writer.write(Heard("phil/v/state", "state", b"", 2, MAX_PAYLOAD_BYTES + 1))
+        writer.write(Heard("phil/v/state", "state", b"", 2, MAX_STATE_BYTES + 1))
         writer.write(heard("alive", b"\x01"))
     recording = Recording(tmp_path / "a.mcap")
     found = [(topic, data) for topic, _, data in map(told, recording.messages())]
     assert {("phil/v/state", b"junk"), ("phil/v/alive", b'{"here": true}')} <= set(found)
     events = [data for topic, data in found if topic == "view/v/events"]
     assert b"unreadable" in events[0]
-    assert b"65537 bytes" in events[1]
+    assert b"4194305 bytes" in events[1]
     assert recording.metadata == {"messages": "3", "dropped": "3"}
 
 
@@ -107,6 +114,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     good = [
         encode(make_state(1, episode=2**63)), encode(make_state(1)), encode(make_command(1)),
         encode(health(1, 2.0, stale=2**63)), encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
+        encode_scene({}, Stamps(1, 1, 0.1, task=ODD)),
     ]  # fmt: skip
     with writing(tmp_path / "a.mcap") as writer:
         for number in range(3000):
@@ -328,7 +336,7 @@ def repair(capsys):
     return repaired
 
 
-@pytest.mark.parametrize("number", [0, 3, 29], ids=["first", "middle", "last"])
+@pytest.mark.parametrize("number", [0, 3, -1], ids=["first", "middle", "last"])
 @pytest.mark.parametrize("damage", ["contents", "length", "opcode", "all zero, as a disk does"])
 def test_only_the_broken_chunk_is_lost(copy, damage, number):
     index = chunks(copy)[number]

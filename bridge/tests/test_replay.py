@@ -8,9 +8,9 @@ from bridge.messages import Heard
 from bridge.record import RecordingWriter
 from bridge.tests.harness import BridgeProcess, bridge_status, make_command, make_policy, start_edge
 from bridge.tests.test_inbound import health
-from edge_runtime.tests.harness import BLACK, WHITE, make_state
-from edge_runtime.transport import free_endpoint
-from edge_runtime.wire import FRAMES_BYTES, encode
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import BLACK, WHITE, frames, make_state
+from edge_runtime.wire import encode
 
 EPOCH_NS = 1_700_000_000 * 10**9
 ANSWER_S, INFERENCE_S = 0.002, 0.001
@@ -31,7 +31,9 @@ class Hand:
         self.writer.write(Heard(key, topic, payload, ns(at_s), len(payload)))
 
     def state(self, at_s, step, **changes):
-        self.hear(at_s, "state", make_state(step, session="here", **changes))
+        self.hear(
+            at_s, "state", make_state(step, session="here", **{"sent_ns": ns(at_s), **changes})
+        )
 
     def command(self, at_s, step, answer_s=ANSWER_S, **changes):
         stamps = {
@@ -123,6 +125,25 @@ def test_a_gap_is_braked_for_as_it_was_and_five_states_later_it_drives(hand):
     assert report["by_recorded"]["safe_stop: no_fresh_state"] == {"compared": 5, "different": 0}
 
 
+def test_plans_are_compared_and_ridden_over_a_gap_as_they_were(hand):
+    plan = [[0.3]] * 5
+    hand.drive(0, 5, plan=plan)
+    hand.drive(11, 15, plan=plan)  # 0.7 s without a state: it rode on.
+    assert is_the_same(hand, compared=9)
+
+
+@pytest.mark.parametrize("mock", [False, True])
+def test_another_plan_differs_and_a_longer_gap_is_braked_for(tmp_path, mock):
+    for name, last, other in (("plan", 0.31, 5), ("gap", 0.3, 12)):
+        hand = Hand(tmp_path / f"{name}.mcap")
+        if mock:
+            hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="mock"))
+        hand.drive(0, 5, plan=[[0.3]] * 4 + [[0.3]])
+        hand.drive(other, other + 1, plan=[[0.3]] * 4 + [[last]])
+        status, report = replay(hand)
+        assert (status, report["compared"], report["different"]) == (1, 6, 1 + (name == "gap"))
+
+
 def test_a_runtime_that_drives_too_early_is_found_out(hand):
     hand.drive(0, 5)
     hand.drive(8, 12)  # Nobody braked over the gap.
@@ -163,7 +184,7 @@ def test_a_recorder_that_was_held_up_changes_nothing(hand):
 
 def test_a_policy_that_answers_nan_brakes_where_the_recorded_one_drove(hand, tmp_path):
     hand.drive(0, 2)
-    hand.state(0.2, 2, frames=bytes([WHITE]) * FRAMES_BYTES)
+    hand.state(0.2, 2, observation=frames(WHITE))
     hand.command(0.2 + ANSWER_S, 2)
     status, report = replay(hand, make_policy(tmp_path, "nan", 0.3))
     assert (status, report["different"]) == (1, 1)
@@ -191,9 +212,9 @@ def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
     hand.drive(20, 23)
     assert is_the_same(hand, compared=23)
     settings = tmp_path / "edge.toml"
-    settings.write_text("vehicle = 'hunter'\n[similarity]\nscale = 0.2\n")
+    settings.write_text("vehicle.driver = 'hunter'\nvehicle.hunter.scale = 0.2\n")
     assert replay(hand, None, "--config", str(settings))[0] == 0
-    settings.write_text("[similarity]\nscale = -1\n")
+    settings.write_text("[vehicle.hunter]\nscale = -1\n")
     assert replay(hand, None, "--config", str(settings))[0] == 2
 
 
@@ -205,6 +226,13 @@ def test_a_repeated_stop_just_before_or_after_the_next_state_is_no_difference(ha
     hand.state(1.0, 10)
     hand.command(1.0 + 2 * ANSWER_S, 10, answer_s=2 * ANSWER_S, inference_ns=3 * 10**6)
     assert is_the_same(hand, compared=11)
+
+
+def test_a_watchdog_that_woke_with_the_state_after_the_silence_is_no_difference(hand):
+    hand.drive(0, 3)
+    hand.state(0.425, 3)  # 2.25 T after the last one
+    hand.command(0.425 + ANSWER_S, 3, **SAFE_STOP)
+    assert is_the_same(hand, compared=4)
 
 
 def test_of_several_vehicles_one_is_named(hand, tmp_path, capsys, refusal):
@@ -240,7 +268,7 @@ def test_no_terminal_obeys_what_a_recording_holds(hand, tmp_path, capsys):
 def test_through_a_running_edge_runtime(hand, tmp_path):
     hand.drive(0, 10)
     for step in range(10, 12):
-        hand.state(step * 0.1, step, frames=bytes([BLACK]) * FRAMES_BYTES, final=step == 11)
+        hand.state(step * 0.1, step, observation=frames(BLACK), final=step == 11)
         hand.command(step * 0.1 + ANSWER_S, step)
     hand.close()
     endpoint, out = free_endpoint(), tmp_path / "live.json"

@@ -1,7 +1,6 @@
 """The views in rerun: geometry, pace, where a recording goes, and `bridge view` beside a drive."""
 
 import math
-import os
 import re
 import shutil
 import signal
@@ -15,7 +14,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from hypothesis import given
 from hypothesis import strategies as st
-from rerun.chunk import RrdReader
 
 import bridge.rerun
 from bridge import messages
@@ -26,9 +24,11 @@ from bridge.rerun.wire_view import Timeline, WireLog
 from bridge.tests import harness
 from bridge.tests.toy import ToyEnv
 from bridge.tests.viewers import NO_GPU, in_place, listens
-from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.transport import free_endpoint
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import HEALTH, make_state, wait_until
+from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
+from edge_runtime.wire import encode
 
 
 def test_a_car_that_heads_down_the_picture_is_long_in_y():
@@ -50,6 +50,7 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
 
 def test_episodes_stand_end_to_end():
     timeline = Timeline()
+    timeline.period_s = 0.1
     steps = [timeline.place(*place).total_step for place in ((0, 0), (0, 7), (1, 0), (0, 5))]
     assert steps == [0, 7, 8, 5]
     late = timeline.place(1, 2)
@@ -93,19 +94,6 @@ def test_what_comes_faster_is_thinned_out_and_a_pause_brings_no_burst():
 
 def opened(kind, path=""):
     return open_sink(Sink(kind, str(path)), "test", rrb.Blueprint())
-
-
-def test_sigterm_finishes_the_file(tmp_path):
-    out = tmp_path / "a.rrd"
-
-    with pytest.raises(KeyboardInterrupt), opened("save", out) as recording:  # noqa: PT012
-        recording.log("speed", rr.Scalars(3.0))
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(5.0)
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
-    found = [chunk.entity_path for chunk in RrdReader(str(out)).stream().to_chunks()]
-    assert "/speed" in found
 
 
 def test_a_link_to_a_file_stays_and_the_folder_of_a_file_is_made(tmp_path):
@@ -173,7 +161,7 @@ def test_a_window_listens_on_loopback_only_and_stays_open(tmp_path, monkeypatch)
         ("ends at once", NO_GPU),
         ("never listens", "does not listen after 1 s"),
         ("is killed", "it was closed"),
-        ("hangs", "timed out"),
+        ("hangs", "(timed out|it hangs)"),  # drawing, or at the end
     ],
 )
 def test_a_viewer_that_is_gone_is_one_plain_error(where, kind, why, tmp_path, monkeypatch):
@@ -235,6 +223,18 @@ def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
     assert events == ["no command: the simulator brakes by itself"]
 
 
+def test_a_ride_is_shown_and_no_silence(kept, monkeypatch):
+    log, events = WireLog(rr.RecordingStream("test")), []
+    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+    log.write_state(make_state(7), 10**18)
+    log.write_command(harness.make_command(7, plan=[[0.1]] * 5), 10**18)
+    for step, ridden in ((8, 0), (9, 1), (10, 2)):
+        log.write_state(make_state(step), 10**18 + (step - 7) * 10**8)
+        log.write_scene(make_scene(ridden=ridden), 10**18)
+    log.write_command(harness.make_command(10), 10**18)
+    assert events == ["drive", "drive: rides on the plan", "drive"]
+
+
 @pytest.mark.parametrize("damaged", [False, True])
 def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(damaged, tmp_path, capsys):
     path, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
@@ -285,14 +285,20 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
     assert kept["latency/downlink"] == pytest.approx([60.0 - 26.0])
 
 
-def test_rejections_are_counted_by_side_and_reason(kept):
-    log = WireLog(rr.RecordingStream("test"))
+def test_rejections_are_counted_by_side_and_reason(kept, monkeypatch):
+    log, events = WireLog(rr.RecordingStream("test")), []
+    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
     for count in (0, 2, 5):
         log.write_scene(make_scene(rejected={"stale": count}), 10**18)
-    assert kept == {
-        "rejected/simulator/all": [0, 2, 5],
-        "rejected/simulator/stale": [0, 2, 5],  # From zero, so that the line shows the step.
-    }
+        log.write_health(msgspec.structs.replace(HEALTH, rejected={"stale": count}), 10**18)
+    # From zero, so that the line shows the step.
+    sides = [f"rejected/{side}/{of}" for side in ("simulator", "edge") for of in ("all", "stale")]
+    assert kept == {path: [0, 2, 5] for path in sides}
+    assert events == [f"edge rejected {new} states: stale" for new in (2, 3)]
+    for payload in (b"\xc1", encode(harness.make_feedback(3, speed_mps=0.5))):
+        log.write(messages.Heard("", "feedback", payload, 10**18, len(payload)))
+    assert [event.split(": ")[0] for event in events[2:]] == ["unreadable feedback"]
+    assert kept["speed/vehicle"] == [0.5]
 
 
 def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
@@ -306,6 +312,8 @@ def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
     for interval_s, expected in ((0.1, 2 * 11), (0.0, 2 * 101)):
         drawn.clear()
         log = WireLog(rr.RecordingStream("test"), interval_s)
+        told = messages.encode_scene({}, messages.Stamps(0, 0, 0.0, task=TASK))
+        log.write_scene(messages.DECODERS["scene"](told), 10**18)  # says how to read the states
         for step in range(101):  # A lock-step drive at ten times real time.
             log.write_state(make_state(step), 10**18 + step * 10**7)
         assert len(drawn) == pytest.approx(expected, abs=2)

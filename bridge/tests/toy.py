@@ -14,6 +14,9 @@ PERIOD_S = 0.1
 class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """Full pedal is 3 m/s2, full brake -4 m/s2; the picture's brightness follows the distance."""
 
+    scenario, action_names, observation_name = "left_turn", ("pedal",), "frames"
+    control_period_s = PERIOD_S
+
     def __init__(self, goal_m=GOAL_M, max_steps=80, wall_s=0.0, reward=0.1) -> None:
         self.observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.certs import write_key_pair
 from deploy.installer.verify import Target
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.policies import public_pem, write_policy
-from edge_runtime.transport import free_endpoint
 
 QUICK = ("--settle", "0.2")
 PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"

@@ -29,6 +29,7 @@ from deploy.bundle import (
     gather,
     lock_path,
     make_bundle,
+    pip,
     read_lock,
 )
 from deploy.installer import verify
@@ -124,7 +125,9 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
         ("allow_unsigned = true", "allow_unsigned is the bundle's to say"),
         ('vehicle = "mock"\narmed_at_start = true', "armed_at_start would let a machine move"),
         ('connect = "tls/10.0.0.1:7447"', "needs certificates"),
-        ('vehicle = "tank"', "choose from"),
+        ('vehicle = "tank"', "in no wheel of the bundle: .*--with, or choose from none, mock, hu"),
+        ('vehicle = "carts:Cart"', "'carts:Cart' is in no wheel"),
+        ('[vehicle]\ndriver = "hunter"\nhunter.speed = 3', "vehicle.hunter: .*unknown field"),
         ("no toml", "is no TOML"),
         ("\udcff", "is no TOML"),
     ],
@@ -134,6 +137,30 @@ def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text, match):
     config.write_bytes(os.fsencode(text))
     with pytest.raises(UserError, match=match):
         workshop.make(config=config)
+
+
+@pytest.mark.parametrize("vehicle", ["rover", "my_vehicle:Rover"])
+def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(
+    workshop, board, tmp_path, vehicle
+):
+    words = ("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path))
+    pip(*words, str(ROOT / "examples/my_vehicle"))
+    (wheel,) = tmp_path.glob("*.whl")
+    config = tmp_path / "c.toml"
+    config.write_text(f'connect = "{workshop.endpoint}"\nvehicle = "{vehicle}"\n')
+    inputs = [workshop.edge_wheel, workshop.host, wheel]
+    made = workshop.make(wheels=inputs, config=config)
+    assert read(made)["wheels/my_vehicle-0.1.0.whl"] == wheel.read_bytes()
+    assert board.install(made.path).returncode == 0
+    site = Layout(str(board.root)).release(made.manifest.version) / "site-packages"
+    assert (site / "my_vehicle.py").exists()
+    launcher = site.parent / "bin/phil-edge"
+    start = (launcher, "run", "--policy", "absent.onnx", "--vehicle")
+    for name, said in ((vehicle, "absent.onnx does not exist"), ("tank", "rover, or a module")):
+        ended = subprocess.run([*start, name], capture_output=True, text=True)
+        assert (ended.returncode, said in ended.stderr) == (2, True), ended.stderr
+    with pytest.raises(UserError, match="the bundle has another my_vehicle"):
+        workshop.make(wheels=[*inputs, wheel])
 
 
 def test_a_bundle_of_somebody_elses_policy_or_key_or_a_long_name_is_refused(workshop, tmp_path):
@@ -316,7 +343,6 @@ def changed(path):
 
 
 def test_any_one_byte_changed_is_found(bundle):
-    """`python -m hil_tests board` tries it with the installer on a board."""
     for _ in changed(bundle):
         refused(bundle, "is refused: its signature is not of the key")
     # A signature is text: a few changes, as of a line's end, leave what it says as it was.

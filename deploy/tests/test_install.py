@@ -207,7 +207,11 @@ def test_a_policy_that_may_not_drive_there_changes_nothing(board: Board, worksho
     good = workshop.make(0.1)
     assert board.install(good.path).returncode == 0
     wheel = changed_wheel(
-        workshop.edge_wheel, tmp_path / "w", "edge_runtime/policy.py", "OPSET = 17", "OPSET = 18"
+        workshop.edge_wheel,
+        tmp_path / "w",
+        "edge_runtime/policy.py",
+        "range(13, 22)",
+        "range(18, 22)",
     )
     done = board.install(workshop.make(0.2, wheels=[wheel, workshop.host]).path)
     assert done.returncode == 1

@@ -17,6 +17,7 @@ import zenoh
 from edge_runtime import wire
 from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
+from edge_runtime.tests.policies import SIZE
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 
@@ -25,12 +26,17 @@ PATIENCE_S = 20.0
 BLACK, WHITE = 0, 255
 
 
+def frames(level: int) -> Dict[str, bytes]:
+    """The observation of pictures that are grey throughout."""
+    return {"frames": bytes([level]) * SIZE}
+
+
 def make_state(step: int, **changes: Any) -> State:
     """A valid black state; `changes` replace its fields."""
     fields: Dict[str, Any] = {
         "session": "simulator-a", "episode": 0, "step": step,
-        "sim_time_s": step * wire.CONTROL_PERIOD_S, "sent_ns": time.time_ns(),
-        "frames": bytes([BLACK]) * wire.FRAMES_BYTES, "speed_mps": 1.0, "final": False,
+        "sim_time_s": step * 0.1, "sent_ns": time.time_ns(),
+        "observation": frames(BLACK), "speed_mps": 1.0, "final": False,
     }  # fmt: skip
     return State(**{**fields, **changes})
 

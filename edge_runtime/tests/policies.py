@@ -4,6 +4,7 @@ import hashlib
 from pathlib import Path
 from typing import Any, Dict, Optional, Sequence
 
+import msgspec
 import numpy as np
 import onnx
 import onnx.parser
@@ -11,17 +12,33 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import helper, numpy_helper
 
-from edge_runtime.policy import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
+from edge_runtime.manifest import (
+    MANIFEST_KEY,
+    Action,
+    Car,
+    Entry,
+    Manifest,
+    Task,
+)
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
 FAULT_BRIGHTNESS = 200.0
-SLOW_LOOPS = 1500
-_SLOW_SIZE = 256
+SLOW_LOOPS = 50_000
+_SLOW_SIZE = 512
 
 PEDAL, STEERING = (
-    Action(name=name, meaning="m", unit="u", low=-1.0, high=1.0) for name in ("pedal", "steering")
+    Action(name=name, meaning="m", unit="u", low=-1.0, high=1.0, stop=stop)
+    for name, stop in (("pedal", -1.0), ("steering", None))
 )
+SHAPE = (2, 45, 80)
+SIZE = 2 * 45 * 80
+FRAMES = {"frames": Entry(dtype="uint8", shape=list(SHAPE), meaning="[t-1, t]")}
+T = 0.1
+CAR = Car(
+    throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.785, wheelbase_m=5.0
+)
+TASK = Task(task="left_turn", observation=FRAMES, action=[PEDAL], control_period_s=T)
 
 
 def write_policy(
@@ -34,28 +51,48 @@ def write_policy(
     opset: int = 17,
     ir_version: int = 8,
     loops: int = SLOW_LOOPS,
+    graph: str = "",
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" the mean brightness scaled to [-1, 1]; "nan" is
     "constant" until the frames are brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then
-    takes about a second at SLOW_LOOPS `loops`, and in proportion at others.
+    takes about a second at SLOW_LOOPS `loops`, and in proportion at others. `graph` is another
+    network, in ONNX's text form; it may name the constant `ten`.
     """
-    graph = _graph(kind, value, len(actions), loops)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
+    made = _own_graph(graph) if graph else _graph(kind, value, len(actions), loops)
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
     fields: Dict[str, Any] = {
-        "scenario": "left_turn", "algorithm": "test", "observation": Observation(),
-        "action": list(actions), "training": training, "created": "2025-01-01T00:00:00Z",
+        "task": "left_turn", "algorithm": "test", "observation": FRAMES, "action": list(actions),
+        "control_period_s": T, "car": CAR, "training": training, "created": "2025-01-01T00:00:00Z",
     }  # fmt: skip
     manifest = Manifest(**{**fields, **(manifest_changes or {})})
-    helper.set_model_props(model, {MANIFEST_KEY: encode_manifest(manifest)})
+    helper.set_model_props(model, {MANIFEST_KEY: msgspec.json.encode(manifest).decode()})
     data = model.SerializeToString()
     Path(path).write_bytes(data)
     if key is not None:
         Path(f"{path}.sig").write_bytes(key.sign(data))
     return hashlib.sha256(data).hexdigest()
+
+
+ROVER = {
+    "camera": Entry(dtype="uint8", shape=[4, 6, 3]),
+    "ranges": Entry(dtype="float32", shape=[2]),
+    "lit": Entry(dtype="bool", shape=[]),
+}
+ROVER_INPUTS = {"camera": "uint8[b, 4, 6, 3]", "ranges": "float[b, 2]", "lit": "bool[b]"}
+WHEELS = [*(Action(name=name, low=-40.0, high=80.0, stop=0.0) for name in ("left", "right"))]
+
+
+def write_rover(path: Any, kinds: Dict[str, str] = ROVER_INPUTS, **changes: Any) -> str:
+    """A policy of another kind of robot: its wheels are its ranges, tenfold."""
+    inputs = ", ".join(f"{kind} {name}" for name, kind in kinds.items())
+    graph = f"rover ({inputs}) => (float[b, 2] action) {{ action = Mul(ranges, ten) }}"
+    fields = {"task": "rover", "observation": ROVER, "control_period_s": 0.02, "car": None}
+    options: Dict[str, Any] = {"opset": 21, "ir_version": 10, "actions": WHEELS}
+    return write_policy(path, graph=graph, manifest_changes={**fields, **changes}, **options)
 
 
 def public_pem(key: Any) -> bytes:
@@ -72,19 +109,25 @@ _ANSWERS = {
     # The root of a negative number is NaN, and NaN times zero stays NaN.
     "nan": """room = Sub(fault_brightness, mean) root = Sqrt(room) nothing = Mul(root, zero)
         answer = Add(nothing, value)""",
-    # Multiplies matrices in a loop, `loops` times for bright frames and never for others.
+    # A recurrent network over `loops` steps for bright frames, and over one for others.
     "slow": """is_bright = Greater(mean, fault_brightness) bright = Cast<to = 7>(is_bright)
-        trips = Mul(bright, loops)
-        result = Loop(trips, always, matrix)<body =
-            multiply (int64 index, bool going, float[] carried) => (bool go_on, float[] product) {
-                go_on = Identity(going) product = MatMul(carried, carried)
-            }>
-        level = ReduceMean<axes = [0, 1], keepdims = 0>(result)
-        nothing = Mul(level, zero) answer = Add(nothing, value)""",
+        more = Mul(bright, loops) steps = Add(more, last_axis)
+        shape = Concat<axis = 0>(steps, last_axis, last_axis)
+        sequence = ConstantOfShape(shape)
+        every, level = RNN<hidden_size = 512>(sequence, inward, recurrent)
+        sum = ReduceSum<keepdims = 0>(level) nothing = Mul(sum, zero)
+        answer = Add(nothing, value)""",
 }
 
 
+def _own_graph(text: str) -> onnx.GraphProto:
+    graph = onnx.parser.parse_graph(text)
+    graph.initializer.append(numpy_helper.from_array(np.array(10.0, np.float32), "ten"))
+    return graph
+
+
 def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
+    size = _SLOW_SIZE if kind == "slow" else 1
     weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
@@ -93,8 +136,8 @@ def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphPro
         "ones": np.ones((1, n_actions), np.float32),
         "loops": np.array([loops], np.int64),
         "last_axis": np.array([1], np.int64),
-        "always": np.array(True),
-        "matrix": np.eye(_SLOW_SIZE if kind == "slow" else 1, dtype=np.float32),
+        "inward": np.zeros((1, size, 1), np.float32),
+        "recurrent": np.zeros((1, size, size), np.float32),
     }
     graph = onnx.parser.parse_graph(
         f"""test_{kind} (uint8[batch, 2, 45, 80] frames) => (float[batch, {n_actions}] action) {{
@@ -105,6 +148,9 @@ def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphPro
             action = Mul(column, ones)
         }}"""
     )
+    for node in graph.node:
+        if node.op_type == "RNN":
+            node.output[0] = ""  # one of the two outputs would fill the memory
     graph.initializer.extend(
         numpy_helper.from_array(array, name) for name, array in weights.items()
     )

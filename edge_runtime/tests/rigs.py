@@ -2,21 +2,34 @@
 
 import math
 
-from edge_runtime.config import CarSettings, Ros2Settings
+from edge_runtime.manifest import Manifest
+from edge_runtime.tests.policies import FRAMES, STEERING, T
+from edge_runtime.tests.policies import PEDAL as PEDAL_ACTION
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.ros2 import STEERING, Ros2Core
+from edge_runtime.vehicles.mapping import SPECS, ScenarioCar, similarity_to
+from edge_runtime.vehicles.ros2 import STEERING as ANGLE
+from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
 
 SPEC = SPECS["2.0"]
+CARS = {
+    "left_turn": ScenarioCar(3.0, 4.0, 6.0, math.pi / 4, 5.0),
+    "congestion": ScenarioCar(3.0, 4.0, 6.0, -0.15, 5.0),  # its action +1 turns right
+}
 LEFT_TURN, CONGESTION = (similarity_to(CARS[name], SPEC) for name in ("left_turn", "congestion"))
 OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
 STREAM_S = 0.02
 PEDAL = {"pedal": 1.0}
-CAR = CarSettings(
-    throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=5.0, full_steering_rad=0.3, wheelbase_m=1.0
-)
+CAR = ScenarioCar(1.0, 2.0, 5.0, 0.3, 1.0)
+
+
+def a_manifest(car=CARS["left_turn"], **changes):
+    fields = {
+        "task": "parking", "observation": FRAMES, "action": [PEDAL_ACTION, STEERING],
+        "control_period_s": T, "algorithm": "", "training": {}, "created": "",
+    }  # fmt: skip
+    return Manifest(car=car, **{**fields, **changes})
 
 
 class Rig:
@@ -24,6 +37,7 @@ class Rig:
 
     def __init__(self, core):
         self.core, self.now_s, self.ticks = core, 100.0, 0
+        core.follow_period(T)
         self.obeys = self.talks = True
         self.speed_mps = self.inner_rad = 0.0
         self.sent = []  # each frame or message with its time
@@ -130,7 +144,7 @@ class Ros2Rig(Rig):
                 self.inner_rad = SPEC.inner_rad(self.centre_rad)
         if self.talks:
             angular = self.centre_rad
-            if self.settings.odometry_angular != STEERING:
+            if self.settings.odometry_angular != ANGLE:
                 angular = self.speed_mps * math.tan(self.centre_rad) / SPEC.wheelbase_m
             angular = angular if self.angular is None else self.angular
             self.core.hear(round(self.now_s * 1e9), self.speed_mps, angular, self.now_s)

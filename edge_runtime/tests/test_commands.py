@@ -7,6 +7,7 @@ import subprocess
 import sys
 from argparse import ArgumentTypeError
 from pathlib import Path
+from typing import Tuple, Type
 
 import msgspec
 import pytest
@@ -17,11 +18,15 @@ import edge_runtime
 from edge_runtime import cli
 from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
-from edge_runtime.config import Config, load_config
+from edge_runtime.config import BUILT_IN, Config, convert, load_config
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import HEALTH, Simulator, exit_status, run_command
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter import HunterSettings
+from edge_runtime.vehicles.mock import MockParameters
+from edge_runtime.vehicles.ros2 import Ros2Settings
 
 
 def fails_with_one_line(result, *words):
@@ -46,7 +51,7 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     report = json.loads(result.stdout)
     assert report == json.loads(out.read_text())
     assert report["policy_id"] == hashlib.sha256(signed.path.read_bytes()).hexdigest()
-    assert report["manifest"]["scenario"] == "left_turn"
+    assert report["manifest"]["task"] == "left_turn"
     assert 0 < report["inference_ms"]["p50"] <= report["inference_ms"]["max"]
 
 
@@ -72,7 +77,6 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["check"], ["POLICY.onnx"]),
         (["run"], ["--policy"]),
         (["run", "--policy", "p.onnx", "--vehicle", "tank"], ["tank", "none, mock, hunter"]),
-        (["run", "--policy", "p.onnx", "--bus", "can0"], ["can0", "socketcan:can0"]),
         (["run", "--policy", "p.onnx", "--bus", "socketcan:can0"], ["--vehicle hunter", "none"]),
         (["run", "--policy", "p.onnx", "--bus", ""], ["empty value after --bus"]),
         (["run", "--policy", "p.onnx", "--connect", "localhost"], ["tcp/127.0.0.1:7447"]),
@@ -103,7 +107,6 @@ WRONG = {
     "speed = 3": "speed.*known are policy, connect",
     "policy = 3": "policy: Expected `str",
     "policy = ": "is no TOML",
-    "vehicle = 'tank'": "tank.*none, mock, hunter",
     "log_level = 'loud'": "log_level.*debug, info",
     "log_format = 'xml'": "log_format.*text, json",
     "realtime_priority = 100": "realtime_priority 100.*1 to 99",
@@ -114,20 +117,10 @@ WRONG = {
     "cpus = 'all'": "cpus: Expected `array",
     "connect = 'localhost'": "localhost.*write it as",
     "vehicle_id = 'a/b'": "a/b",
-    "bus = 'can0'": "bus 'can0'.*INTERFACE:CHANNEL",
-    "[hunter]\nmodel = '3.0'": "hunter.model '3.0'.*2.0, se",
-    "[hunter]\nprofile = 'v9'": "hunter.profile 'v9'.*v2, manual",
-    "[hunter]\nspeed = 3": "unknown field `speed`",
-    "[ros2]\ntopic = 1": "ros2: .* unknown field `topic`; known are model, listen,",
-    "vehicle = 'ros2'\n[ros2]\nconnect = 'tls/h:1'": "plain text",
-    "[similarity]\nscale = 0.0": "scale 0.0.*above 0",
-    "[similarity]\nscale = nan": "scale nan.*above 0",
-    "[similarity.car]\nthrottle_mps2 = 1.0": "brake_mps2",
-    "[similarity.car]\nthrottle = 1.0": "unknown field `throttle`; known are throttle_mps2",
-    "[similarity.car]\nthrottle_mps2 = 3.0\nbrake_mps2 = 4.0\nmax_speed_mps = 6.0\n"
-    "full_steering_rad = 2.0\nwheelbase_m = 5.0": (
-        "full_steering_rad 2.0 is not valid: it must be above 0 and below 1.5 rad, or below 0"
-    ),
+    "bus = 'can0'": "unknown field `bus`",
+    "vehicle = 3": "vehicle: Expected `str`",
+    "[vehicle]\nname = 'mock'": r"vehicle: name is no table, .*\[vehicle.NAME\]",
+    "[vehicle]\ndriver = 3": "vehicle: Expected `str`",
 }
 
 
@@ -150,22 +143,38 @@ def test_flags_win_over_the_file(settings):
     assert config == Config(policy="flag.onnx", vehicle_id="from_file", allow_unsigned=True)
 
 
-def test_a_bus_in_the_file_may_be_of_a_vehicle_that_is_off_but_not_on_the_command_line(settings):
-    path = settings("policy = 'p.onnx'\nbus = 'socketcan:can1'")
-    assert load_config(path, {}).vehicle == "none"
+def test_a_vehicles_table_may_be_of_one_that_is_off_and_the_flag_of_a_bus_may_not(settings):
+    path = settings("policy = 'p.onnx'\nvehicle.hunter = {bus = 'socketcan:can1', model = 'se'}")
+    config = load_config(path, {})
+    table = {"bus": "socketcan:can1", "model": "se"}
+    assert (config.vehicle, config.vehicle_settings) == ("none", {"hunter": table})
     for file in (path, None):
         flags = {"policy": "p.onnx", "bus": "socketcan:can0"}
         with pytest.raises(UserError, match="--bus needs --vehicle hunter"):
             load_config(file, flags)
-        assert load_config(file, {**flags, "vehicle": "hunter"}).bus == "socketcan:can0"
+        given = load_config(file, {**flags, "vehicle": "hunter"}).vehicle_settings["hunter"]
+        assert given == {**(table if file else {}), "bus": "socketcan:can0"}
 
 
 def test_the_example_config_holds_every_key_at_its_default():
     example = Path(edge_runtime.__file__).with_name("config.example.toml")
     config = load_config(example, {})
-    assert config == Config(policy="results/policies/left_turn.onnx")
+    tables = config.vehicle_settings
+    defaults = Config(policy="my.onnx", vehicle_settings=tables)
+    assert config == defaults
     text = example.read_text()
-    assert all(f"{name} =" in text or f"[{name}]" in text for name in Config.__struct_fields__)
+    places: Tuple[Type[msgspec.Struct], ...] = (MockParameters, HunterSettings, Ros2Settings)
+    for name, kind in zip(BUILT_IN, places):
+        assert convert(tables[name], kind) == kind()
+        assert f"[vehicle.{name}]" in text
+    kinds = (
+        *(name for kind in places for name in kind.__struct_fields__),
+        *Config.__struct_fields__,
+    )
+    assert [name for name in kinds if f"{name} =" not in text] == [
+        "ride_through",
+        "vehicle_settings",
+    ]
 
 
 def test_a_busy_port_is_named():
@@ -216,7 +225,7 @@ def test_an_error_or_a_status_holds_nothing_that_a_terminal_acts_upon():
     assert str(UserError("file \x1b]0;x\x07\nis not")) == "file \\x1b]0;x\\x07 is not"
     health = msgspec.structs.asdict(HEALTH)
     status = {key: HOSTILE if isinstance(value, str) else value for key, value in health.items()}
-    more = {"rejected": {HOSTILE: 1}, "manifest": {"scenario": HOSTILE}, "version": HOSTILE}
+    more = {"rejected": {HOSTILE: 1}, "manifest": {"task": HOSTILE}, "version": HOSTILE}
     table = render_status({**status, **more, "vehicle_fault": HOSTILE})
     assert all(line.isprintable() for line in table.splitlines())
 

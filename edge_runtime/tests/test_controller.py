@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from edge_runtime.controller import ActionLimit, Controller, Received, limit_action, shared_limits
+from edge_runtime.ride import Ride
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
 from edge_runtime.util import UserError
@@ -22,14 +24,14 @@ KINDS: dict = {  # of states that come, and how the policy answers them
     "nan": {"output": NAN},
     "final": {"final": True},
     "of another simulator": {"session": "simulator-b"},
-    "of our task": {"task": "left_turn, pedal -1 to 1"},
-    "of another task": {"task": "congestion, steering -1 to 1"},
-    "final nan of another task": {"task": "congestion", "final": True, "output": NAN},
+    "of our task": {"task": "ours"},
+    "of another task": {"task": "another"},
+    "final nan of another task": {"task": "another", "final": True, "output": NAN},
 }
 
 
 def make(needs_rearm=False, actions=(PEDAL,), vehicle=None, **options):
-    return Controller(shared_limits(actions, vehicle or {}), needs_rearm, **options)
+    return Controller(shared_limits(actions, vehicle or {}), T, needs_rearm, **options)
 
 
 def begin(controller, step, arrived_s, now_s, **changes):
@@ -39,6 +41,54 @@ def begin(controller, step, arrived_s, now_s, **changes):
 def answer(controller, step, now_s, output=GOOD, **changes):
     begin(controller, step, now_s, now_s, **changes)
     return controller.finish(output, QUICK_NS, now_s + 0.001)
+
+
+def test_a_vehicle_is_played_the_plan_until_it_ends_and_then_it_stops():
+    slow = {"pedal": ActionLimit(-1.0, 0.4, 1.0)}
+    limits = shared_limits([PEDAL], slow)
+    controller = Controller(limits, T, True, ride=Ride(0.59, T, limits, plays=True))
+    order = answer(controller, 0, 10.0)
+    plan = [round(value, 6) for (value,) in order.plan or []]
+    assert (order.action, plan) == ([pytest.approx(0.1)], [0.2, 0.3, 0.4, 0.4, 0.4])
+    told = []
+    while (due_s := controller.next_deadline_s() or 0.0) < 11.0:
+        order = controller.tick(due_s + 1e-6)
+        assert order is not None
+        told.append((round(due_s, 3), order.ridden, round(order.action[0], 3), order.reason))
+    assert told[:6] == [
+        (10.121, True, 0.2, ""), (10.221, True, 0.3, ""), (10.321, True, 0.4, ""),
+        (10.421, True, 0.4, ""), (10.521, True, 0.4, ""), (10.72, False, -1.0, "no_fresh_state"),
+    ]  # fmt: skip
+    assert not any(ridden for _, ridden, _, _ in told[6:])
+
+
+def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
+    limits = shared_limits([PEDAL], {})
+    controller = Controller(limits, T, False, ride=Ride(0.5, T, limits, plays=False))
+    for step, (arrived_s, sent_s, driven) in enumerate([
+        (10.0, 5.0, True), (10.1, 5.1, True), (10.6, 5.6, True),  # lost: as late as it was sent
+        (11.1, 5.7, False), (11.101, 5.8, False), (11.102, 5.9, True), (11.103, 6.0, True),
+        (11.104, 6.1, True), (11.2, 6.2, True), (11.3, 2.0, True), (11.4, 9.0, True),  # a clock
+        (11.8, 9.1, False), (11.9, 9.2, True),  # in step again
+    ]):  # fmt: skip
+        order = answer(controller, step, arrived_s, sent_ns=round(sent_s * 1e9))
+        assert (order is not None) == driven, step
+        assert order is None or order.mode == "drive"
+
+
+def test_an_end_of_the_episode_that_the_link_held_up_ends_the_ride():
+    limits = shared_limits([PEDAL], {})
+    controller = Controller(limits, T, True, ride=Ride(0.5, T, limits, plays=True))
+    answer(controller, 0, 10.0, sent_ns=10**10)
+    order = answer(controller, 1, 10.4, sent_ns=round(10.1e9), final=True)
+    assert (order.mode, order.reason) == ("safe_stop", "final_state")
+    assert controller.next_deadline_s() is None
+
+
+@pytest.mark.parametrize("max_s", [-1.0, 0.05, 1.1, math.nan, math.inf])
+def test_a_ride_is_one_period_to_one_second(max_s):
+    with pytest.raises(UserError, match=r"ride_through.max_s .* use 0.1 to 1 s, or 0 for off"):
+        Ride(max_s, T, shared_limits([PEDAL], {}), plays=True)
 
 
 def said(order):
@@ -171,7 +221,7 @@ STORIES = {
 @pytest.mark.parametrize("story", STORIES)
 def test_without_a_vehicle(story):
     safe_stops, misses, rows = STORIES[story]
-    controller = play(make(task="left_turn, pedal -1 to 1", armed_at_start=False), rows)
+    controller = play(make(task="ours", armed_at_start=False), rows)
     assert (controller.safety.safe_stops, controller.deadline_misses) == (safe_stops, misses)
     assert not controller.waits_for_rearm  # it needs no permission
 
@@ -206,10 +256,20 @@ def test_an_answer_to_a_state_older_than_two_periods_stops():
     assert said(controller.finish(GOOD, QUICK_NS, 0.901)) == TOO_LONG
 
 
-def test_a_safe_stop_holds_the_last_steering():
-    controller = make(actions=(PEDAL, STEERING))
-    answer(controller, 0, 0.0, np.array([0.4, -0.25], np.float32))
-    assert controller.tick(0.3).action == [-1.0, -0.25]
+def test_a_safe_stop_is_the_manifests_or_holds_the_last_value():
+    lift = replace(PEDAL, name="lift", low=-40.0, high=80.0, stop=12.5)
+    controller = make(actions=(PEDAL, STEERING, lift))
+    answer(controller, 0, 0.0, np.array([0.4, -0.25, 70.0], np.float32))
+    assert controller.tick(0.3).action == [-1.0, -0.25, 12.5]
+
+
+@pytest.mark.parametrize("period_s", [0.01, 0.05, 1.0])
+def test_every_limit_follows_the_policys_control_period(period_s):
+    controller = Controller(shared_limits([PEDAL], {}), period_s, needs_rearm=False)
+    story = [(0.0, "state", "drive"), (2.19, "tick", None), (2.21, "tick", SILENT)]
+    story += [(0.0, "next tick", SILENT), (3.3, "begin", None), (4.29, "tick", SILENT)]
+    play(controller, [(periods * period_s, *row) for periods, *row in story])
+    assert said(controller.tick(4.31 * period_s)) == TOO_LONG
 
 
 def test_a_farewell_brakes_but_not_between_episodes_and_before_the_first():
@@ -247,6 +307,7 @@ def test_a_rate_limit_is_per_second_and_counts_from_the_last_order_whatever_its_
     controller = make(vehicle={"pedal": ActionLimit(-1.0, 1.0, 2.5)})
     assert answer(controller, 0, 0.0).action == [0.25]
     assert answer(controller, 1, 0.1).action == pytest.approx([0.5])
+    assert answer(controller, 2, 0.0, np.array([1.0], np.float32)).action == pytest.approx([0.5])
     controller.tick(0.4)
     times_s = enumerate((0.4, 0.5, 0.6, 0.7, 0.71, 0.81), start=2)
     actions = [answer(controller, step, now_s).action[0] for step, now_s in times_s]
@@ -269,11 +330,13 @@ def test_without_a_slow_vehicle_only_the_manifest_bounds(vehicle, wanted, last, 
     ("wanted", "last", "elapsed_s", "limited"),
     [
         (1.0, 0.0, T, 0.2), (-1.0, 0.0, T, -0.2), (1.0, 0.4, T, 0.5), (1.0, 0.0, 0.005, 0.01),
-        (1.0, 0.0, 9.0, 0.2), (1.0, 0.0, -1.0, 0.0),
+        (1.0, 0.0, 0.0, 0.0),
     ],
 )  # fmt: skip
 def test_a_slow_vehicle_by_hand(wanted, last, elapsed_s, limited):
-    assert limit_action([wanted], [last], shared_limits([PEDAL], SLOW), elapsed_s) == [limited]
+    limits = shared_limits([PEDAL], SLOW)
+    assert limit_action([wanted], [last], limits, elapsed_s) == [limited]
+    assert limits == shared_limits([replace(PEDAL, slew_per_s=2.0, high=0.5)], {})  # the same rule
 
 
 def test_a_vehicle_without_the_policys_action_is_refused():
@@ -282,7 +345,12 @@ def test_a_vehicle_without_the_policys_action_is_refused():
     with pytest.raises(UserError, match="do not meet"):
         shared_limits([PEDAL], {"pedal": ActionLimit(2.0, 3.0, 1.0)})
     vehicle = {"steering": ActionLimit(1.0, 3.0, 1.0)}
-    assert shared_limits([STEERING], vehicle)["steering"] == (1.0, 1.0, 1.0)  # they meet there
+    assert shared_limits([STEERING], vehicle)["steering"] == (
+        1.0,
+        1.0,
+        1.0,
+        None,
+    )  # they meet there
     controller = make(actions=(STEERING,), vehicle=vehicle)
     begin(controller, 0, 0.0, 0.0)
     assert controller.tick(0.2).action == [1.0]  # where it holds is within them from the start
@@ -366,3 +434,37 @@ def test_a_service_with_a_vehicle_waits_for_its_first_permission():
         (6.001, "finish", "not_armed"), *states(6.1, 4, "not_armed"), (6.45, "rearm", ""),
         (6.5, "state", "drive"),
     ])  # fmt: skip
+
+
+class Quality:
+    """A link's judge that says what it is told to."""
+
+    outside, why = "", ""
+
+    def refusal(self):
+        return self.why
+
+
+def test_outside_the_envelope_it_stops_and_is_not_armed():
+    link = Quality()
+    controller = make(needs_rearm=True, link=link)
+    play(controller, [FIRST])
+    link.outside = link.why = "too late"
+    play(controller, [*states(0.1, 3, "outside_envelope"), (0.35, "rearm", "too late")])
+    assert controller.waits_for_rearm
+    link.outside = ""
+    play(controller, [*states(0.4, 9, "outside_envelope"), (1.25, "rearm", "too late")])
+    link.why = ""
+    play(controller, [(1.3, "state", "outside_envelope"), (1.35, "rearm", "")])
+    play(controller, [*states(1.4, 1, "drive")])
+
+
+def test_without_a_vehicle_it_waits_outside_and_drives_on_inside():
+    link = Quality()
+    controller = make(link=link)
+    play(controller, [FIRST])
+    link.outside = "too late"
+    play(controller, states(0.1, 20, "outside_envelope"))
+    link.outside = ""
+    play(controller, [*states(2.1, 4, "outside_envelope"), (2.5, "state", "drive")])
+    assert controller.safety.safe_stops == 1

@@ -8,6 +8,7 @@ import math
 from functools import partial
 from typing import Any, Optional
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
 from edge_runtime.controller import ActionLimit, Controller, Order, Received, shared_limits
+from edge_runtime.ride import Ride
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
 
@@ -24,7 +26,7 @@ LONGEST_PAUSE_S = 10.0
 JUST_AFTER_S = 1e-6
 SLOW = {"pedal": ActionLimit(-1.0, 0.5, 2.0), "steering": ActionLimit(-0.4, 0.4, 1.0)}
 
-gaps = st.sampled_from([0.001, 0.05, T, T, T, 0.19, 0.2, 0.21, 0.23, 1.0, 9.0, 11.0])
+gaps = st.sampled_from([0.001, 0.05, T, T, T, 0.19, 0.2, 0.21, 0.23, 0.6, 0.71, 1.0, 9.0, 11.0])
 durations = st.sampled_from([0.001, 0.001, 0.001, 0.06, 0.099, 0.101, 0.5])
 waits = st.sampled_from([0.0, 0.0, 0.0, 0.05, 0.3])
 numbers = st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 0.0, math.nan, math.inf, -math.inf]))
@@ -35,11 +37,14 @@ outputs = st.one_of(
 
 
 class AnyHistory(RuleBasedStateMachine):
-    def __init__(self, vehicle: bool, armed_at_start: bool) -> None:
+    def __init__(self, vehicle: bool, armed_at_start: bool, ride_s: float) -> None:
         super().__init__()
         self.vehicle = vehicle
         self.limits = shared_limits([PEDAL, STEERING], SLOW if vehicle else {})
-        self.controller = Controller(self.limits, vehicle, armed_at_start)
+        ride = Ride(ride_s, T, self.limits, plays=vehicle) if ride_s else None
+        self.controller = Controller(self.limits, T, vehicle, armed_at_start, ride=ride)
+        self.ride_s = ride_s
+        self.answered_s = -math.inf  # the last order that was no ridden one
         self.now_s = 100.0
         self.step = 0
         self.session = 0
@@ -64,14 +69,29 @@ class AnyHistory(RuleBasedStateMachine):
 
     @rule(gap_s=gaps)
     def another_simulator(self, gap_s):
+        self._pass(max(gap_s, SILENT_S), late=False)
         self.session += 1
         self._fault()
         self.permitted = self.permitted and self.arrived_s is None
-        self._state([0.5, 0.1], max(gap_s, SILENT_S))
+        self._state([0.5, 0.1], 0.0)
 
     @rule(duration_s=st.sampled_from([0.05, 0.25, 2.0, 12.0]))
     def nothing_comes(self, duration_s):
         self._pass(duration_s, late=False)
+
+    @rule()
+    def the_vehicle_fails(self):
+        """In whatever moment: what drives, or rides, stops with the next look."""
+        if self.vehicle:
+            drove, rearmed = self._drives(), self._is_stopped() and self.permitted
+            self.controller.vehicle_fault = "it is stuck"
+            order = self.controller.tick(self.now_s)
+            self.controller.vehicle_fault = ""
+            assert not drove or (order is not None and order.reason == "vehicle_fault")
+            if drove or rearmed:
+                self._fault()
+            if order is not None:
+                self._note(order)
 
     @rule()
     def the_operator_permits(self):
@@ -85,13 +105,14 @@ class AnyHistory(RuleBasedStateMachine):
         """A state comes after `gap_s`, waits for the policy, and is answered."""
         self._pass(gap_s, late)
         pause_s = 0.0 if self.arrived_s is None else self.now_s - self.arrived_s
-        if pause_s > SILENT_S:
+        if pause_s > self._patience_s():
             self._fault()
         if pause_s > LONGEST_PAUSE_S:
             self.permitted = False
         self.arrived_s = self.now_s
         self.step += 1
-        state = make_state(self.step, session=f"s{self.session}", final=final)
+        sent = {"sent_ns": int(self.now_s * 1e9)}  # No link holds it up.
+        state = make_state(self.step, session=f"s{self.session}", final=final, **sent)
         received = Received(state, self.now_s, 0)
         self._pass(wait_s, late)
         self.controller.begin(received, self.now_s)
@@ -112,6 +133,13 @@ class AnyHistory(RuleBasedStateMachine):
         if self._is_stopped():
             self.permitted = False
 
+    def _drives(self) -> bool:
+        last = self.last
+        return last is not None and last.mode == "drive" and not last.answers.state.final
+
+    def _patience_s(self) -> float:
+        return SILENT_S + (self.ride_s if self._drives() else 0.0)
+
     def _is_stopped(self) -> bool:
         return self.last is not None and self.last.mode == "safe_stop"
 
@@ -129,14 +157,14 @@ class AnyHistory(RuleBasedStateMachine):
             self.now_s = max(self.now_s, due_s + JUST_AFTER_S)
             order = self.controller.tick(self.now_s)
             if order is not None:
-                assert order.mode == "safe_stop"
+                assert (order.mode == "safe_stop") != order.ridden
                 if self.stop_s is not None and order.reason != "inference_too_long":
                     assert self.now_s - self.stop_s == pytest.approx(T, abs=1e-4)
                 self._note(order)
         self.now_s = end_s
-        if self.last and self.last.mode == "drive" and not self.last.answers.state.final:
+        if self._drives():
             assert self.arrived_s is not None
-            assert self.now_s - self.arrived_s <= SILENT_S + 2 * JUST_AFTER_S
+            assert self.now_s - self.arrived_s <= self._patience_s() + 2 * JUST_AFTER_S
 
     def _note(self, order: Order) -> None:
         if order.mode == "drive":
@@ -157,13 +185,26 @@ class AnyHistory(RuleBasedStateMachine):
         for value, row in zip(order.action, self.limits.values()):
             assert row.low <= value <= row.high
         self.last, self.last_s = order, self.now_s
+        self.answered_s = self.answered_s if order.ridden else self.now_s
         self.stop_s = self.now_s if self._is_stopped() else None
 
     def _check_drive(self, order: Order) -> None:
-        assert self.good_in_a_row >= (5 if self._is_stopped() else 1)
+        if order.ridden:  # by what drives, for a vehicle, after T, and no longer than it may
+            assert self.vehicle
+            assert self._drives()
+            assert order.plan is msgspec.UNSET
+            assert T < self.now_s - self.answered_s <= self.ride_s + 0.2 * T + 1e-4
+        elif self.ride_s and not order.answers.state.final:
+            plan = order.plan or []
+            assert len(plan) == 5
+            for action in plan:
+                for value, row in zip(action, self.limits.values()):
+                    assert row.low <= value <= row.high
+        assert order.ridden or self.good_in_a_row >= (5 if self._is_stopped() else 1)
         assert self.permitted or not self.vehicle
         assert order.reason == ""
-        assert self.now_s - order.answers.arrived_s <= SILENT_S
+        ridden_s = self.ride_s if order.ridden else 0.0
+        assert self.now_s - order.answers.arrived_s <= SILENT_S + ridden_s
         before = self.last.action if self.last else [0.0, 0.0]
         since_s = self.now_s - self.last_s
         for value, last, row in zip(order.action, before, self.limits.values()):
@@ -172,10 +213,11 @@ class AnyHistory(RuleBasedStateMachine):
                 assert abs(value - last) <= row.slew_per_s * min(since_s, T) + 1e-9
 
 
+@pytest.mark.parametrize("ride_s", [0.0, 0.5])
 @pytest.mark.parametrize(
     ("vehicle", "armed_at_start"), [(False, True), (True, True), (True, False)]
 )
-def test_any_history(vehicle, armed_at_start):
+def test_any_history(vehicle, armed_at_start, ride_s):
     patient = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
-    make: Any = partial(AnyHistory, vehicle, armed_at_start)
+    make: Any = partial(AnyHistory, vehicle, armed_at_start, ride_s)
     run_state_machine_as_test(make, settings=patient)

@@ -7,19 +7,29 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.config import DEFAULT_BUS, Config, SimilaritySettings
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import wait_until
-from edge_runtime.tests.rigs import CAR, LEFT_TURN, PEDAL
-from edge_runtime.transport import free_endpoint
+from edge_runtime.tests.rigs import LEFT_TURN, PEDAL
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import hunter, make_vehicle, stream, vehicle_limits
+from edge_runtime.vehicles import hunter, stream
 from edge_runtime.vehicles.core import State
-from edge_runtime.vehicles.hunter import BusName, Gate, HunterVehicle, open_bus, parse_bus, protocol
+from edge_runtime.vehicles.hunter import (
+    DEFAULT_BUS,
+    BusName,
+    Gate,
+    HunterSettings,
+    HunterVehicle,
+    open_bus,
+    parse_bus,
+    protocol,
+)
 
 
 class Chassis:
@@ -70,8 +80,9 @@ def chassis(channel):
 
 @pytest.fixture
 def vehicle(channel):
-    bus = BusName("virtual", channel, None)
-    with contextlib.closing(HunterVehicle(bus, LEFT_TURN, "v2")) as vehicle:
+    settings = HunterSettings(bus=f"virtual:{channel}")
+    with contextlib.closing(HunterVehicle(settings, LEFT_TURN)) as vehicle:
+        vehicle.control_period_s = 0.1
         yield vehicle
 
 
@@ -140,6 +151,26 @@ def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle
         while crowd.recv(0.0) is not None:
             pass
         assert crowd.recv(5.0) is not None  # it sends as soon as it can
+
+
+def test_of_foreign_frames_bus_off_stops_it_and_it_listens_on(chassis, vehicle, monkeypatch):
+    enable(vehicle)
+    drive(chassis, vehicle)
+    for kind in ("is_error_frame", "is_extended_id", "is_remote_frame", "is_fd"):
+        foreign: Any = {"arbitration_id": 0x111, "is_extended_id": False, kind: True}
+        vehicle._hear(can.Message(**foreign))
+    assert vehicle.state is State.ENABLED
+    vehicle._hear(can.Message(arbitration_id=0x40, is_error_frame=True))
+    assert vehicle.feedback(time.monotonic()).faults == ["the CAN bus fails: bus-off"]
+    enable(vehicle)
+    with monkeypatch.context() as patch:
+        patch.setattr(vehicle._bus, "recv", Mock(side_effect=OSError("Network is down")))
+        wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
+    enable(vehicle)
+    monkeypatch.setattr(Gate, "send", Mock(side_effect=OSError("Network is down")))
+    vehicle.close()  # raises nothing, and leaves the bus
+    with pytest.raises(can.CanOperationError, match="closed"):
+        vehicle._bus.recv(0.0)
 
 
 def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle):
@@ -218,20 +249,6 @@ def test_buses_that_cannot_be_opened_are_one_line(caplog, monkeypatch):
     monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(UserError, match=r"pip install 'phil-edge-runtime\[can\]'"):
         open_bus(parse_bus(DEFAULT_BUS))
-
-
-def test_the_registry_makes_it_for_a_known_scenario_only(channel):
-    config = Config(bus=f"virtual:{channel}")
-    for make in (make_vehicle, vehicle_limits):
-        with pytest.raises(UserError, match="parking"):
-            make("hunter", config, "parking")
-    ours = SimilaritySettings(scale=0.1, car=CAR)
-    for scenario, similarity, scale in (("left_turn", None, 0.25), ("parking", ours, 0.1)):
-        config = Config(bus=config.bus, similarity=similarity or SimilaritySettings())
-        with contextlib.closing(make_vehicle("hunter", config, scenario)) as vehicle:
-            assert isinstance(vehicle, HunterVehicle)
-            assert vehicle.limits == vehicle_limits("hunter", config, scenario)
-            assert vehicle._core.similarity.scale == scale
 
 
 @pytest.fixture

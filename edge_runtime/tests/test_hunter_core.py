@@ -70,9 +70,12 @@ def test_a_chassis_that_does_not_confirm(rig, change, words, outranks):
     assert set(rig.speeds()) == {0.0}
 
 
-@pytest.mark.parametrize(("faults", "clears"), [(0x0001, True), (0x1000, False), (0, False)])
-def test_errors_are_cleared_before_control_is_asked_for_but_a_lost_link_is_not(rig, faults, clears):
-    rig.status = OK._replace(faults=faults)
+@pytest.mark.parametrize(
+    ("change", "clears"),
+    [({"faults": 0x0001}, True), ({"state": 2}, True), ({"faults": 0x1000}, False), ({}, False)],
+)
+def test_errors_are_cleared_before_control_is_asked_for_but_a_lost_link_is_not(rig, change, clears):
+    rig.status = OK._replace(**change)
     rig.tell(protocol.SYSTEM_STATUS, rig.status)
     rig.core.enable(rig.now_s)
     rig.step()
@@ -91,7 +94,7 @@ def test_time_limits_to_the_instant(driving):
             event(at_s)
             assert core.state is then
 
-    holds_until(rules.COMMAND_TIMEOUT_S, State.ENABLED, core.tick)
+    holds_until(core.command_timeout_s, State.ENABLED, core.tick)
     core.state = State.ENABLED
     core.bus_failed("full", 0.0)
     holds_until(BUS_PATIENCE_S, State.ENABLED, lambda at_s: core.bus_failed("full", at_s))
@@ -211,6 +214,7 @@ def test_no_more_than_the_model_can_do_with_three_tenths_is_believed(rig, field,
         ([(0.0, 200)], 0.0),  # the first one
         ([(0.0, 200), (0.1, 200 + 127 - 256)], 0.1),  # ahead by less than half of the circle
         ([(0.0, 200), (0.1, 200 + 128 - 256)], 0.0),
+        ([(0.0, 255), (0.1, 0)], 0.1),  # the next one
         ([(0.0, 200), (STATUS_SILENCE_S, 200)], 0.0),  # begun anew, but not after a silence
         ([(0.0, 200), (SILENT_S, 200)], SILENT_S),
     ],

@@ -1,9 +1,10 @@
 """The Hunter's CAN frames and fault bits, as bytes and as numbers."""
 
 import math
+from itertools import product
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.vehicles import stream
@@ -79,11 +80,10 @@ def test_fields_do_not_overlap():
         assert len(taken) == len(set(taken))
 
 
-@settings(max_examples=2000)
-@given(st.integers(0, 0x7FF) | st.sampled_from(sorted(FRAMES)), st.binary(max_size=8))
-def test_only_a_known_frame_of_the_right_length_is_read_and_nothing_raises(can_id, data):
-    is_known = can_id in FRAMES and len(data) == FRAMES[can_id].length
-    assert (decode(can_id, data) is not None) == is_known
+def test_only_a_known_frame_of_the_right_length_is_read_and_nothing_raises():
+    for can_id, length in product(range(0x800), range(9)):
+        is_known = can_id in FRAMES and length == FRAMES[can_id].length
+        assert (decode(can_id, b"\xa5" * length) is not None) == is_known
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -5,8 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import latest as latest_module
-from edge_runtime.latest import TAKEOVER_SILENCE_S, LatestState
+from edge_runtime.latest import LatestState
 from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.policies import T
 from edge_runtime.wire import Reason
 
 
@@ -29,7 +30,7 @@ STORIES: dict = {
         (B, 0, 0, 0.3, FOREIGN), (B, 0, 1, 0.39, None), (A, 0, 2, 0.4, FOREIGN),
     ],
     "a foreign state does not end the silence": [
-        (A, 0, 0, 0.0, None), (B, 0, 0, 0.1, FOREIGN), (B, 0, 0, TAKEOVER_SILENCE_S, None),
+        (A, 0, 0, 0.0, None), (B, 0, 0, 0.1, FOREIGN), (B, 0, 0, 2 * T, None),
     ],
     "a stale message still shows that its simulator is there": [
         (A, 0, 3, 0.0, None), (A, 0, 3, 0.15, DUPLICATE), (B, 0, 0, 0.25, FOREIGN),
@@ -61,7 +62,7 @@ STORIES: dict = {
 
 @pytest.mark.parametrize("story", STORIES)
 def test_which_states_are_accepted(story):
-    latest, reasons = LatestState(), [reason for *_, reason in STORIES[story]]
+    latest, reasons = LatestState(T), [reason for *_, reason in STORIES[story]]
     for session, episode, step, now_s, reason in STORIES[story]:
         state = make_state(step, session=session, episode=episode)
         assert reason_of(latest, state, now_s) is reason, (session, episode, step)
@@ -71,7 +72,7 @@ def test_which_states_are_accepted(story):
 
 @pytest.mark.parametrize("take_overs", [17, 100, 2000])
 def test_no_number_of_take_overs_makes_an_old_session_new(take_overs):
-    latest = LatestState()
+    latest = LatestState(T)
     latest.offer(make_state(0, session="old"), 0.0)
     for number in range(take_overs):
         assert latest.offer(make_state(0, session=f"s{number}"), 1.0 + number) is None
@@ -83,7 +84,7 @@ def test_no_number_of_take_overs_makes_an_old_session_new(take_overs):
 
 def test_too_many_sessions_end_in_no_new_one_rather_than_in_an_old_one(monkeypatch):
     monkeypatch.setattr(latest_module, "MAX_FORGOTTEN_SESSIONS", 3)
-    latest = LatestState()
+    latest = LatestState(T)
     for number in range(19):
         assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
     reason, detail = latest.offer(make_state(0, session="s19"), 30.0) or ("", "")
@@ -103,7 +104,7 @@ messages = st.tuples(
 @given(st.lists(messages, max_size=60))
 def test_never_backwards(history):
     """Whatever arrives: within a session the accepted states rise, and each message is counted."""
-    latest, now_s = LatestState(), 0.0
+    latest, now_s = LatestState(T), 0.0
     reached: dict = {}
     heard: dict = {}
     current = None
@@ -112,7 +113,7 @@ def test_never_backwards(history):
         state = make_state(step, session=session, episode=episode)
         if latest.offer(state, now_s) is None:
             assert (episode, step) > reached.get(session, (-1, -1))
-            assert current in (None, session) or now_s - heard[current] >= TAKEOVER_SILENCE_S
+            assert current in (None, session) or now_s - heard[current] >= 2 * T
             reached[session] = (episode, step)
             current = session
         heard[session] = now_s

@@ -13,9 +13,10 @@ import pytest
 from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
+from edge_runtime.reach import look
 from edge_runtime.run import Waiting
 from edge_runtime.tests.harness import HEALTH
-from edge_runtime.transport import look, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 
 
@@ -91,7 +92,7 @@ def test_a_link_that_gave_way_sends_nothing(session, link):
 
 def test_only_a_query_by_its_own_name_re_arms(session, link):
     rearm = MagicMock(return_value="")
-    link.declare(lambda payload: None, lambda: HEALTH, rearm)
+    link.declare(lambda payload: None, lambda: HEALTH, rearm, 0)
     asked = dict(call.args for call in session.declare_queryable.call_args_list)
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
         asked["phil/hunter01/rearm"](MagicMock(key_expr=selector))
@@ -108,11 +109,13 @@ def test_the_session_is_closed_even_where_nothing_can_be_undeclared(session, lin
 
 
 def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatch):
-    monkeypatch.setattr(run, "load_policy", MagicMock())
+    policy = MagicMock()
+    policy.manifest.envelope = None
+    monkeypatch.setattr(run, "load_policy", lambda *_: policy)
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))
     with pytest.raises(OSError, match="no link"):
-        run._drive(Config(), MagicMock())
+        run._drive(Config(), MagicMock(), None)
     assert session.close.call_count == 2  # the one that asked for other runtimes, and its own
 
 

@@ -6,10 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, SPEC
-from edge_runtime.util import UserError
+from edge_runtime.tests.rigs import CARS, CONGESTION, LEFT_TURN, SPEC
 from edge_runtime.vehicles import mapping
-from edge_runtime.vehicles.mapping import CARS, SPECS, SetPoint, car_of, similarity_to, wish_of
+from edge_runtime.vehicles.mapping import SPECS, SetPoint, similarity_to, wish_of
 
 MOST = SPEC.max_speed_mps
 unit = st.floats(-1, 1)
@@ -32,13 +31,6 @@ def test_steering_there_and_back(scenario, steering, scale, curvature):
     centre_rad = similarity.centre_rad(steering)
     assert similarity.steering(centre_rad) == pytest.approx(steering, abs=1e-9)
     assert math.isfinite(similarity.car.steering(curvature))  # none is too much for the inverse
-
-
-def test_a_scenarios_car_on_the_hunter():
-    assert similarity_to(car_of("left_turn", "hunter"), SPEC) == LEFT_TURN
-    assert LEFT_TURN.scale == 0.25
-    with pytest.raises(UserError, match=r"'parking'.*congestion, left_turn.*\[similarity.car\]"):
-        car_of("parking", "hunter")
 
 
 def pedal_to_speed(set_point, pedal, step_s=0.1, measured=None):

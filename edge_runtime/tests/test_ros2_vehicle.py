@@ -7,17 +7,22 @@ import time
 
 import pytest
 
-from edge_runtime.config import Config, Ros2Settings
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, wait_until
+from edge_runtime.tests.policies import T
 from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from edge_runtime.tests.ros2_side import RosHunter
-from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import vehicle_limits
 from edge_runtime.vehicles.core import Event, State
-from edge_runtime.vehicles.ros2 import STEERING, YAW_RATE, Motion, Ros2Core, Ros2Vehicle
+from edge_runtime.vehicles.ros2 import (
+    STEERING,
+    YAW_RATE,
+    Motion,
+    Ros2Core,
+    Ros2Settings,
+    Ros2Vehicle,
+)
 from edge_runtime.vehicles.ros2.node import drive_of, twist_of
-from edge_runtime.wire import CONTROL_PERIOD_S
 
 
 def test_only_odometry_confirms_it_and_without_any_it_stops_and_says_so():
@@ -93,8 +98,9 @@ def test_a_twist_by_hand():
 
 
 @pytest.fixture
-def make():
+def make(monkeypatch):
     """Makes vehicles, closed with the test: an open session would hang the process."""
+    monkeypatch.setattr(Ros2Vehicle, "control_period_s", 0.1)
     with contextlib.ExitStack() as made:
         yield lambda similarity=LEFT_TURN, **changes: made.enter_context(
             contextlib.closing(Ros2Vehicle(Ros2Settings(**changes), similarity))
@@ -140,7 +146,6 @@ def linked(make):
 @pytest.mark.parametrize("bridge_listens", [False, True])
 def test_a_pedal_drives_the_hunter_and_a_brake_stands_until_enabled_again(linked, bridge_listens):
     vehicle, hunter = linked(bridge_listens=bridge_listens)
-    assert vehicle.limits == vehicle_limits("ros2", Config(), "left_turn")
 
     def drives():
         return hunter.speed_mps > 0.5 and report(vehicle).speed_mps > 0.3
@@ -195,7 +200,6 @@ def test_it_closes_twice_and_without_having_been_enabled(make, enables):
         ({"listen": "tcp/127.0.0.1:1", "connect": "tcp/127.0.0.1:1"}, "give one of them"),
         ({"connect": "tls/127.0.0.1:7448"}, "plain text"),
         ({"connect": "nowhere"}, "endpoint 'nowhere'"),
-        ({"model": "3.0"}, "ros2.model '3.0'"),
         ({"twist_topic": ""}, "no topic to command by"),
         ({"odometry_topic": ""}, "no odometry_topic"),
         ({"odometry_topic": "/cmd_vel"}, "a topic twice: cmd_vel, cmd_vel"),
@@ -211,14 +215,18 @@ def test_settings_that_cannot_be_are_one_line(make, changes, part):
 
 def test_a_busy_port_is_one_line_with_the_settings_name(make):
     busy = free_endpoint()
-    with RosHunter(listen=busy), pytest.raises(UserError, match=r"another with \[ros2\] listen$"):
+    with RosHunter(listen=busy), pytest.raises(
+        UserError, match=r"another with \[vehicle.ros2\] listen$"
+    ):
         make(listen=busy)
 
 
 def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(make_policy, tmp_path):
     endpoint, ros_endpoint, settings = free_endpoint(), free_endpoint(), tmp_path / "edge.toml"
     topics = "twist_topic = '/cmd_vel'\nodometry_topic = '/odom'\nnamespace = '/any'"
-    settings.write_text(f"vehicle = 'ros2'\n[ros2]\nlisten = '{ros_endpoint}'\n{topics}")
+    settings.write_text(
+        f"vehicle.driver = 'ros2'\n[vehicle.ros2]\nlisten = '{ros_endpoint}'\n{topics}"
+    )
     flags = [*make_policy(value=1.0).flags, "--connect", endpoint, "--config", str(settings)]
     with Simulator(endpoint) as simulator, EdgeProcess(*flags) as edge, RosHunter(
         connect=ros_endpoint
@@ -232,7 +240,7 @@ def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(make_
                 simulator.ask(make_state(next(steps)))
                 if rearms and simulator.health[-1].needs_rearm:
                     simulator.query("rearm")
-                time.sleep(CONTROL_PERIOD_S)
+                time.sleep(T)
                 return condition()
 
             wait_until(holds, what)

@@ -9,12 +9,22 @@ import time
 
 import pytest
 
+from edge_runtime.commands import render_status
 from edge_runtime.files import Hold
-from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, run_command, wait_until
-from edge_runtime.transport import free_endpoint
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import (
+    WHITE,
+    EdgeProcess,
+    Simulator,
+    frames,
+    make_state,
+    run_command,
+    wait_until,
+)
+from edge_runtime.tests.policies import T
+from edge_runtime.tests.test_link_quality import ENVELOPE, LIMITS
 
-WHITE_FRAMES = {"frames": b"\xff" * FRAMES_BYTES}
+WHITE_FRAMES = {"observation": frames(WHITE)}
 
 
 @pytest.fixture
@@ -38,7 +48,7 @@ def drive(simulator, steps):
     for step in steps:
         begun_s = time.monotonic()
         commands.append(simulator.ask(make_state(step)))
-        time.sleep(max(0.0, CONTROL_PERIOD_S - (time.monotonic() - begun_s)))
+        time.sleep(max(0.0, T - (time.monotonic() - begun_s)))
     return commands
 
 
@@ -59,7 +69,7 @@ def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulat
     assert edge.ready_line.startswith("ready ")
     for step in range(50):
         level = step * 5
-        command = simulator.ask(make_state(step, frames=bytes([level]) * FRAMES_BYTES))
+        command = simulator.ask(make_state(step, observation=frames(level)))
         assert command.received_ns <= command.sent_ns
         if command.mode == "drive":
             assert command.action == pytest.approx([level / 127.5 - 1], abs=1e-6)
@@ -139,9 +149,9 @@ def test_bad_states_are_counted_by_reason_and_not_answered(edge_and_simulator):
     bad = {
         "stale": make_state(4),
         "duplicate": make_state(5),
-        "schema": make_state(6, schema=2),
-        "frames_size": make_state(6, frames=bytes(10)),
-        "oversized": make_state(6, frames=bytes(100_000)),
+        "schema": make_state(6, schema=1),
+        "observation": make_state(6, observation={"frames": bytes(10)}),
+        "oversized": make_state(6, observation={"frames": bytes(100_000)}),
         "not_finite": make_state(6, speed_mps=float("inf")),
         "malformed": b"not a map",
     }
@@ -156,7 +166,7 @@ def test_status_and_rearm_without_a_vehicle(edge_and_simulator):
     _, simulator = edge_and_simulator()
     simulator.ask(make_state(0))
     status = simulator.query("status")
-    assert (status["accepted"], status["manifest"]["scenario"]) == (1, "left_turn")
+    assert (status["accepted"], status["manifest"]["task"]) == (1, "left_turn")
     assert 0 < status["inference_ms"]["max"] <= status["command_ms"]["max"]
     assert 10 < status["rss_mb"] < 500
     assert status["load_1min"] >= 0
@@ -241,7 +251,7 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
             with Simulator(endpoint) as simulator:
                 simulator.wait_for_edge()
                 assert simulator.ask(make_state(0, session=session)).session == session
-            time.sleep(3 * CONTROL_PERIOD_S)
+            time.sleep(3 * T)
 
 
 @pytest.fixture
@@ -285,3 +295,33 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path, 
     assert simulator.next_command().session == "simulator-a"
     assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
     assert edge.end() == 0
+
+
+def test_a_vehicle_is_armed_inside_its_policys_envelope_only(edge_and_simulator):
+    """The simulator claims how long commands take to it."""
+    changes = {"envelope": {**ENVELOPE, "limits": {**LIMITS, "jitter_ms": 1000.0}}}
+    _, simulator = edge_and_simulator("constant", "--vehicle", "mock", manifest_changes=changes)
+    steps = itertools.count()
+    heard: dict[str, int] = {}
+
+    def drive_on(count, down_ms):
+        for number in range(count):
+            command = simulator.ask(make_state(next(steps), **heard))
+            took_ns = round(down_ms * 1e6)
+            heard.update(heard=heard.get("heard", 0) + 1, heard_sent_ns=command.sent_ns)
+            heard["heard_ns"] = command.sent_ns + took_ns + number
+        return command
+
+    assert drive_on(50, 20.0).reason == "not_armed"
+    assert "not known yet" in simulator.query("rearm")["detail"]
+    drive_on(200, 20.0)
+    status = simulator.query("status")
+    assert status["link"]["delay_ms"] == pytest.approx(10.0, abs=8.0)
+    assert status["envelope"]["delay_ms"] == LIMITS["delay_ms"]
+    assert f"delay_ms {status['link']['delay_ms']:.3g} of 100" in render_status(status)
+    assert simulator.query("rearm")["accepted"]
+    assert drive_on(5, 20.0).mode == "drive"
+    assert drive_on(300, 400.0).reason == "outside_envelope"
+    refused = simulator.query("rearm")
+    assert not refused["accepted"]
+    assert refused["detail"].startswith("the link is outside the policy's envelope: all axes add")

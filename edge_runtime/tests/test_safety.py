@@ -6,6 +6,7 @@ import edge_runtime
 from edge_runtime import safety as rules
 from edge_runtime.safety import TRANSITIONS, Event, Mode, Safety, advance, note_arrival
 from edge_runtime.tests.harness import render_table
+from edge_runtime.tests.policies import T
 
 STANDBY, DRIVE, STOP = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
 GOOD = {"fresh_state", "recovered", "final_state"}
@@ -13,6 +14,7 @@ GOOD = {"fresh_state", "recovered", "final_state"}
 BAD = {
     "no_fresh_state", "output_not_finite", "inference_failed", "policy_thread_dead", "other_task",
     "inference_too_long", "pause_too_long", "other_session", "not_armed", "vehicle_fault",
+    "outside_envelope",
 }  # fmt: skip
 
 
@@ -28,7 +30,7 @@ def test_every_pair(mode, event, rearmed):
     """Of the whole record: where it goes, why, and what it remembers."""
     expected = TRANSITIONS[mode, event]
     stopped = mode is STOP
-    before = Safety(mode, "before" if stopped else "", 3, rearmed, 7.5, "s", 9, 6.5)
+    before = Safety(T, mode, "before" if stopped else "", 3, rearmed, 7.5, "s", 9, 6.5)
     after = advance(before, event)
     assert after.mode is expected
     assert after.safe_stops == 9 + int(not stopped and expected is STOP)
@@ -43,10 +45,10 @@ def test_every_pair(mode, event, rearmed):
 
 
 def test_the_limits_are_the_contracts():
-    assert (rules.MAX_INFERENCE_S, rules.FRESH_STATES_TO_RECOVER) == (0.1, 5)
-    assert round(rules.SILENCE_S, 9) == 0.22  # 2 T and a grace within the promised 50 ms
+    assert rules.FRESH_STATES_TO_RECOVER == 5
+    assert round(Safety(T).silence_s, 9) == 0.22  # 2 T and a grace within the promised T / 2
     assert rules.MAX_PAUSE_S == 10.0
-    assert Safety() == (STANDBY, "", 0, False, None, None, 0, None)
+    assert Safety(T) == (T, STANDBY, "", 0, False, None, None, 0, None, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -67,20 +69,20 @@ def test_the_limits_are_the_contracts():
     ],
 )
 def test_what_the_time_before_a_state_means(mode, gap_s, session, without, with_vehicle):
-    safety = note_arrival(Safety(mode), "a", 1000.0)
+    safety = note_arrival(Safety(T, mode), "a", 1000.0)
     for needs_rearm, event in ((False, without), (True, with_vehicle)):
         assert rules.classify_arrival(safety, session, 1000.0 + gap_s, needs_rearm) is event
         # Before the first state of all nothing was due.
-        assert rules.classify_arrival(Safety(), session, gap_s, needs_rearm) is None
+        assert rules.classify_arrival(Safety(T), session, gap_s, needs_rearm) is None
 
 
 @pytest.mark.parametrize("mode", Mode)
 def test_only_the_first_state_and_those_that_come_in_drive_put_off_the_pause(mode):
-    first = note_arrival(Safety(mode), "a", 1.0)
-    assert first == Safety(mode, last_fresh_s=1.0, session="a", permitted_s=1.0)
+    first = note_arrival(Safety(T, mode), "a", 1.0)
+    assert first == Safety(T, mode, last_fresh_s=1.0, session="a", permitted_s=1.0)
     permitted_s = 2.0 if mode is DRIVE else 1.0
     then = note_arrival(first, "b", 2.0)
-    assert then == Safety(mode, last_fresh_s=2.0, session="b", permitted_s=permitted_s)
+    assert then == Safety(T, mode, last_fresh_s=2.0, session="b", permitted_s=permitted_s)
 
 
 @pytest.mark.parametrize(
@@ -95,18 +97,25 @@ def test_only_the_first_state_and_those_that_come_in_drive_put_off_the_pause(mod
     ],
 )
 def test_the_fifth_fresh_state_recovers(mode, before, rearmed, without, with_vehicle):
-    safety = Safety(mode, fresh_in_a_row=before, rearmed=rearmed)
+    safety = Safety(T, mode, fresh_in_a_row=before, rearmed=rearmed)
     for needs_rearm, event in ((False, without), (True, with_vehicle)):
         assert rules.classify_fresh(safety, False, needs_rearm) is event
         assert rules.classify_fresh(safety, True, needs_rearm) is Event.FINAL
 
 
 def test_silence_begins_after_two_periods_and_one_lost_state_is_none():
-    safety = note_arrival(Safety(), "a", 10.0)
-    assert rules.is_silent(Safety(), 0.0)
+    safety = note_arrival(Safety(T), "a", 10.0)
+    assert rules.is_silent(Safety(T), 0.0)
     assert [rules.is_silent(safety, now_s) for now_s in (10.21, 10.221)] == [False, True]
     # A state exactly as old as the limit is still in time.
-    assert not rules.is_silent(Safety(last_fresh_s=0.0), rules.SILENCE_S)
+    assert not rules.is_silent(Safety(T, last_fresh_s=0.0), 2.2 * T)
+
+
+def test_only_what_drives_may_be_silent_for_as_long_as_it_rides():
+    for mode, silent_s in ((STANDBY, 0.22), (DRIVE, 0.72), (STOP, 0.22)):
+        safety = note_arrival(Safety(T, mode, ride_s=0.5), "a", 0.0)
+        assert round(safety.answer_s, 9) == 0.22
+        assert [rules.is_silent(safety, silent_s + by_s) for by_s in (-1e-6, 1e-6)] == [False, True]
 
 
 def test_the_readme_shows_the_table():  # written out a second time, from the contract

@@ -4,28 +4,29 @@ import contextlib
 import gc
 import json
 import os
+import resource
 import signal
 import socket
 import sys
 import threading
 import time
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
-from edge_runtime import log, loop, service
+from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
+from edge_runtime.manifest import Layout
+from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
-from edge_runtime.tests.policies import PEDAL
+from edge_runtime.tests.policies import PEDAL, TASK, T
 from edge_runtime.tests.test_commands import HOSTILE
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
-from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import encode
 
@@ -55,11 +56,18 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.append(cpus))
-    monkeypatch.setattr(service, "_lock_memory", lambda _: asked.append("locked"))
-    assert service.claim_resources(50, [1], True) == ["realtime_priority"]
-    assert asked == [[1], "locked"]
-    assert service.claim_resources(0, [1, 7], False) == ["cpus"]
-    assert service.claim_resources(0, [], False) == []
+    lock = MagicMock(return_value=-1)  # C's word for a failure
+    monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: MagicMock(mlockall=lock))
+    for limit, user, tries in ((2**16, 1000, 0), (2**16, 0, 1), (resource.RLIM_INFINITY, 1000, 2)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+        assert realtime.claim_resources(0, [], True) == ["lock_memory"]
+        assert lock.call_count == tries  # with a limit, an allocation would fail in mid-drive
+    lock.return_value = 0
+    assert realtime.claim_resources(50, [1], True) == ["realtime_priority"]
+    assert (asked, lock.call_count) == ([[1]], 3)
+    assert realtime.claim_resources(0, [1, 7], False) == ["cpus"]
+    assert realtime.claim_resources(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json_without_what_a_terminal_acts_upon(capfd):
@@ -155,13 +163,13 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
 class FakePolicy:
     """Answers 0.5 at once, or waits while it is told to hang."""
 
-    policy_id, manifest = "p", SimpleNamespace(action=[PEDAL])
+    policy_id, manifest, layout = "p", TASK, Layout(TASK)
 
     def __init__(self) -> None:
         self.free = threading.Event()
         self.free.set()
 
-    def act(self, frames: np.ndarray) -> np.ndarray:
+    def act(self, observation: Any) -> np.ndarray:
         self.free.wait(20.0)
         return np.array([0.5], np.float32)
 
@@ -189,7 +197,7 @@ def running():
         def start(notifier: Any, vehicle: Any = None) -> Any:
             policy: Any = FakePolicy()
             link: Any = FakeLink()
-            controller = Controller(shared_limits([PEDAL], {}), needs_rearm=False)
+            controller = Controller(shared_limits([PEDAL], {}), T, needs_rearm=False)
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
             control = ControlLoop(policy, controller, link, runner, notifier)
             control.start()
@@ -230,7 +238,7 @@ def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running,
     control, link, policy = running(systemd.notifier())
     link.state_comes(encode(make_state(0)))
     assert systemd.until("STATUS") == "STATUS=drive"
-    policy.act = lambda frames: sys.exit("no exception that inference catches")
+    policy.act = lambda observation: sys.exit("no exception that inference catches")
     link.state_comes(encode(make_state(1)))
     assert systemd.until("STATUS") == "STATUS=safe_stop policy_thread_dead"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message any more")

@@ -6,6 +6,7 @@ import signal
 import socket
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,7 +19,7 @@ from edge_runtime.service import WINDOW, LatencyWindow
 from edge_runtime.util import UserError, printable, read_bytes
 
 
-def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path):
+def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "runs" / "today" / "out.json"
     check_writable(path)
     assert os.listdir(tmp_path) == []  # the folder is made when it is written and not before
@@ -26,6 +27,10 @@ def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path):
         write_json_out(path, {"a": number})
     with pytest.raises(ValueError, match="JSON"):
         write_json_out(path, {"a": float("nan")})
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(UserError, match=r"^cannot write .*json: No space left on device$"):
+            write_json_out(path, {"a": 3})
     assert json.loads(path.read_text()) == {"a": 2}
     assert os.listdir(path.parent) == ["out.json"]
     write_json_out(None, {"a": 3})

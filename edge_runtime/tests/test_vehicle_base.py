@@ -8,14 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.config import Config, SimilaritySettings
+from edge_runtime.controller import ActionLimit
 from edge_runtime.tests.harness import make_command, wait_until
-from edge_runtime.tests.rigs import CAR, PEDAL
-from edge_runtime.util import UserError
-from edge_runtime.vehicles import base, make_vehicle, vehicle_limits
+from edge_runtime.tests.policies import T
+from edge_runtime.tests.rigs import CAR, CARS, PEDAL, a_manifest
+from edge_runtime.vehicles import base, make_vehicle
 from edge_runtime.vehicles.base import LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
-from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
+
+
+@pytest.fixture(scope="module", autouse=True)
+def period():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MockVehicle, "control_period_s", T)
+        yield
 
 
 class BrokenVehicle(MockVehicle):
@@ -195,7 +201,7 @@ def report(pedal=0.0, speed_mps=1.0, self_braking=False):
 
 def watched(asked=0.0, **reported):
     """A watch that has seen a steady drive; and the time."""
-    watch = VehicleWatch()
+    watch = VehicleWatch(T, MockVehicle.limits)
     watch.begin(100.0)
     for tick in range(20):
         now_s = 100.0 + tick * TICK_S
@@ -222,14 +228,14 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
 
 
 def test_silence_after_two_periods_also_before_the_first_report():
-    watch = VehicleWatch()
+    watch = VehicleWatch(T, MockVehicle.limits)
     assert watch.fault(1e9) == ""  # what was not begun owes nothing
     watch.begin(10.0)
-    assert watch.fault(10.0 + base.SILENCE_S) == ""
-    assert watch.fault(10.001 + base.SILENCE_S) == SILENT
+    assert watch.fault(10.0 + 2 * T) == ""
+    assert watch.fault(10.001 + 2 * T) == SILENT
     watch.report(report(), 10.3)
     assert watch.fault(10.3) == ""
-    assert watch.silent_at_s == pytest.approx(10.3 + base.SILENCE_S)
+    assert watch.silent_at_s == pytest.approx(10.3 + 2 * T)
 
 
 def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
@@ -239,6 +245,20 @@ def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while()
     assert watch.fault(now_s + TICK_S + base.DEVIATES_S + 0.001) == STUCK
     watch.report(report(pedal=0.6), now_s + 2 * TICK_S)
     assert watch.fault(now_s + 2 * TICK_S) == ""
+
+
+REACHED = [(60.0, ""), (45.1, ""), (44.9, STUCK), (81.0, LYING)]
+
+
+@pytest.mark.parametrize(("reached", "fault"), REACHED)
+def test_what_is_far_from_what_was_asked_depends_on_the_actions_range(reached, fault):
+    """An eighth of -40 to 80 is 15; a hundred revolutions are no lie of a wheel that makes them."""
+    watch = VehicleWatch(T, {"left": ActionLimit(-40.0, 80.0)})
+    watch.begin(0.0)
+    for tick in range(20):
+        watch.command({"left": 60.0}, tick * TICK_S)
+        watch.report(base.VehicleReport({"left": reached}, 1.0, False, []), tick * TICK_S)
+    assert watch.fault(19 * TICK_S) == fault
 
 
 def test_a_leap_is_a_lie_until_that_speed_could_be_real():
@@ -251,7 +271,7 @@ def test_a_leap_is_a_lie_until_that_speed_could_be_real():
 @given(st.lists(st.floats(-1, 1), min_size=1, max_size=30))
 def test_the_mock_stays_within_its_limits_and_is_never_accused(pedals):
     """Whatever a policy asks at the control rate, reported at the feedback's."""
-    vehicle, watch = MockVehicle(), VehicleWatch()
+    vehicle, watch = MockVehicle(), VehicleWatch(T, MockVehicle.limits)
     vehicle.enable(0.0)
     watch.begin(0.0)
     for step, pedal in enumerate(pedals):
@@ -290,16 +310,13 @@ def test_lag_and_rate_limit_by_hand():
     assert vehicle.feedback(0.1).action["pedal"] == pytest.approx(-1.0 + 0.2)
 
 
-@pytest.mark.parametrize(
-    ("scenario", "ours", "car"),
-    [
-        *((name, None, CARS[name]) for name in CARS),
-        ("another", None, CARS["left_turn"]),
-        ("left_turn", CAR, CAR),
-    ],
-)
-def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(scenario, ours, car):
-    vehicle = make_vehicle("mock", Config(similarity=SimilaritySettings(car=ours)), scenario)
+@pytest.mark.parametrize(("manifests", "ours", "car"), [
+    (CAR, None, CAR), (None, None, CARS["left_turn"]), (CARS["congestion"], CAR, CAR),
+])  # fmt: skip
+def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(manifests, ours, car):
+    names = ("throttle_mps2", "brake_mps2", "max_speed_mps") if ours else ()
+    settings = {name: getattr(ours, name) for name in names}
+    vehicle = make_vehicle("mock", {"mock": settings}, a_manifest(manifests))
     vehicle.enable(0.0)
     speeds = []
     for tick in range(400):
@@ -335,17 +352,6 @@ def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it():
         assert vehicle.feedback(0.09).action["pedal"] == -1.0
         assert (vehicle.feedback(0.19).action["pedal"] > -1.0) != brakes
         assert vehicle.feedback(1e6).speed_mps == 0.0  # a long gap is no long computation
-
-
-def test_the_registry():
-    assert isinstance(make_vehicle("mock", Config(), ""), MockVehicle)
-    assert vehicle_limits("none", Config(), "") == {}
-    assert vehicle_limits("mock", Config(), "") == MockVehicle.limits
-    for make in (make_vehicle, vehicle_limits):
-        with pytest.raises(UserError, match=r"choose from .*mock, hunter"):
-            make("tank", Config(), "")
-    with pytest.raises(ValueError, match="lacks an action"):
-        enabled().command({}, 0.1, 6.0)
 
 
 def test_it_moves_only_enabled_and_a_stop_latches_but_at_an_episodes_end():

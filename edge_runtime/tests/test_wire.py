@@ -1,4 +1,5 @@
 import math
+from functools import partial
 from typing import Any, Dict, List, Optional, Union, get_type_hints
 
 import msgspec
@@ -8,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import wire
+from edge_runtime.manifest import Layout
 from edge_runtime.tests.harness import HEALTH, make_command, make_state
+from edge_runtime.tests.policies import SHAPE, SIZE, TASK
 from edge_runtime.util import UserError
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
-DECODERS = {
-    State: wire.decode_state,
+LAYOUT = Layout(TASK)
+decode_state = partial(wire.decode_state, layout=LAYOUT)
+DECODERS: Dict[Any, Any] = {
+    State: decode_state,
     Command: wire.decode_command,
     Feedback: wire.decode_feedback,
     Health: wire.decode_health,
@@ -26,13 +31,15 @@ OF_TYPE: Dict[Any, Any] = {
     int: counts,
     float: finite,
     str: texts,
+    Union[int, msgspec.UnsetType]: counts | st.just(msgspec.UNSET),
     Union[str, msgspec.UnsetType]: texts | st.just(msgspec.UNSET),
     Optional[float]: st.none() | finite,
     List[float]: st.lists(st.floats(-1, 1), min_size=1, max_size=4),
+    Union[List[List[float]], msgspec.UnsetType]: st.just(msgspec.UNSET),
     List[str]: st.lists(texts, max_size=3),
     Dict[str, int]: st.dictionaries(texts, counts, max_size=3),
     Dict[str, float]: st.dictionaries(texts, finite, max_size=3),
-    bytes: st.binary(min_size=1, max_size=1).map(lambda byte: byte * wire.FRAMES_BYTES),
+    Dict[str, bytes]: st.binary(min_size=1, max_size=1).map(lambda byte: {"frames": byte * SIZE}),
 }
 OF_NAME = {"schema": st.just(wire.SCHEMA), "mode": st.sampled_from(wire.COMMAND_MODES)}
 
@@ -66,31 +73,37 @@ def test_random_bytes_never_raise(kind, payload):
 def test_state_and_command_have_exactly_the_contracts_fields():
     assert set(as_map(make_state(0))) == {
         "schema", "session", "episode", "step", "sim_time_s", "sent_ns",
-        "frames", "speed_mps", "final",
+        "observation", "speed_mps", "final",
     }  # fmt: skip
-    assert set(Command.__struct_fields__) == {
+    assert set(as_map(make_command())) == {
         "schema", "session", "episode", "step", "mode", "action", "policy_id",
         "received_ns", "inference_ns", "sent_ns", "reason",
     }  # fmt: skip
 
 
 def test_frames_keep_their_order():
-    pixels = np.random.default_rng(0).integers(0, 256, wire.FRAMES_SHAPE, dtype=np.uint8)
-    state = wire.decode_state(wire.encode(make_state(0, frames=pixels.tobytes())))
+    pixels = np.random.default_rng(0).integers(0, 256, SHAPE, dtype=np.uint8)
+    sent = make_state(0, observation={"frames": pixels.tobytes()})
+    state = decode_state(wire.encode(sent))
     assert isinstance(state, State)
-    np.testing.assert_array_equal(state.frames_array(), pixels)
+    np.testing.assert_array_equal(LAYOUT.arrays(state.observation)["frames"], pixels)
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"schema": 2}, Reason.SCHEMA),
+        ({"schema": 1}, Reason.SCHEMA),
         ({"schema": 0}, Reason.SCHEMA),
         ({"schema": 9, "step": "nine"}, Reason.SCHEMA),  # though its fields differ
-        ({"frames": bytes(7199)}, Reason.FRAMES_SIZE),
-        ({"frames": bytes(7201)}, Reason.FRAMES_SIZE),
-        ({"frames": b""}, Reason.FRAMES_SIZE),
-        ({"frames": bytes(70_000)}, Reason.OVERSIZED),
+        ({"observation": {"frames": bytes(7199)}}, Reason.OBSERVATION),
+        ({"observation": {"frames": bytes(7201)}}, Reason.OBSERVATION),
+        ({"observation": {"frames": b""}}, Reason.OBSERVATION),
+        ({"observation": {}}, Reason.OBSERVATION),
+        ({"observation": {"pixels": bytes(7200)}}, Reason.OBSERVATION),
+        ({"observation": {"frames": bytes(7200), "more": b""}}, Reason.OBSERVATION),
+        ({"observation": {"frames": bytes(12_000)}}, Reason.OVERSIZED),
+        ({"observation": {"frames": "text"}}, Reason.MALFORMED),
+        ({"observation": bytes(7200)}, Reason.MALFORMED),
         ({"speed_mps": math.nan}, Reason.NOT_FINITE),
         ({"sim_time_s": math.inf}, Reason.NOT_FINITE),
         ({"step": -1}, Reason.MALFORMED),
@@ -104,7 +117,7 @@ def test_frames_keep_their_order():
 def test_a_bad_state_is_rejected_by_reason(changes, reason):
     fields = {**as_map(make_state(0)), **changes}
     fields = {name: value for name, value in fields.items() if value is not ...}
-    assert rejected(wire.decode_state, fields).reason is reason
+    assert rejected(decode_state, fields).reason is reason
 
 
 def rejected(decode, fields):
@@ -116,12 +129,9 @@ def rejected(decode, fields):
 @pytest.mark.parametrize(
     ("action", "mode", "found"),
     [
-        ([-1.0, 0.0, 1.0], "drive", None),
-        *(
-            (action, "drive", (Reason.MALFORMED, "action is empty or leaves [-1, 1]"))
-            for action in ([], [1.01], [-2.0], [0.0, 1.5])
-        ),
-        ([0.0, math.nan], "drive", (Reason.NOT_FINITE, "action[1] is nan")),
+        ([-1.0, 0.0, 300.0], "drive", None),  # its range is the manifest's
+        ([], "drive", (Reason.MALFORMED, "action is empty")),
+        ([0.0, math.nan], "drive", (Reason.NOT_FINITE, "action.1 is nan")),
         ([0.0], "fly", (Reason.MALFORMED, "mode 'fly' is neither drive nor safe_stop")),
     ],
 )
@@ -131,10 +141,30 @@ def test_a_bad_command_is_rejected_by_reason(action, mode, found):
 
 
 @pytest.mark.parametrize(
+    ("plan", "reason"),
+    [
+        ([[0.1, 0.2]] * 10, None),
+        ([], None),
+        ([[0.1, 0.2]] * 11, Reason.MALFORMED),
+        ([[0.1, 0.2], [0.1]], Reason.MALFORMED),
+        ([[]], Reason.MALFORMED),
+        ([0.1], Reason.MALFORMED),
+        ("long", Reason.MALFORMED),
+        ([[0.1, 0.2], [0.1, math.inf]], Reason.NOT_FINITE),
+    ],
+)
+def test_a_plan_holds_ten_whole_finite_actions_at_most(plan, reason):
+    fields = {**as_map(make_command(action=[0.0, 0.0])), "plan": plan}
+    found = wire.decode_command(msgspec.msgpack.encode(fields))
+    assert (found.reason if isinstance(found, Rejection) else None) is reason
+    assert isinstance(found, Rejection) or found.plan == plan
+
+
+@pytest.mark.parametrize(
     "nested", [b"\x91" * 60_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff"]
 )
 def test_hostile_nesting_and_lengths(nested):
-    assert isinstance(wire.decode_state(b"\x82\xa6schema\x01\xa1x" + nested), Rejection)
+    assert isinstance(decode_state(b"\x82\xa6schema\x01\xa1x" + nested), Rejection)
 
 
 def test_the_health_of_an_earlier_version_is_understood_and_so_is_ours_by_it():
@@ -152,18 +182,23 @@ def test_the_health_of_an_earlier_version_is_understood_and_so_is_ours_by_it():
 
 def padded_to(size: int) -> bytes:
     """A valid state that is so many bytes long, by a field that nobody knows."""
-    tried = 50_000
+    tried = 3000
     overhead = len(msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(tried)})) - tried
     return msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(size - overhead)})
 
 
 def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():
-    assert len(padded_to(65_536)) == 65_536
-    assert isinstance(wire.decode_state(padded_to(65_536)), State)
-    too_long = (Reason.OVERSIZED, "65537 bytes, at most 65536 are read")
-    assert wire.decode_state(padded_to(65_537)) == too_long
+    most = 7200 + 4096  # the manifest's observation, and 4 KiB
+    assert len(padded_to(most)) == most
+    assert isinstance(decode_state(padded_to(most)), State)
+    too_long = (Reason.OVERSIZED, "11297 bytes, at most 11296 are read")
+    assert decode_state(padded_to(most + 1)) == too_long
+    assert isinstance(wire.decode_state(padded_to(most + 1)), State)  # whoever has no manifest
+    for huge in (wire.decode_state(bytes(2**22 + 1)), wire.decode_command(bytes(2**16 + 1))):
+        assert isinstance(huge, Rejection)
+        assert huge.reason is Reason.OVERSIZED
     for count in (256, 257):
-        state = wire.decode_state(wire.encode(make_state(0, session="x" * count)))
+        state = decode_state(wire.encode(make_state(0, session="x" * count)))
         assert isinstance(state, State) == (count == 256)
 
 
@@ -181,7 +216,8 @@ def test_only_feedback_may_say_that_no_command_came_yet():
     assert rejected(wire.decode_health, negative).detail == words
 
 
-def test_keys():
+def test_keys_and_their_rates():
+    assert (wire.TOPICS["feedback"], wire.TOPICS["health"]) == (20.0, 2.0)
     assert wire.key("hunter01", "state") == "phil/hunter01/state"
     for bad in ("", "a/b", "*", "a" * 65, "a\n", "h\u00fcnter"):
         with pytest.raises(UserError):

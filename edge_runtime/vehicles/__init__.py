@@ -1,114 +1,97 @@
-"""Vehicle drivers, and those that `--vehicle` knows by name.
+"""The door of every vehicle: by name, as an entry point of another package, or as module:Class.
 
 What one of them needs is imported for that one only.
 """
 
 from __future__ import annotations
 
-from typing import Dict
+import inspect
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Iterable, Mapping, Tuple, Type
 
-import msgspec
-
-from edge_runtime.config import (
-    DEFAULT_BUS,
-    NONE,
-    VEHICLE_NAMES,
-    Config,
-    HunterSettings,
-    Ros2Settings,
-    check_choice,
-)
-from edge_runtime.controller import ActionLimit
+from edge_runtime.config import BUILT_IN, NONE
+from edge_runtime.controller import ActionLimit, Limits
+from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
-from edge_runtime.vehicles.mapping import (
-    CARS,
-    SPECS,
-    ScenarioCar,
-    Similarity,
-    car_of,
-    similarity_to,
-)
-from edge_runtime.vehicles.mock import MockParameters, MockVehicle
+
+GROUP = "phil.vehicles"
+Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by name
 
 
-def make_vehicle(name: str, config: Config, scenario: str) -> Vehicle:
-    """The driver of that name for a policy of that scenario. Nothing is sent before it is enabled.
+def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
+    """The driver of that name, open for a policy. Nothing is sent before it is enabled.
 
-    Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
-    what it hangs on cannot be opened.
+    Raises UserError where there is none, for its settings, and where it cannot be opened.
     """
-    check_choice("vehicle", name, VEHICLE_NAMES[1:])
-    if name == "mock":
-        return _mock(config, scenario)
-    similarity = _similarity(name, config, scenario)
-    if name == "hunter":
-        from edge_runtime.vehicles.hunter import HunterVehicle, parse_bus
-
-        return HunterVehicle(parse_bus(config.bus), similarity, config.hunter.profile)
-    from edge_runtime.vehicles.ros2 import Ros2Vehicle
-
-    return Ros2Vehicle(config.ros2, similarity)
+    kind, settings = _find(name, tables)
+    try:
+        vehicle = kind.open(settings, manifest)
+    except UserError:
+        raise
+    except Exception as error:  # a stranger's driver raises what its library raises
+        raise UserError(f"vehicle {name} cannot be opened: {_words(error)}") from None
+    check_driver(vehicle)
+    return vehicle
 
 
-def vehicle_limits(name: str, config: Config, scenario: str) -> Dict[str, ActionLimit]:
+def check_driver(vehicle: Any) -> None:
+    """Raise UserError for what is no driver, and, closed, for one without proper `limits`."""
+    if not isinstance(vehicle, Vehicle):
+        raise UserError(f"vehicle {vehicle!r} is no edge_runtime.vehicles.base.Vehicle")
+    limits: Any = getattr(vehicle, "limits", None)
+    if not (isinstance(limits, dict) and all(isinstance(x, ActionLimit) for x in limits.values())):
+        vehicle.close()
+        form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller"
+        raise UserError(f"vehicle {vehicle.name}: its limits must be like {form}, not {limits!r}")
+
+
+def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
     """What the vehicle of that name lets each action be, without opening anything; "none": {}.
 
-    Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
+    Raises UserError where there is none, and for its settings.
     """
-    check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return {}
-    if name == "mock":
-        return MockVehicle.limits
-    return _similarity(name, config, scenario).limits()
+    kind, settings = _find(name, tables)
+    return kind.limits_of(settings, manifest)
 
 
-def _mock(config: Config, scenario: str) -> Vehicle:
-    """As quick as the policy's car, where that is known."""
-    car = config.similarity.car or CARS.get(scenario)
-    if car is None:
-        return MockVehicle()
-    return MockVehicle(
-        MockParameters(
-            throttle_mps2=car.throttle_mps2,
-            brake_mps2=car.brake_mps2,
-            max_speed_mps=car.max_speed_mps,
-        )
-    )
+def find_vehicle(name: str) -> Type[Vehicle]:
+    """The class of a driver. Raises UserError where it cannot be loaded, or is no Vehicle."""
+    place = name if ":" in name else BUILT_IN.get(name)
+    if place is None:
+        others = {point.name: point.value for point in _others()}
+        place = others.get(name)
+    if place is None:
+        known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
+        raise UserError(f"vehicle {name!r} is not known; choose from {known}, or a module:Class")
+    module, _, member = place.partition(":")
+    try:
+        kind = getattr(import_module(module), member)
+    except Exception as error:  # whatever a stranger's module raises
+        raise UserError(f"vehicle {name!r} cannot be loaded: {_words(error)}") from None
+    if not (isinstance(kind, type) and issubclass(kind, Vehicle)):
+        raise UserError(f"vehicle {name!r}: {place} is no edge_runtime.vehicles.base.Vehicle")
+    if inspect.isabstract(kind):
+        lacking = ", ".join(sorted(kind.__abstractmethods__))
+        raise UserError(f"vehicle {name!r}: {place} is no whole Vehicle: it lacks {lacking}")
+    return kind
 
 
-def _similarity(name: str, config: Config, scenario: str) -> Similarity:
-    """From the policy's car to the chassis of the vehicle of that name. Raises UserError."""
-    given = config.similarity.car
-    car = ScenarioCar(**msgspec.structs.asdict(given)) if given else car_of(scenario, name)
-    model = config.ros2.model if name == "ros2" else config.hunter.model
-    return similarity_to(car, SPECS[model], config.similarity.scale)
+def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
+    """The class, and its table: that of its name here, of a module:Class that of its own name."""
+    kind = find_vehicle(name)
+    return kind, tables.get(kind.name if ":" in name else name, {})
 
 
-def check_settings(config: Config) -> None:
-    """Raise UserError for settings that are not valid, whichever vehicle is chosen.
+def _others() -> Iterable[Any]:
+    """The entry points of other packages."""
+    found: Any = entry_points()
+    # Before Python 3.10 a dict of lists; two folders on the path may both name one.
+    return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())
 
-    The defaults are valid (a test), and load nothing.
-    """
-    if (config.bus, config.hunter) != (DEFAULT_BUS, HunterSettings()):
-        from edge_runtime.vehicles.hunter import parse_bus, protocol
 
-        parse_bus(config.bus)
-        check_choice("hunter.model", config.hunter.model, tuple(SPECS))
-        check_choice("hunter.profile", config.hunter.profile, tuple(protocol.PROFILES))
-    if config.ros2 != Ros2Settings():
-        from edge_runtime.vehicles import ros2
-
-        ros2.check_settings(config.ros2)
-    car, scale = config.similarity.car, config.similarity.scale
-    numbers = {} if car is None else msgspec.structs.asdict(car)
-    if scale is not None:
-        numbers["scale"] = scale
-    for name, value in numbers.items():
-        fits, words = 0.0 < value < float("inf"), "above 0"
-        if name == "full_steering_rad":  # to the right, the full angle is below 0
-            fits = 0.0 < abs(value) < 1.5
-            words = "above 0 and below 1.5 rad, or below 0 and above -1.5"
-        if not fits:
-            raise UserError(f"similarity: {name} {value} is not valid: it must be {words}")
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -8,19 +8,38 @@ braking by itself; and the loop goes on, and says safe stop, when the driver rai
 from __future__ import annotations
 
 import abc
+import inspect
 import math
 import threading
 import time
 from collections import deque
-from typing import Callable, ClassVar, Deque, Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    ClassVar,
+    Deque,
+    Dict,
+    List,
+    Mapping,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+)
 
 from edge_runtime import log
-from edge_runtime.controller import ActionLimit
-from edge_runtime.wire import CONTROL_PERIOD_S, MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
+from edge_runtime.controller import ActionLimit, Limits
+from edge_runtime.manifest import MIN_PERIOD_S
+from edge_runtime.util import UserError
+from edge_runtime.wire import MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
+
+if TYPE_CHECKING:
+    from edge_runtime.manifest import Manifest
 
 
 class VehicleReport(NamedTuple):
-    """What the vehicle does. `action` is what its actuators have reached, in -1 to 1.
+    """What the vehicle does. `action` is what its actuators have reached, in the units of `limits`.
 
     `faults` says in words why it does not drive, until it is enabled again; `standing` are those
     whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
@@ -39,10 +58,46 @@ class VehicleReport(NamedTuple):
 
 
 class Vehicle(abc.ABC):
-    """A vehicle under command. `limits` is keyed by the action names of the manifest."""
+    """A vehicle under command. `limits` is keyed by the action names of the manifest, in its units.
+
+    `name` is what others see of it, and its table in the settings; the class's own name by default.
+    The runtime sets `control_period_s` to the policy's before `enable`; until then it is the
+    shortest there is, which brakes soonest.
+    """
 
     name: ClassVar[str]
-    limits: Dict[str, ActionLimit]
+    limits: Limits
+    control_period_s: float = MIN_PERIOD_S
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if not hasattr(cls, "name"):
+            cls.name = cls.__name__
+
+    @classmethod
+    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
+        """The driver for a policy, with the settings of its table. Sends nothing before `enable`.
+
+        By default they are the constructor's arguments. Raises UserError for settings that are
+        not valid, and where what it hangs on cannot be opened.
+        """
+        known = inspect.signature(cls)
+        try:
+            known.bind(**settings)
+        except TypeError as error:
+            names = ", ".join(known.parameters) or "none"
+            raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
+        return cls(**settings)
+
+    @classmethod
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
+        """What `limits` of the driver would be, without opening anything: a replay needs them.
+
+        By default those of the class. Raises UserError where it has none, or as `open` does.
+        """
+        if not hasattr(cls, "limits"):
+            raise UserError(f"vehicle {cls.name}: what it lets an action be is not known unopened")
+        return cls.limits
 
     @abc.abstractmethod
     def enable(self, now_s: float) -> None:
@@ -83,19 +138,19 @@ class Vehicle(abc.ABC):
 
 PEDAL = "pedal"
 SILENT, STUCK, LYING = "vehicle_silent", "vehicle_stuck", "vehicle_lying"
-SILENCE_S = 2 * CONTROL_PERIOD_S
-LAG_S = 3 * CONTROL_PERIOD_S  # an actuator may still follow a command of this age
-DEVIATION = 0.25  # of full pedal or steering, outside of all that was asked within LAG_S
-DEVIATES_S = CONTROL_PERIOD_S  # for this long without a break
+LAG_S = 0.3  # an actuator may still follow a command of this age
+DEVIATION = 0.125  # of an action's range, outside of all that was asked within LAG_S
+DEVIATES_S = 0.1  # for this long without a break
 MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
 SPEED_NOISE_MPS = 0.5
-_ROUNDING = 1e-3
+_ROUNDING = 5e-4  # of an action's range
 
 
 class VehicleWatch:
     """Told every command and report; `fault` says what is wrong. Not thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, control_period_s: float, limits: Limits) -> None:
+        self._silence_s, self._limits = 2 * control_period_s, limits
         self._asked: Deque[Tuple[float, Dict[str, float]]] = deque()
         self._reported_s: Optional[float] = None
         self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
@@ -105,14 +160,14 @@ class VehicleWatch:
     @property
     def silent_at_s(self) -> float:
         """When it counts as silent if no further report comes; inf before the first report."""
-        return math.inf if self._reported_s is None else self._reported_s + SILENCE_S
+        return math.inf if self._reported_s is None else self._reported_s + self._silence_s
 
     def begin(self, now_s: float) -> None:
         """The vehicle is enabled: from now on it owes reports."""
         self._reported_s = now_s
 
     def command(self, action: Dict[str, float], now_s: float) -> None:
-        """Note what was asked; the pedal of a safe stop is -1."""
+        """Note what was asked; of a safe stop, too."""
         self._asked.append((now_s, action))
         # One entry older than LAG_S stays: it was in force when the window began.
         while len(self._asked) > 1 and self._asked[1][0] < now_s - LAG_S:
@@ -139,8 +194,12 @@ class VehicleWatch:
         return STUCK if since_s is not None and now_s - since_s > DEVIATES_S else ""
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
-        is_in_range = all(abs(value) <= 1.0 + _ROUNDING for value in report.action.values())
-        if not (is_in_range and math.isfinite(report.speed_mps)):  # NaN is in no range
+        for name, value in report.action.items():
+            low, high = self._range(name)
+            slack = _ROUNDING * (high - low)
+            if not low - slack <= value <= high + slack:  # NaN is in no range
+                return True
+        if not math.isfinite(report.speed_mps):
             return True
         # From the last possible report on: a leap is a lie until that speed could be real.
         since_s, speed_mps = self._believed or (now_s, report.speed_mps)
@@ -154,12 +213,18 @@ class VehicleWatch:
             if name == PEDAL and report.commanded_speed_mps is not None:
                 continue  # worked out from a speed, whose limits it cannot know: the driver judges
             asked = [action[name] for _, action in self._asked if name in action]
-            if asked and not min(asked) - DEVIATION <= value <= max(asked) + DEVIATION:
+            low, high = self._range(name)
+            most = DEVIATION * (high - low)
+            if asked and not min(asked) - most <= value <= max(asked) + most:
                 return True
         return False
 
+    def _range(self, name: str) -> Tuple[float, float]:
+        """Of an action of the vehicle; it may report more than it takes, in -1 to 1."""
+        limit = self._limits.get(name)
+        return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
 
-_PERIOD_S = 1.0 / TOPICS["feedback"]
+
 _JOIN_S = 0.5
 
 
@@ -186,7 +251,10 @@ class VehicleRunner:
         self._action_names = action_names
         self._publish = publish
         self.on_fault: Callable[[], None] = lambda: None
-        self._watch = VehicleWatch()
+        self._watch = VehicleWatch(vehicle.control_period_s, vehicle.limits)
+        self._silence_s = 2 * vehicle.control_period_s
+        # As often as the topic says, and twice before its silence would be a fault.
+        self._period_s = min(1.0 / TOPICS["feedback"], vehicle.control_period_s / 2)
         self._refuses = False  # the driver raised at the newest command
         self._failing = False
         self._next: Optional[_Task] = None  # the newest, until the driver takes it
@@ -277,7 +345,7 @@ class VehicleRunner:
             now_s = time.monotonic()
             if now_s >= next_s:
                 # Absolute deadlines; after a long pause one report, not one for each missed period.
-                next_s = max(next_s + _PERIOD_S, now_s)
+                next_s = max(next_s + self._period_s, now_s)
                 self._report()
             self._busy_since_s = None
 
@@ -312,7 +380,9 @@ class VehicleRunner:
                 self._vehicle.brake(now_s, task.latch)
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
-            elif now_s - task.given_s <= SILENCE_S:  # a driver that hung must not obey the past
+            elif (
+                now_s - task.given_s <= self._silence_s
+            ):  # a driver that hung must not obey the past
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
         except Exception as error:  # a driver may raise anything; its thread must live on
             if not self._refuses:

@@ -16,25 +16,25 @@ from collections import deque
 from enum import Enum
 from typing import ClassVar, Deque, Dict, List, NamedTuple, Optional, Tuple
 
-from edge_runtime.safety import SILENCE_S
+from edge_runtime.manifest import MIN_PERIOD_S
+from edge_runtime.safety import SILENCE_PERIODS
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, wish_of
-from edge_runtime.wire import CONTROL_PERIOD_S
 
-# A beat later than the runtime's own silence rule, which then tells the reason; still within
-# the promise of 2 T + 50 ms, and less than half of the 500 ms of a Hunter's chassis.
-COMMAND_TIMEOUT_S = SILENCE_S + 0.02
+# A beat later than the runtime's own silence rule, which then tells the reason.
+BEAT_S = 0.02
+LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
 ENABLE_TIMEOUT_S = 1.0
 # At the end zeros go out for so long, unless it is known to stand before; and what is then not
 # known to stand gets the parking brake, where there is one.
 STOP_TAKES_S = 1.0
 
-FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of this age
+FOLLOWS_S = 1.0  # a drive may still follow a set-point of this age
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
-DEVIATES_S = CONTROL_PERIOD_S
+DEVIATES_S = 0.1
 STANDS_MPS = 0.02
 IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
-_SLACK_S = 0.01
+_WINDOW_S = 0.11
 
 
 class State(str, Enum):
@@ -98,16 +98,24 @@ class Finding(NamedTuple):
 
 
 class Speeds:
-    """The speeds that a vehicle reported in the last control period, and what follows from them."""
+    """The speeds that a vehicle reported in the last 0.1 s, and what follows from them.
+
+    After `silence_s` without feedback it counts as silent.
+    """
 
     def __init__(self) -> None:
+        self.silence_s = 0.2
         self._noted: Deque[Tuple[float, float]] = deque()
 
     def note(self, speed_mps: float, now_s: float) -> None:
         """The newest one."""
         self._noted.append((now_s, speed_mps))
-        while self._noted[0][0] < now_s - CONTROL_PERIOD_S - _SLACK_S:
+        while self._noted[0][0] < now_s - _WINDOW_S:
             self._noted.popleft()
+
+    def forget(self) -> None:
+        """Those from before count no more."""
+        self._noted.clear()
 
     @property
     def speed_mps(self) -> float:
@@ -120,7 +128,7 @@ class Speeds:
         return abs(self.speed_mps) < STANDS_MPS
 
     def acceleration_mps2(self) -> float:
-        """Over the last control period; 0 while there is too little to tell."""
+        """Over the last 0.1 s; 0 while there is too little to tell."""
         if len(self._noted) < 2:
             return 0.0
         (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
@@ -164,9 +172,15 @@ class StreamedCore(abc.ABC):
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
         self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
+        self.follow_period(MIN_PERIOD_S)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
+
+    def follow_period(self, control_period_s: float) -> None:
+        """Take the policy's control period T: how long a command holds, and feedback may miss."""
+        self.command_timeout_s = SILENCE_PERIODS * control_period_s + BEAT_S
+        self._heard.silence_s = max(2 * control_period_s, LEAST_SILENCE_S)
 
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
@@ -194,7 +208,7 @@ class StreamedCore(abc.ABC):
     @property
     def late_at_s(self) -> float:
         """After which moment its newest command is too old to be obeyed; inf where it has none."""
-        return math.inf if self._wish is None else self._wished_s + COMMAND_TIMEOUT_S
+        return math.inf if self._wish is None else self._wished_s + self.command_timeout_s
 
     def report(self, now_s: float) -> VehicleReport:
         """What the vehicle does, in the policy's terms and in its own."""
@@ -259,8 +273,8 @@ class StreamedCore(abc.ABC):
         if self.state is not State.ENABLED:
             return
         found = self._silence(self._since_s, now_s) or self._lie()
-        if found is None and self._wish is not None and now_s - self._wished_s > COMMAND_TIMEOUT_S:
-            found = Finding(Event.COMMAND_LATE, f"no command for {COMMAND_TIMEOUT_S:.2f} s")
+        if found is None and now_s > self.late_at_s:
+            found = Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
         asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps
         if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
             words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"

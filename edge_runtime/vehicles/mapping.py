@@ -14,14 +14,17 @@ from __future__ import annotations
 import math
 from typing import Dict, NamedTuple, Optional
 
+import msgspec
+
+from edge_runtime.config import check_choice
 from edge_runtime.controller import ActionLimit
+from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S
 
 # The set-point runs ahead of the speed by what full acceleration gives in this time, and no
 # further: a vehicle that was held up must not leap when it comes free (anti-windup).
 LEAD_S = 0.5
-_LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
+_LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for it
 
 
 def clamp(value: float, most: float) -> float:
@@ -70,12 +73,8 @@ SPECS: Dict[str, HunterSpec] = {
 }
 
 
-class ScenarioCar(NamedTuple):
-    """The car that a policy was trained on.
-
-    `full_steering_rad` is the front-wheel angle at action +1, positive to the left.
-    `wheelbase_m` is the length that highway-env's bicycle model turns by.
-    """
+class ScenarioCar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The car that a policy was trained on, as `manifest.Car` describes it, and how it turns."""
 
     throttle_mps2: float
     brake_mps2: float
@@ -96,26 +95,6 @@ class ScenarioCar(NamedTuple):
         """The steering action of a path; not clamped. Inverse of the above."""
         slip_rad = math.asin(clamp(0.5 * self.wheelbase_m * curvature, 1.0))
         return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
-
-
-# The numbers of trainer/scenarios, which holds them equal by a test. Congestion's throttle is its
-# IDM's: no action of its policy reaches it; its action +1 turns right. No action of the left turn
-# steers: the angle there is where its path tracker ends.
-CARS: Dict[str, ScenarioCar] = {
-    "left_turn": ScenarioCar(3.0, 4.0, 6.0, math.pi / 4, 5.0),
-    "congestion": ScenarioCar(3.0, 4.0, 6.0, -0.15, 5.0),
-}
-
-
-def car_of(scenario: str, vehicle: str) -> ScenarioCar:
-    """The car of a manifest's scenario. Raises UserError for one that this runtime cannot know."""
-    if scenario not in CARS:
-        raise UserError(
-            f"the {vehicle} cannot follow a policy of the scenario {scenario!r}: which car it was"
-            f" trained on is known for {', '.join(sorted(CARS))};"
-            " set [similarity.car] in --config, or use --vehicle none"
-        )
-    return CARS[scenario]
 
 
 class Similarity(NamedTuple):
@@ -175,6 +154,43 @@ class Similarity(NamedTuple):
 def similarity_to(car: ScenarioCar, spec: HunterSpec, scale: Optional[float] = None) -> Similarity:
     """The similarity of a robot; by default its top speed is the car's top speed."""
     return Similarity(car, spec, spec.max_speed_mps / car.max_speed_mps if scale is None else scale)
+
+
+class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What stands in the table of each vehicle that takes a speed and an angle.
+
+    `scale`: metres of the vehicle for one of the scenario; None: top speed is top speed. `car`: in
+    place of the manifest's.
+    """
+
+    model: str = "2.0"
+    scale: Optional[float] = None
+    car: Optional[ScenarioCar] = None
+
+    def similarity(self, vehicle: str, manifest: Manifest) -> Similarity:
+        """From the policy's car to this vehicle. Raises UserError where one of them is not known,
+        and for numbers that cannot be.
+        """
+        table = f"vehicle.{vehicle}"
+        check_choice(f"{table}.model", self.model, tuple(SPECS))
+        given = self.car or manifest.car
+        if given is None:
+            raise UserError(
+                f"the {vehicle} cannot follow a policy of the task {manifest.task!r}: its manifest"
+                f" does not say which car it was trained on; set car in [{table}] of --config"
+            )
+        numbers = msgspec.structs.asdict(given)
+        if self.scale is not None:
+            numbers["scale"] = self.scale
+        for name, value in numbers.items():
+            fits, words = 0.0 < value < float("inf"), "above 0"
+            if name == "full_steering_rad":  # to the right, the full angle is below 0
+                fits = 0.0 < abs(value) < 1.5
+                words = "above 0 and below 1.5 rad, or below 0 and above -1.5"
+            if not fits:
+                raise UserError(f"{table}: {name} {value} is not valid: it must be {words}")
+        car = ScenarioCar(**msgspec.structs.asdict(given))
+        return similarity_to(car, SPECS[self.model], self.scale)
 
 
 class Wish(NamedTuple):

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import ClassVar, Deque, Dict, NamedTuple, Optional, Tuple
+from typing import TYPE_CHECKING, Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
 
+import msgspec
+
+from edge_runtime.config import convert
 from edge_runtime.controller import ActionLimit
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
-from edge_runtime.wire import CONTROL_PERIOD_S
+from edge_runtime.vehicles.mapping import clamp
 
-COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
+if TYPE_CHECKING:
+    from edge_runtime.manifest import Manifest
+
 _INTEGRATION_STEP_S = 0.005
 _LONGEST_GAP_S = 10.0  # without a command it then stands, whatever it did before
 
 
-class MockParameters(NamedTuple):
-    """Actuators (rates in full pedal or steering per second), and a body as in mapping.CARS."""
+class MockParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Actuators (rates in full pedal or steering per second), and a body. [vehicle.mock]."""
 
     dead_time_s: float = 0.02
     time_constant_s: float = 0.05
@@ -41,6 +46,8 @@ class MockVehicle(Vehicle):
         "steering": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
     }
 
+    _OF_THE_CAR = ("throttle_mps2", "brake_mps2", "max_speed_mps")
+
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
         self._parameters = parameters or MockParameters()
         self._pedal, self._steering, self._speed_mps = -1.0, 0.0, 0.0
@@ -49,6 +56,13 @@ class MockVehicle(Vehicle):
         self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
         self._target = (-1.0, 0.0)
         self._latched = True  # until it is enabled
+
+    @classmethod
+    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
+        """As quick as the policy's car, where that is known and the settings say nothing else."""
+        car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
+        known = {name: car[name] for name in cls._OF_THE_CAR if name in car}
+        return cls(convert({**known, **settings}, MockParameters, "vehicle.mock"))
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
@@ -59,13 +73,15 @@ class MockVehicle(Vehicle):
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
         """An action that a policy does not have is zero: no pedal, wheels straight."""
-        if not action:
-            raise ValueError("a command that lacks an action")
+        if not action.keys() & self.limits.keys():
+            raise ValueError(f"a command that lacks an action: {action}")
+        if not all(map(math.isfinite, action.values())):
+            raise ValueError(f"a command that is not finite: {action}")
         self._integrate(now_s)
         if self._latched:
             return
         self._commanded_s = now_s
-        target = (action.get("pedal", 0.0), action.get("steering", 0.0))
+        target = (clamp(action.get("pedal", 0.0), 1.0), clamp(action.get("steering", 0.0), 1.0))
         self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
@@ -87,12 +103,13 @@ class MockVehicle(Vehicle):
         )
 
     def close(self) -> None:
-        """Nothing to free; the brake comes on with the last command's age."""
+        """Nothing to free; it stands, and stays so."""
+        self._latched = True
         self._on_the_way.clear()
         self._target = (-1.0, self._target[1])
 
     def _is_left_alone(self, now_s: float) -> bool:
-        return now_s - self._commanded_s > COMMAND_TIMEOUT_S
+        return now_s - self._commanded_s > 2 * self.control_period_s
 
     def _integrate(self, until_s: float) -> None:
         begin_s = until_s if self._now_s is None else self._now_s

@@ -11,19 +11,30 @@ from __future__ import annotations
 import abc
 import threading
 import time
-from typing import Callable, Dict, Optional
+from typing import TYPE_CHECKING, Any, Callable, ClassVar, Dict, Mapping, Optional, Type
 
 from edge_runtime import log
+from edge_runtime.config import convert
+from edge_runtime.controller import Limits
 from edge_runtime.service import LatencyWindow
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
+from edge_runtime.vehicles.mapping import RobotSettings
+
+if TYPE_CHECKING:
+    from edge_runtime.manifest import Manifest
 
 PERIOD_S = 0.02
 _JOIN_S = 0.5
 
 
 class StreamedVehicle(Vehicle):
-    """A core behind a lock, and the stream that sends what it asks for."""
+    """A core behind a lock, and the stream that sends what it asks for.
+
+    It is made of its settings and the similarity of its robot to the policy's car.
+    """
+
+    settings_type: ClassVar[Type[RobotSettings]]
 
     def __init__(self, core: StreamedCore) -> None:
         self._core = core
@@ -32,6 +43,21 @@ class StreamedVehicle(Vehicle):
         self._closed = False
         self._logged = ("", "")
         self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
+
+    @classmethod
+    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
+        """As `Vehicle.open`."""
+        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        make: Any = cls
+        vehicle: StreamedVehicle = make(given, given.similarity(cls.name, manifest))
+        vehicle._core.follow_period(manifest.control_period_s)  # it listens before it is enabled
+        return vehicle
+
+    @classmethod
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
+        """As `Vehicle.limits_of`."""
+        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        return given.similarity(cls.name, manifest).limits()
 
     @property
     def state(self) -> State:
@@ -43,6 +69,7 @@ class StreamedVehicle(Vehicle):
         if self._closed:
             return
         with self._lock:
+            self._core.follow_period(self.control_period_s)
             self._core.enable(now_s)
         self._start()
         self._stream.wake()

@@ -5,8 +5,9 @@ done to it from outside is put in here, so that the code that drives has no swit
 ``python -m hil_tests.faults.inside router LISTEN CONNECT`` is a Zenoh router to be killed.
 
 The directory PHIL_FAULT_DIR holds the switches, which are files: ``end`` ends the episode,
-``bright`` turns the frames white, ``vehicle`` holds the fault of the mock vehicle. Every press and
-release of the simulated brake is written to ``brakes`` there, with its monotonic time.
+``bright`` turns pictures white, ``vehicle`` holds the fault of the mock vehicle; ``task`` holds the
+task that the policy was made for. Every press and release of the simulated brake is written to
+``brakes`` there, with its monotonic time.
 """
 
 from __future__ import annotations
@@ -21,49 +22,62 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from edge_runtime import vehicles
+from edge_runtime.config import BUILT_IN
+from edge_runtime.manifest import Entry, Task
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
 
 DIRECTORY = "PHIL_FAULT_DIR"
 ENVIRONMENT = "hil_tests.faults.inside:PhilEndless-v0"
-END, BRIGHT, BRAKES, VEHICLE = "end", "bright", "brakes", "vehicle"
+END, BRIGHT, BRAKES, VEHICLE, TASK = "end", "bright", "brakes", "vehicle", "task"
 _FULL_MPS2, _MOST_MPS = 4.0, 12.0
 _WHITE, _DARKEST_TO_BRIGHTEST = 255, 120
 _STUCK_AT, _LEAP_MPS = -1.0, 8.0
 _STEP_S = 3600
 
 
-class EndlessEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A car on a straight road; the picture is noise below half brightness, new every step."""
+Observation = dict[str, np.ndarray]
+
+
+class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
+    """A car on a straight road, whose pedal is the first action; it sees noise."""
 
     def __init__(self) -> None:
-        self.observation_space = spaces.Box(0, 255, FRAMES_SHAPE, np.uint8)
-        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.brake_action = np.array([-1.0], np.float32)
         self._directory = Path(os.environ[DIRECTORY])
+        self._task = task = msgspec.json.decode((self._directory / TASK).read_bytes(), type=Task)
+        self.scenario, self.control_period_s = task.task, task.control_period_s
+        self.action_names = tuple(one.name for one in task.action)
+        seen: dict[str, spaces.Space[Any]] = {
+            name: _space(entry) for name, entry in task.observation.items()
+        }
+        self.observation_space: Any = spaces.Dict(seen)
+        ends = ((one.low, one.high, one.stop or 0.0) for one in task.action)
+        low, high, self.brake_action = np.array(list(ends), np.float32).T
+        self.action_space = spaces.Box(low, high)
         self._braking = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Stand at the start of the road."""
         super().reset(seed=seed)
         self._speed_mps = self._distance_m = 0.0
-        return self._frames(), self._info()
+        return self._observation(), self._info()
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period."""
-        change_mps = float(action[0]) * _FULL_MPS2 * CONTROL_PERIOD_S
-        self._speed_mps = min(max(self._speed_mps + change_mps, 0.0), _MOST_MPS)
-        self._distance_m += self._speed_mps * CONTROL_PERIOD_S
+        first, period_s = self._task.action[0], self.control_period_s
+        pedal = 2.0 * (float(action[0]) - first.low) / (first.high - first.low) - 1.0
+        speed_mps = self._speed_mps + pedal * _FULL_MPS2 * period_s
+        self._speed_mps = min(max(speed_mps, 0.0), _MOST_MPS)
+        self._distance_m += self._speed_mps * period_s
         ended = (self._directory / END).exists()
-        return self._frames(), 0.0, ended, False, self._info()
+        return self._observation(), 0.0, ended, False, self._info()
 
     def press_brake(self, pressed: bool) -> None:
         """Told every tick whether the vehicle brakes; only changes are written."""
@@ -72,13 +86,30 @@ class EndlessEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             with (self._directory / BRAKES).open("a") as brakes:
                 brakes.write(f"{time.monotonic():.6f} {int(pressed)}\n")
 
-    def _frames(self) -> np.ndarray:
-        if (self._directory / BRIGHT).exists():
-            return np.full(FRAMES_SHAPE, _WHITE, np.uint8)
-        return self.np_random.integers(0, _DARKEST_TO_BRIGHTEST, FRAMES_SHAPE, dtype=np.uint8)
+    def _observation(self) -> Observation:
+        bright = (self._directory / BRIGHT).exists()
+        return noise(self._task, self.np_random, bright)
 
     def _info(self) -> dict[str, Any]:
         return {"distance_m": self._distance_m, "speed_mps": self._speed_mps, "outcome": "goal"}
+
+
+def noise(task: Task, generator: np.random.Generator, bright: bool = False) -> Observation:
+    """An observation of random numbers; pictures are below half brightness, or white."""
+
+    def draw(entry: Entry) -> np.ndarray:
+        if entry.dtype == "uint8" and bright:
+            return np.full(entry.shape, _WHITE, np.uint8)
+        most = _DARKEST_TO_BRIGHTEST if entry.dtype == "uint8" else 2
+        whole = generator.integers(0, most, entry.shape)
+        return (whole if entry.dtype != "float32" else whole - 0.5).astype(entry.dtype)
+
+    return {name: draw(entry) for name, entry in task.observation.items()}
+
+
+def _space(entry: Entry) -> spaces.Box:
+    low, high = (0, 255) if entry.dtype == "uint8" else (0, 1) if entry.dtype == "bool" else (-9, 9)
+    return spaces.Box(low, high, tuple(entry.shape), np.dtype(entry.dtype).type)
 
 
 if "PhilEndless-v0" not in gymnasium.registry:
@@ -94,9 +125,7 @@ if "PhilEndless-v0" not in gymnasium.registry:
 class FaultyMockVehicle(MockVehicle):
     """The mock until its switch, a file, holds ``silent``, ``stuck`` or ``lying``."""
 
-    def __init__(self, switch: Path) -> None:
-        super().__init__()
-        self._switch = switch
+    _switch = Path(os.environ.get(DIRECTORY, "")) / VEHICLE
 
     def feedback(self, now_s: float) -> VehicleReport:
         """The mock's report: none, one of stuck actuators, or an impossible one."""
@@ -124,8 +153,8 @@ def step_clock_on_signals() -> None:
 def launch(package: str) -> None:
     """Put the faults in, then be the command."""
     step_clock_on_signals()
-    switch = Path(os.environ[DIRECTORY]) / VEHICLE
-    vehicles._mock = lambda config, scenario: FaultyMockVehicle(switch)
+    # Not __name__: see above.
+    BUILT_IN["mock"] = "hil_tests.faults.inside:FaultyMockVehicle"
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 
 import msgspec
 import numpy as np
 
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback, Message, Rejection, encode
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, make_state
 from hil_tests.faults.rows import GAP, Try, drives_on, drove_on, fault
 from hil_tests.processes import wait_until
@@ -36,17 +38,17 @@ def bad_states(rig: Rig, number: int) -> Try:
     sent: Counter[str] = Counter()
     for _ in range(BAD_STATE_ROUNDS):
         with rig.sender.lock:
-            for reason, payload in _bad_of(rig.sender.step):
+            for reason, payload in _bad_of(rig.sender.step, rig.task):
                 rig.probe.put("state", payload)
                 sent[reason] += 1
             # Two states that have overtaken one another, and one that says it is from the future.
             rig.sender.step += 3
             step = rig.sender.step
-            rig.sender.send(make_state(step - 1))
-            rig.probe.put("state", encode(make_state(step - 2)))
+            rig.sender.send(make_state(step - 1, rig.task))
+            rig.probe.put("state", encode(make_state(step - 2, rig.task)))
             sent["stale"] += 1
-            rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
-        time.sleep(CONTROL_PERIOD_S / 2)
+            rig.sender.send(make_state(step, rig.task, sent_ns=time.time_ns() + _HOUR_NS))
+        time.sleep(rig.period_s / 2)
     return Try(rejected=sent)
 
 
@@ -56,7 +58,7 @@ def oversized(rig: Rig, number: int) -> Try:
     payload, memory_mb = bytes(OVERSIZED_BYTES), rig.edge.resident_mb()
     for _ in range(OVERSIZED):
         rig.probe.put("state", payload)
-        time.sleep(CONTROL_PERIOD_S)
+        time.sleep(rig.period_s)
     figures = {"memory grown, MB": rig.edge.resident_mb() - memory_mb}
     return Try(rejected={"oversized": OVERSIZED}, figures=figures)
 
@@ -85,12 +87,12 @@ def flood(rig: Rig, number: int) -> Try:
 @drives_on(_COUNTED, counted="edge")
 def second_simulator(rig: Rig, number: int) -> Try:
     """A second simulator with the same id."""
-    steps = round(SECOND_S / CONTROL_PERIOD_S)
+    steps = round(SECOND_S / rig.period_s)
     for step in range(steps):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
         rig.timeline.states[("second", number, step)] = time.monotonic()
-        rig.probe.put("state", encode(make_state(step, session="second", episode=number)))
-        time.sleep(CONTROL_PERIOD_S)
+        rig.probe.put("state", encode(make_state(step, rig.task, session="second", episode=number)))
+        time.sleep(rig.period_s)
     return Try(rejected={"foreign_session": steps})
 
 
@@ -113,7 +115,7 @@ def second_edge(rig: Rig, number: int) -> Try:
 @drives_on(_COUNTED, counted="edge")
 def garbage_states(rig: Rig, number: int) -> Try:
     """10,000 random and mutated states."""
-    return _put_garbage(rig, "state", make_state(1, session=_FOREIGN), number)
+    return _put_garbage(rig, "state", make_state(1, rig.task, session=_FOREIGN), number)
 
 
 @drives_on(_COUNTED, counted="simulator")
@@ -123,7 +125,7 @@ def garbage_commands(rig: Rig, number: int) -> Try:
     others = {
         "unknown_step": _command(rig, ahead=1000),
         "stale": _command(rig, ahead=-3),
-        "action_size": _command(rig, action=[0.1, 0.2]),
+        "action_size": _command(rig, action=[0.1] * (len(rig.task.action) + 1)),
     }
     for command in others.values():
         rig.probe.put("command", encode(command))
@@ -157,6 +159,8 @@ def garbage_health(rig: Rig, number: int) -> Try:
 def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
     decode, prefix, legal = _READ[topic]
+    if topic == "state":
+        decode = partial(wire.decode_state, layout=Layout(rig.task))
     sent: Counter[str] = Counter()
     begin_s = time.monotonic()
     for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):
@@ -178,25 +182,28 @@ _READ: dict[str, tuple[Callable[[bytes], object], str, str]] = {
 """Topic -> how it is read, the prefix of a reason in the report, and how what is valid counts."""
 
 
-def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
+def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
     """(reason, payload) of what must not reach the policy, around the newest step."""
-    valid = encode(make_state(step + 1))
+    state, (name, *_) = make_state(step + 1, task), task.observation
+    large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
+    valid = encode(state)
     yield "malformed", valid[: len(valid) // 2]
-    yield "malformed", without(valid, "frames")
-    yield "oversized", with_fields(valid, frames=bytes(wire.MAX_PAYLOAD_BYTES))
-    yield "schema", with_fields(valid, schema=2)
-    yield "frames_size", with_fields(valid, frames=bytes(100))
+    yield "malformed", without(valid, "observation")
+    yield "oversized", with_fields(valid, observation=large)
+    yield "schema", with_fields(valid, schema=1)
+    yield "observation", with_fields(valid, observation=small)
     yield "not_finite", with_fields(valid, speed_mps=float("nan"))
-    yield "duplicate", encode(make_state(step))
-    yield "stale", encode(make_state(step - 1))
+    yield "duplicate", encode(make_state(step, task))
+    yield "stale", encode(make_state(step - 1, task))
     # From another time of day is no reason: the next one is good whatever its clock says.
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
     """A drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
+    middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
     command = Command(
-        session=session, episode=episode, step=max(0, step + ahead), mode="drive", action=[0.1],
+        session=session, episode=episode, step=max(0, step + ahead), mode="drive", action=middle,
         policy_id="0" * 64, received_ns=time.time_ns(), inference_ns=1, sent_ns=time.time_ns(),
     )  # fmt: skip
     return msgspec.structs.replace(command, **changes)

@@ -17,12 +17,14 @@ import can
 import zenoh
 
 from edge_runtime import wire
+from edge_runtime.manifest import Task
+from edge_runtime.tests.policies import TASK
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import FRAMES
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
+from edge_runtime.wire import DRIVE, SAFE_STOP
 
-REACTION_LIMIT_S = 2 * CONTROL_PERIOD_S + 0.05
+REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
 """After the last good state a safe stop is out, or the other end brakes by itself."""
 RECOVERY_LIMIT_S = 1.0
 """From the end of the fault to the first drive command, with no vehicle attached."""
@@ -63,33 +65,45 @@ class Timeline:
     feedback_s: list[float] = field(default_factory=list)
     named: list[tuple[float, str]] = field(default_factory=list)
     """When the feedback said what was wrong with the vehicle."""
+    self_braking_s: list[float] = field(default_factory=list)
+    """When the feedback said that the vehicle brakes by itself."""
     unreadable: int = 0
     """Commands that no receiver would take: outside their limits, or no commands at all."""
 
 
 def unsafe_commands(
-    commands: Iterable[CommandSeen], states: Mapping[Place, float], by_arrival: bool = False
+    commands: Iterable[CommandSeen],
+    states: Mapping[Place, float],
+    by_arrival: bool = False,
+    task: Task = TASK,
 ) -> list[str]:
     """Why each unsafe command is one; empty where all is well.
 
-    A ``drive`` is unsafe outside its limits, in answer to a state that nobody sent or that was
-    to be rejected, and later than the reaction limit after the state that it answers.
+    A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or that
+    was to be rejected, and later than the reaction limit after the state that it answers.
     ``by_arrival`` takes the probe's time in place of the edge's clock, where that was stepped.
     """
-    found = []
+    found, limit_s = [], REACTION_LIMIT_S + later_s(task)
     for command in commands:
         if command.mode != DRIVE:
             continue
         state_s = states.get(command.place)
-        if not all(-1.0 <= value <= 1.0 for value in command.action):
+        ranges = zip(command.action, task.action, strict=False)
+        inside = all(one.low <= value <= one.high for value, one in ranges)
+        if len(command.action) != len(task.action) or not inside:
             found.append(f"{command.place}: action {command.action}")
         elif state_s is None:
             found.append(f"{command.place}: answers no acceptable state")
         else:
             age_s = (command.seen_s if by_arrival else command.sent_s) - state_s
-            if age_s > REACTION_LIMIT_S:
+            if age_s > limit_s:
                 found.append(f"{command.place}: its state was {age_s:.3f} s old")
     return found
+
+
+def later_s(task: Task) -> float:
+    """How much later than the limits of T = 0.1 s this task's 2 T are."""
+    return 2.0 * (task.control_period_s - TASK.control_period_s)
 
 
 def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
@@ -181,6 +195,7 @@ class Probe:
         feedback = wire.decode_feedback(bytes(sample.payload))
         if isinstance(feedback, wire.Feedback):
             self.timeline.named += [(seen_s, words) for words in feedback.faults]
+            self.timeline.self_braking_s += [seen_s] * feedback.self_braking
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         health = wire.decode_health(bytes(sample.payload))

@@ -22,11 +22,14 @@ import msgspec
 import numpy as np
 
 from edge_runtime.commands import ask
-from edge_runtime.transport import free_endpoint
+from edge_runtime.manifest import Task
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import GROUP
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode
-from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
+from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
+from hil_tests.faults import inside
+from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT, noise
 from hil_tests.faults.observe import (
     CanMonitor,
     CommandSeen,
@@ -39,6 +42,7 @@ from hil_tests.processes import Process, wait_until
 
 E = TypeVar("E")
 VEHICLE_ID = "faults"
+RIDE_S = 0.5  # Of the rows with ride-through
 SESSION = "campaign"
 HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
@@ -58,7 +62,8 @@ _STATE_BYTES = 20
 class Rig:
     """Start it with ``with``; it ends every process that it started.
 
-    ``policy`` are the edge runtime's options for its policy, ``vehicle`` its ``--vehicle``. The
+    ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
+    ``vehicle`` is its ``--vehicle``. The
     ``directory`` is an empty one, for switches and reports. Edge runtime and probe meet at a
     ``link`` or a ``router`` where ``between`` says so. ``sender`` sends states here, without a
     simulator. With the vehicle ``hunter`` there is a mock of it on a CAN bus. Only what the options
@@ -76,17 +81,25 @@ class Rig:
         self,
         policy: Sequence[str],
         directory: Path,
+        task: Task = TASK,
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
+        ride_s: float = 0.0,
     ) -> None:
         self.timeline = Timeline()
         self.directory = directory
         self.crashes: list[str] = []
         self._policy, self._vehicle = policy, vehicle
+        if ride_s:
+            (directory / "edge.toml").write_text(f"[ride_through]\nmax_s = {ride_s}\n")
+            self._policy = (*policy, "--config", str(directory / "edge.toml"))
         self._processes: list[tuple[str, Process]] = []
         self._closing = contextlib.ExitStack()
+        self.task = task
+        self.period_s = task.control_period_s
         (directory / BRAKES).touch()
+        (directory / inside.TASK).write_bytes(msgspec.json.encode(task))
         self._simulator_endpoint, self._hub = free_endpoint(), free_endpoint()
         if not sender:
             self.simulator = self.start_simulator()
@@ -110,7 +123,7 @@ class Rig:
         self.edge = self.start_edge()
         self._closing.callback(self._end_processes)
         if sender:
-            self.sender = Sender(self.probe)
+            self.sender = Sender(self.probe, task)
             self._closing.callback(self.sender.stop)
 
     def start_edge(self) -> Process:
@@ -295,8 +308,9 @@ def _await_first(events: Callable[[], list[E]], wanted: Callable[[E], bool], wha
 class Sender:
     """The rig's own simulator: step after step at absolute ticks until it is stopped."""
 
-    def __init__(self, probe: Probe) -> None:
+    def __init__(self, probe: Probe, task: Task) -> None:
         self.step = 0
+        self._task = task
         self.running = threading.Event()
         self.running.set()
         self._probe = probe
@@ -315,7 +329,7 @@ class Sender:
         """Send the next step now."""
         with self.lock:
             self.step += 1
-            self.send(make_state(self.step))
+            self.send(make_state(self.step, self._task))
 
     def stop(self) -> None:
         """End the thread."""
@@ -325,17 +339,18 @@ class Sender:
     def _run(self) -> None:
         next_s = time.monotonic()
         while not self._stopping.wait(max(0.0, next_s - time.monotonic())):
-            next_s = max(next_s + CONTROL_PERIOD_S, time.monotonic())
+            next_s = max(next_s + self._task.control_period_s, time.monotonic())
             if self.running.is_set():
                 self.send_next()
 
 
-def make_state(step: int, **changes: object) -> State:
-    """A valid state with a picture of noise below half brightness."""
-    noise = np.random.default_rng(step).integers(0, 120, FRAMES_SHAPE, dtype=np.uint8)
+def make_state(step: int, task: Task = TASK, **changes: object) -> State:
+    """A valid state of the task, which sees noise."""
+    seen = noise(task, np.random.default_rng(step)).items()
     state = State(
-        session=SESSION, episode=0, step=step, sim_time_s=round(step * CONTROL_PERIOD_S, 6),
-        sent_ns=time.time_ns(), frames=noise.tobytes(), speed_mps=3.0, final=False,
+        session=SESSION, episode=0, step=step, sim_time_s=round(step * task.control_period_s, 6),
+        sent_ns=time.time_ns(), observation={name: value.tobytes() for name, value in seen},
+        speed_mps=3.0, final=False,
     )  # fmt: skip
     return msgspec.structs.replace(state, **changes)
 

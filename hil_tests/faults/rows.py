@@ -24,7 +24,8 @@ from typing import Any, Literal
 import numpy as np
 
 from bridge.recording import Recording
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State, decode_state
+from edge_runtime.tests.policies import T
+from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, stops_between
 from hil_tests.faults.rig import Rig, address
@@ -143,7 +144,7 @@ def drove_on(rig: Rig, begin_s: float, end_s: float, done: Try, counted: Counter
 
 def at_any_phase(number: int) -> None:
     """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(number).uniform(0, CONTROL_PERIOD_S)))
+    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
 
 
 def sleep_until(time_s: float) -> None:
@@ -368,9 +369,9 @@ def recorder_killed(rig: Rig, number: int) -> Try:
     states, places = states_in(path), list(rig.timeline.states)
     last = (states[-1].session, states[-1].episode, states[-1].step) if states else None
     lost = sent - 1 - places.index(last) if last in places else sent
-    lost_s = max(0, lost) * CONTROL_PERIOD_S
+    lost_s = max(0, lost) * rig.period_s
     wrong = _too_few(states)
-    wrong += [f"{lost_s:.1f} s lost"] if lost_s > MOST_LOST_S + CONTROL_PERIOD_S / 2 else []
+    wrong += [f"{lost_s:.1f} s lost"] if lost_s > MOST_LOST_S + rig.period_s / 2 else []
     return Try(wrong=wrong, figures={"lost, s": lost_s})
 
 

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from edge_runtime.manifest import Task
 from edge_runtime.policy import load_policy
-from edge_runtime.tests.policies import SLOW_LOOPS, write_policy
+from edge_runtime.tests.policies import SHAPE, SLOW_LOOPS, TASK, write_policy
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
-from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
-from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
+from hil_tests.faults import hunter, messages, ride  # noqa: F401 (they fill the table)
+from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
 from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
 
-SLOW_S = 2.5 * CONTROL_PERIOD_S
-STALLED_S = 1.5 * CONTROL_PERIOD_S
+SLOW_S = 2.5 * TASK.control_period_s
+STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
 
@@ -35,7 +35,7 @@ def write_slow(path: Path) -> None:
     write_policy(trial, "slow")
     policy = load_policy(trial, allow_unsigned=True)
     begun_s = time.perf_counter()
-    policy.act(np.full(FRAMES_SHAPE, 255, np.uint8))
+    policy.act({"frames": np.full(SHAPE, 255, np.uint8)})
     took_s = time.perf_counter() - begun_s
     write_policy(path, "slow", loops=max(1, round(SLOW_LOOPS * SLOW_S / took_s)))
 
@@ -80,6 +80,7 @@ def run_faults(
     """
     chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
+    given = load_policy(policy or POLICY, public_key, allow_unsigned=True).manifest
     if policy is None:
         trust = ("--policy", str(POLICY), "--public-key", public_key or str(PUBLIC_KEY))
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
@@ -92,12 +93,14 @@ def run_faults(
         outcomes: dict[str, Outcome] = {}
         for alone in (False, True):
             in_parallel(
-                lambda row: run_row(row, policies[row.policy], work, tries, on_try),
+                lambda row: run_row(
+                    row, policies[row.policy], task_of(row, given), work, tries, on_try
+                ),
                 [row for row in chosen if row.alone == alone],
                 1 if alone else jobs,
                 lambda row, outcome: outcomes.update({row.name: outcome}),
             )
-    found = [report_row(row, outcomes[row.name]) for row in chosen]
+    found = [report_row(row, outcomes[row.name], later_s(task_of(row, given))) for row in chosen]
     return {
         "tries": tries,
         "rows": found,
@@ -118,13 +121,23 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
     return [row for row in ROWS if row.name in chosen]
 
 
+def task_of(row: Row, given: Task) -> Task:
+    """What the row's policy is made for: only ``given`` ones may differ from `TASK`."""
+    return given if row.policy == "given" else TASK
+
+
 def run_row(
-    row: Row, trust: Sequence[str], work: Path, tries: int, on_try: Callable[[str], None]
+    row: Row,
+    trust: Sequence[str],
+    task: Task,
+    work: Path,
+    tries: int,
+    on_try: Callable[[str], None],
 ) -> Outcome:
     """All tries of a row, each rig in a directory in ``work``; one that hangs is replaced."""
     outcome, number = Outcome(), 0
     while number < tries:
-        with Rig(trust, Path(tempfile.mkdtemp(dir=work)), **row.rig) as rig:
+        with Rig(trust, Path(tempfile.mkdtemp(dir=work)), task, **row.rig) as rig:
             going = True
             while going and number < tries:
                 disturbed = outcome.disturbed
@@ -133,7 +146,7 @@ def run_row(
                     number += 1
                     on_try(row.name)
             seen = rig.timeline
-            outcome.unsafe += unsafe_commands(seen.commands, seen.states, row.by_arrival)
+            outcome.unsafe += unsafe_commands(seen.commands, seen.states, row.by_arrival, task)
             if seen.unreadable:
                 outcome.unsafe.append(f"{seen.unreadable} commands that nobody would take")
         outcome.crashes += rig.crashes
@@ -151,18 +164,22 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
         outcome.failures.append(f"try {number}: {error}")
         return False
     gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
-    if row.flows and gap_s > STALLED_S and outcome.disturbed < MOST_DISTURBED:
+    if row.flows and gap_s > STALLED_PERIODS * rig.period_s and outcome.disturbed < MOST_DISTURBED:
         outcome.disturbed += 1
     else:
         outcome.tries.append(done)
     return True
 
 
-def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
-    """A row of the report: spreads of the times, how many were late, and what was wrong."""
+def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, Any]:
+    """A row of the report: spreads of the times, how many were late, and what was wrong.
+
+    Its limit of reactions is that of the row and ``later_s``.
+    """
+    limit_s = None if row.reaction_limit_s is None else row.reaction_limit_s + later_s
     reactions = [t.reaction_s for t in outcome.tries if t.reaction_s is not None]
     recoveries = [t.recovery_s for t in outcome.tries if t.recovery_s is not None]
-    late = _over(reactions, row.reaction_limit_s), _over(recoveries, row.recovery_limit_s)
+    late = _over(reactions, limit_s), _over(recoveries, row.recovery_limit_s)
     wrong = [*outcome.failures, *(text for t in outcome.tries for text in t.wrong)]
     names = {name for t in outcome.tries for name in t.figures}
     figures = {n: max(t.figures[n] for t in outcome.tries if n in t.figures) for n in names}
@@ -171,7 +188,7 @@ def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
         "tries": len(outcome.tries) + len(outcome.failures),
         "disturbed": outcome.disturbed,
         "reaction_ms": spread_ms(reactions),
-        "reaction_limit_ms": _ms(row.reaction_limit_s),
+        "reaction_limit_ms": _ms(limit_s),
         "reactions_late": late[0],
         "recovery_ms": spread_ms(recoveries),
         "recovery_limit_ms": _ms(row.recovery_limit_s),

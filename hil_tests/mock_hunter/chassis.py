@@ -130,7 +130,6 @@ CONDITION: dict[Event, tuple[Condition, ...]] = {
     Event.ERRORS:       (_X, _B, _X, _B),
     Event.ERRORS_OVER:  (_K, _E, _K, _E),
 }  # fmt: skip
-"""The same for `Condition`."""
 
 
 class Chassis(NamedTuple):

@@ -1,5 +1,4 @@
-"""The campaigns: what they say of their rows, that they drive each once, a rig of real processes,
-and the same loop in virtual time."""
+"""The campaigns: what they say of their rows, each driven once, and a rig of real processes."""
 
 import json
 from itertools import chain, repeat
@@ -8,14 +7,13 @@ from unittest import mock
 import pytest
 
 from edge_runtime.cli import run_cli
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests import report as reports
+from hil_tests import campaign as reports
 from hil_tests import sweep
 from hil_tests.__main__ import main
-from hil_tests.mock_hunter.hunter import make_parameters
-from hil_tests.processes import POLICY
-from hil_tests.virtual_drive import Driven, VirtualDrive
-from trainer.drivers import OnnxDriver, make_environment
+from hil_tests.faults.rig import free_bus
+from hil_tests.processes import POLICY, operator, trusting
 
 DELAY = sweep.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = sweep.Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
@@ -69,35 +67,21 @@ def test_every_axis_gets_worse_and_parts_cover_each_seed_once():
     assert [part[1:] for part in parts] == [(7, 25), (32, 25), (57, 10)]
 
 
-def report_of(seed, outcomes, times_s=None, vehicle=None, p99=4.0):
+def report_of(seed, outcomes, p99=4.0):
     """What `bridge simulate` writes, in parts."""
     return {
         "command": "c", "wall_s": 9.0,
         "per_episode": [
-            {"seed": seed + n, "outcome": o, "distance_m": 20.0, "time_s": t, "steps": 20}
-            for n, (o, t) in enumerate(zip(outcomes, times_s or repeat(2.0), strict=False))
+            {"seed": seed + n, "outcome": o, "distance_m": 20.0, "time_s": 2.0, "steps": 20}
+            for n, o in enumerate(outcomes)
         ],
         "latency_ms": {"p50": 1.0, "p99": p99}, "deadline_misses": 10, "tick_overruns": 1,
         "rejected": {"stale": 2}, "safe_stops": 1, "safe_stop_events": [{"reason": "no_feedback"}],
-        "vehicle": vehicle,
     }  # fmt: skip
 
 
 def row_of(*parts):
     return sweep.make_row("s", [sweep.worth_keeping(part) for part in parts])
-
-
-def vehicle_of(samples, rmse, lag_ms):
-    return {
-        "name": "hunter", "scale": 0.25, "samples": samples,
-        "speed_error_mps": {"rmse": rmse, "max": 2 * rmse},
-        "action_error": {
-            "pedal": {"rmse": rmse, "max": 1.0}, "steering": {"rmse": None, "max": None},
-        },
-        "lag_ms": {"speed": lag_ms, "pedal": None},
-        "feedback_age_ms": {"p50": 20.0, "p99": 50.0 + samples}, "faults": {"link": 2},
-        "moving_starts": 1,
-    }  # fmt: skip
 
 
 def test_a_row_joins_its_parts():
@@ -111,60 +95,6 @@ def test_a_row_joins_its_parts():
     assert row["ticks_without_new_command"] == 0.1
     assert row["latency_ms"] == {"p50": 1.0, "p99": 130.0}
     assert row["rejected"] == {"stale": 4}
-    # Errors of several rigs are pooled by their samples.
-    found = sweep.join_vehicles([vehicle_of(100, 0.3, 120.0), vehicle_of(300, 0.1, 140.0)])
-    assert found["speed_error_mps"]["rmse"] == pytest.approx((0.25 * 0.09 + 0.75 * 0.01) ** 0.5)
-    assert found["speed_error_mps"]["max"] == 0.6
-    assert found["action_error"]["steering"] == {"rmse": None, "max": None}
-    assert found["lag_ms"] == {"speed": 130.0, "pedal": None}
-    assert (found["feedback_age_ms"]["p99"], found["faults"]) == (350.0, {"link": 4})
-
-
-def test_the_cost_counts_seeds_that_both_loops_bring_to_the_goal():
-    policy = row_of(report_of(0, ["goal", "goal", "timeout"], [8.0, 9.0, 20.0]))
-    vehicle = row_of(
-        report_of(0, ["goal", "collision"], [8.5, 3.0], vehicle_of(10, 0.1, 100.0)),
-        report_of(2, ["goal"], [9.0], vehicle_of(10, 0.1, 100.0)),
-    )
-    found = sweep.cost(policy["per_episode"], vehicle["per_episode"])
-    assert (found["seeds"], found["longer_s"]["value"]) == (1, 0.5)
-    comparison = {
-        "scenario": "left_turn", "rows": {"policy": policy, "vehicle": vehicle}, "cost": found,
-        "target_success": 0.95, "holds": False,
-    }  # fmt: skip
-    text = reports.render_comparison(comparison)
-    assert "in 67% (21% to 94%) of 3 episodes: the bar of 95% is NOT met." in text
-    assert "| actuator lag, ms | - | speed 100, pedal - |" in text
-
-
-def row_at(dead_ms, constant_ms, goals, lag_ms=None, stops=0):
-    outcomes = ["goal"] * goals + ["collision"] * (20 - goals)
-    driven = [Driven(seed, outcome, 20.0, 8.0, stops) for seed, outcome in enumerate(outcomes)]
-    tracking = {"lag_ms": {"speed": lag_ms}, "speed_error_mps": {"rmse": 0.1, "max": 0.2}}
-    return sweep.lag_row(sweep.Lag(dead_ms, constant_ms), driven, tracking)
-
-
-def test_the_lag_budget_is_the_sum_up_to_which_every_point_holds():
-    rows = [
-        row_at(0, 100, 20, 90), row_at(200, 100, 19, 280), row_at(0, 400, 20, 310),
-        row_at(400, 100, 18, 460), row_at(300, 500, 20, 700),
-    ]  # fmt: skip
-    found = sweep.lag_budget(rows, 0.95)
-    assert (found["sum_ms"], found["measured_ms"], found["all_hold"]) == (400, 310, False)
-    none = sweep.lag_budget([row_at(0, 100, 1, 90), *rows[1:]], 0.95)
-    assert none["sum_ms"] is None
-    for budgeted, words in (
-        (found, "sum up to 400 ms or less (measured: 310 ms)"),
-        (sweep.lag_budget(rows[:3], 0.95), "every lag that was tested"),
-        (none, "below 95% success at the least lag"),
-    ):
-        assert words in reports.lag_sentence({"lag_budget": budgeted})
-    # The table shows lags that were not told as such.
-    two = [row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1)]
-    shown = {"rows": {row["spec"]: row for row in two}, "lag_budget": sweep.lag_budget(two, 0.95)}
-    text = reports.render_sweep({**shown, "runs": 20})
-    assert "| 100 | 100% (90) | - |" in text
-    assert "| 200 | - | 50%* (-) |" in text
 
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
@@ -207,6 +137,13 @@ def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeyp
     assert len(edges) == 2
 
 
+def test_an_environment_that_knows_no_success_has_no_campaign(monkeypatch, tmp_path):
+    monkeypatch.setattr(sweep, "run_rig", lambda *_, **__: {"success_rate": None})
+    task = sweep.Task(POLICY, "any", "Pendulum-v1", "nominal", 1, 1)
+    with pytest.raises(UserError, match="Pendulum-v1 says of no episode whether it succeeded"):
+        sweep.drive_all(task, ["none"], 1, sweep.drive_network, 1, tmp_path / "kept")
+
+
 def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):
     out, markdown = tmp_path / "r.json", tmp_path / "r.md"
     reports.check_report(out)
@@ -221,11 +158,25 @@ def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp
         reports.check_report(out)
 
 
-def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
-    task = sweep.Task(POLICY, "any", SHORT_TOY, "nominal", 0, 1, changes={"dead_time_s": 0.1})
-    options = ("--clock", "realtime", "--loop", "vehicle", "--standing")
+def drive_hunter(folder):
+    """The simulator's report of a drive with a mock Hunter in the loop, and an operator beside."""
+    endpoint, bus, config = free_endpoint(), free_bus(), folder / "edge.toml"
+    config.write_text(f'[vehicle.hunter]\nbus = "{bus}"\n')
+    common = ("--vehicle-id", "hunter")
+    chassis = ("hil_tests", "mock_hunter", "--bus", bus, "--set=dead_time_s=0.1")
+    edge = ("edge_runtime", "run", *trusting(POLICY, None), "--connect", endpoint, *common)
+    with (
+        sweep.Process(*chassis, ready="ready"),
+        sweep.Process(*edge, "--vehicle", "hunter", "--config", str(config), ready="ready"),
+        operator(endpoint, "hunter"),
+    ):
+        drive = ("--env", SHORT_TOY, "--clock", "realtime", "--loop", "vehicle", "--standing")
+        return sweep.simulate(endpoint, folder / "r.json", 120.0, *common, *drive)
+
+
+def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it(tmp_path):
     for _ in range(3):  # A busy machine may pause a process for over 2 T.
-        report = sweep.run_rig(task, sweep.Part(sweep.VEHICLE, 0, 1), 120.0, *options, hunter=True)
+        report = drive_hunter(tmp_path)
         if not report["safe_stops"]:
             break
     vehicle = report["vehicle"]
@@ -235,45 +186,3 @@ def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
     assert vehicle["speed_error_mps"]["max"] > 0.01
     assert 0.0 < vehicle["lag_ms"]["speed"] < 1000.0
     assert report["rejected_by_simulator"] == {}
-
-
-def drive_virtually(seed, **changes):
-    env = make_environment("left_turn")
-    drive = VirtualDrive(env, OnnxDriver(POLICY), make_parameters("hunter-2.0", changes))
-    return drive.episode(seed), drive.tracking.report(drive.action_names)
-
-
-def test_in_virtual_time_a_drive_repeats_and_its_lag_grows_with_the_actuators():
-    driven, tracking = drive_virtually(3)
-    assert driven == drive_virtually(3)[0]
-    assert (driven.outcome, driven.stops) == ("goal", 0)
-    assert tracking["scale"] == pytest.approx(0.25)
-    lag_ms = tracking["lag_ms"]["speed"]
-    # 30 ms of dead time and a time constant of 100 ms, and on the way up to a frame each way.
-    assert 100 <= lag_ms <= 170
-    dead, slow = (
-        drive_virtually(3, **changes)[1]["lag_ms"]["speed"]
-        for changes in ({"dead_time_s": 0.2}, {"speed_time_constant_s": 0.4})
-    )
-    assert dead == pytest.approx(lag_ms + 170, abs=30)
-    assert slow > lag_ms + 100
-    # A vehicle that cannot follow is stopped by its driver.
-    lost, _ = drive_virtually(0, dead_time_s=3.0)
-    assert lost.stops >= 1
-    assert lost.outcome != "goal"
-
-
-def test_the_sweep_as_a_command(tmp_path):
-    out = tmp_path / "r.json"
-    options = ["--only", "sweep", "--runs", "2", "--jobs", "1", "--lags", "50+100", "--seed", "3"]
-    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
-    found = json.loads(out.read_text())["sweep"]
-    assert found["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"goal": 2}
-    (kept,) = (tmp_path / "r_rows").iterdir()
-    (row,) = json.loads(kept.read_text())
-    for text, status in (("{", 2), (json.dumps([{**row, "outcomes": {"kept": 2}}]), 0)):
-        kept.write_text(text)
-        assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == status
-    again = json.loads(out.read_text())["sweep"]
-    assert again["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"kept": 2}
-    assert "| 100 | 100% (" in (tmp_path / "r.md").read_text()

@@ -52,7 +52,7 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
 def test_a_policy_without_signature_is_not_offered_and_a_failing_command_says_why(tmp_path):
     kept = Demo(tmp_path, runs=1)
     kept.policy.write_bytes(b"x")
-    assert not kept.offer_kept()
+    assert not kept.has_kept()
     with pytest.raises(UserError, match="does not exist"):
         Process("edge_runtime", "run", "--policy", str(tmp_path / "none.onnx"), ready="ready")
 

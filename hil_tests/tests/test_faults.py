@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from edge_runtime import wire
+from edge_runtime.manifest import Layout
+from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
+from hil_tests.campaign import render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
 from hil_tests.faults.rig import ChassisProcess, Truth, make_state
 from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, choose_rows, report_row, run_faults
 from hil_tests.mock_hunter.chassis import FAULTS
-from hil_tests.report import render_faults
 
 PLACE = ("session", 0, 7)
 STATES = {PLACE: 10.0}
@@ -28,7 +30,8 @@ def command(**changes):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"action": [0.5, 1.01]}, "action"),
+        ({"action": [1.01]}, "action"),
+        ({"action": [0.5, 0.5]}, "action"),
         ({"action": [float("nan")]}, "action"),
         ({"place": ("session", 0, 8)}, "no acceptable state"),
         ({"sent_s": 10.001 + observe.REACTION_LIMIT_S}, "old"),
@@ -62,12 +65,12 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     payloads = list(mutated(valid, 3000, seed=1))
     assert payloads == list(mutated(valid, 3000, seed=1))
     assert payloads != list(mutated(valid, 3000, seed=2))
-    read = [wire.decode_state(payload) for payload in payloads]
+    read = [wire.decode_state(payload, Layout(TASK)) for payload in payloads]
     reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
     assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
     # The sender's pictures never trip a faulty policy.
-    assert np.frombuffer(make_state(1).frames, np.uint8).max() < 200
+    assert np.frombuffer(make_state(1).observation["frames"], np.uint8).max() < 200
 
 
 def judged(*tries, **outcome):

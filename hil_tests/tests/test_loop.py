@@ -9,11 +9,12 @@ from bridge.__main__ import main as bridge
 from bridge.network import parse_spec
 from bridge.tests.harness import simulate_undisturbed, start_edge
 from edge_runtime.cli import run_cli
-from edge_runtime.transport import free_endpoint
+from edge_runtime.reach import free_endpoint
 from hil_tests.pictures import LEFT_TURN
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluate import drive_episodes
+from trainer.drivers import OnnxDriver
+from trainer.environments import make_environment
+from trainer.evaluation import drive_episodes
 
 NONE, LATE = "none", "100ms"
 BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s,rate=1Mbit/s"

@@ -19,9 +19,10 @@ from deploy.__main__ import main as deploy
 from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.commands import ask
+from edge_runtime.reach import free_endpoint, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
-from edge_runtime.transport import free_endpoint, look, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
 

@@ -1,4 +1,4 @@
-"""Run the paper's experiments and hold their results against its claims."""
+"""Run the paper's experiments and hold their results against its claims; or compare guidance."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.util import UserError
+from trainer.experiments.guidance import write_guidance, write_typical
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
     EXPERIMENTS,
+    FOREIGN,
+    GUIDANCE,
+    GUIDANCE_PLAN,
     PLAN,
     QUICK,
+    QUICK_GUIDANCE,
     SCENARIOS,
     obstacle,
     units_of,
@@ -20,6 +25,7 @@ from trainer.experiments.plan import (
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
 from trainer.options import add_time_limit, deadline_s
+from trainer.person.coach import TYPICAL_FILE
 from trainer.util import cores
 
 EXAMPLE = examples(
@@ -27,8 +33,9 @@ EXAMPLE = examples(
     "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
     "python -m trainer experiment all --scenario congestion",
     "python -m trainer experiment report",
+    "python -m trainer experiment guidance --max-minutes 60",
 )
-ALL, STATUS, REPORT = "all", "status", "report"
+ALL, STATUS, REPORT, TYPICAL = "all", "status", "report", "typical"
 MOST_SEEDS = 1000
 
 
@@ -39,9 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         nargs="+",
         metavar="NAME",
-        choices=[*EXPERIMENTS, ALL, STATUS, REPORT],
+        choices=[*EXPERIMENTS, ALL, STATUS, REPORT, GUIDANCE, TYPICAL],
         help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need; {STATUS}: how much is "
-        f"done; {REPORT}: draw the figures and judge the claims from what is done",
+        f"done; {REPORT}: draw the figures and judge the claims from what is done; {GUIDANCE}: "
+        "compute and report the table of human guidance, which is not the paper's; "
+        f"{TYPICAL}: write the curves that a person's coach shows, from both tables' records",
     )
     what.add_argument(
         "--seeds",
@@ -50,7 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="trainings of each algorithm in each setting",
     )
     what.add_argument(
-        "--scenario", choices=SCENARIOS, help="compute in this one only (default: in both)"
+        "--scenario",
+        choices=[*SCENARIOS, *FOREIGN],
+        help=f"compute in this one only (default: in all; {', '.join(FOREIGN)}: of {GUIDANCE})",
     )
     what.add_argument(
         "--quick",
@@ -77,8 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     where = parser.add_argument_group("where it is kept")
     for option, default, text in (
-        ("--results", "results/paper", "records, figures and report"),
-        ("--runs", "runs/paper", "checkpoints and actors"),
+        ("--results", None, f"records, figures and report (default: results/paper, or {GUIDANCE}; "
+         f"{TYPICAL}: the directory of both, results)"),
+        ("--runs", None, f"checkpoints and actors (default: runs/paper, or {GUIDANCE})"),
         ("--humans", "results/humans/paper",
          "holds the human model of each scenario: DIR/left_turn, DIR/congestion"),
     ):  # fmt: skip
@@ -88,12 +100,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compute, say how much is done, or report; returns the exit status."""
     names = list(dict.fromkeys(arguments.names))
-    if len(names) > 1 and {STATUS, REPORT} & set(names):
-        raise UserError(f"{STATUS} and {REPORT} stand alone")
-    results, runs, humans = map(Path, (arguments.results, arguments.runs, arguments.humans))
-    store = Store(PLAN, results, runs, humans)
+    if len(names) > 1 and {STATUS, REPORT, GUIDANCE, TYPICAL} & set(names):
+        raise UserError(f"{STATUS}, {REPORT}, {GUIDANCE} and {TYPICAL} stand alone")
+    if names == [TYPICAL]:
+        results = Path(arguments.results or "results")
+        write_typical(results, Path(arguments.humans), arguments.seeds, TYPICAL_FILE)
+        print(f"wrote {TYPICAL_FILE}")
+        return 0
+    plan, quick, place = PLAN, QUICK, "paper"
+    if names == [GUIDANCE]:
+        plan, quick, place = GUIDANCE_PLAN, QUICK_GUIDANCE, GUIDANCE
+    results, runs = Path(arguments.results or f"results/{place}"), arguments.runs or f"runs/{place}"
+    runs, humans = Path(runs), Path(arguments.humans)
+    store = Store(plan, results, runs, humans)
     if arguments.quick:
-        store = Store(QUICK, runs / "quick" / "results", runs / "quick", humans)
+        store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
     if names == [STATUS]:
         print("\n".join(store.status_lines(arguments.seeds)))
         return 0
@@ -118,4 +139,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{len(done)} of {len(wanted)} units were done{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
+    if names == [GUIDANCE] and store.results.exists():
+        print(f"wrote {write_guidance(store, arguments.seeds)}")
     return 1 if ends[FAILED] else 0

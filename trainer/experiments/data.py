@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from bridge.report import GOAL
+from bridge.report import GOAL, failed
 from edge_runtime.util import UserError
-from trainer.drivers import CONDITIONS
+from trainer.environments import CONDITIONS
 from trainer.experiments.plan import (
     FULL_PATH_M,
     LABELS,
@@ -183,6 +183,15 @@ SCENES = tuple(Scene(scenario, condition) for scenario in SCENARIOS for conditio
 PAPER_SCENES = tuple(s for s in SCENES if s.condition in ("nominal", "noise", "variant"))
 
 
+class Costs(NamedTuple):
+    """What a training, or its beginning, cost."""
+
+    human_steps: int
+    takeovers: int
+    failures: int  # Training episodes that missed the goal, whoever drove
+    human_s: float
+
+
 @dataclass(frozen=True)
 class Result:
     """A unit's record."""
@@ -236,11 +245,29 @@ class Result:
         return float(max(self.record["validation"]["success"])) - self.end(ALONE, SUCCESS)
 
     @property
-    def costs(self) -> tuple[int, int, int]:
-        """Human steps, take-overs, and training episodes that missed the goal."""
+    def costs(self) -> Costs:
+        """What the whole training cost."""
+        return self._costs_at(np.inf)
+
+    def until(self, level: float) -> Costs | None:
+        """What it cost until the policy alone reached ``level`` in validation; None: never."""
+        columns = self.record["validation"]
+        steps = zip(columns["at_step"], columns["success"], strict=True)
+        there = [step for step, success in steps if success >= level - 1e-9]
+        return self._costs_at(there[0]) if there else None
+
+    def given(self) -> Numbers:
+        """Seconds that the human had driven at each point of the grid."""
+        return np.array([self._costs_at(step).human_s for step in self.grid])
+
+    def _costs_at(self, step: float) -> Costs:
         columns = self.record["training"]
-        failures = sum(outcome != GOAL for outcome in columns["outcome"])
-        return sum(columns["human_steps"]), sum(columns["takeovers"]), failures
+        so_far = np.asarray(columns["end_step"]) <= step
+        human, takeovers = (np.asarray(columns[n])[so_far] for n in ("human_steps", "takeovers"))
+        outcomes = np.asarray(columns["outcome"])[so_far]
+        human_steps, period_s = int(human.sum()), self.record.get("period_s", 0.1)
+        failures = sum(failed(outcome) for outcome in outcomes.tolist())
+        return Costs(human_steps, int(takeovers.sum()), failures, human_steps * period_s)
 
     def reached(self, condition: str) -> NDArray[np.bool_]:
         """Which test drives reached the goal, by seed."""
@@ -270,7 +297,7 @@ class Result:
         return 1e4 * self.record["computed"]["training_s"] / self.record["totals"]["steps"]
 
     def _cut(self, distances_m: Numbers) -> Numbers:
-        return np.minimum(distances_m, FULL_PATH_M[self.unit.scenario])
+        return np.minimum(distances_m, FULL_PATH_M.get(self.unit.scenario, np.inf))
 
 
 @dataclass(frozen=True)
@@ -284,9 +311,8 @@ class Results:
     """Units whose record is of other settings, and left out."""
 
     def of(self, scenario: str, line: Line) -> list[Result]:
-        """What there is of a line in a scenario, by seed."""
-        numbers = [0] if line.algorithm in TESTED_ONLY else range(1, self.seeds + 1)
-        units = [Unit(scenario, *line, seed) for seed in numbers]
+        """What there is of a line in a scenario, by seed; what is only tested has seed 0."""
+        units = [Unit(scenario, *line, seed) for seed in range(self.seeds + 1)]
         return [self.found[unit] for unit in units if unit in self.found]
 
     def complete(self, place: Place, line: Line, quantity: str) -> bool:
@@ -380,13 +406,13 @@ class Results:
         return found
 
 
-def load(store: Store, seeds: int) -> Results:
-    """What there is of the whole plan.
+def load(store: Store, seeds: int, name: str = "all") -> Results:
+    """What there is of an experiment, or of all the paper's.
 
     Raises:
         UserError: a record lacks what this project writes.
     """
-    found, stale = store.find(units_of(["all"], seeds))
+    found, stale = store.find(units_of([name], seeds))
     for unit, record in found.items():
         _check(unit, record, f"{store.records_file(unit.scenario)}: the record of {unit}")
     return Results({unit: Result(unit, found[unit]) for unit in found}, seeds, stale)
@@ -395,7 +421,7 @@ def load(store: Store, seeds: int) -> Results:
 def _check(unit: Unit, record: Mapping[str, Any], named: str) -> None:
     """Refuse a record whose columns are not there, or not of one length."""
     tables: dict[str, tuple[Any, Collection[str]]]
-    tables = {name: (record["tests"].get(name), TEST_COLUMNS) for name in CONDITIONS}
+    tables = {name: (record["tests"].get(name), TEST_COLUMNS) for name in unit.conditions}
     if unit.trained:
         tables["training"] = record.get("training"), TRAINING_COLUMNS
         tables["validation"] = record.get("validation"), VALIDATION_COLUMNS

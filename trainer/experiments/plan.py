@@ -14,20 +14,27 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge_runtime.util import UserError, read_bytes
-from trainer.drivers import COMMAND_NOISE, CONDITIONS, EXPERTS, TRIGGERS, make_environment
+from trainer.environments import COMMAND_NOISE, CONDITIONS, expert_of, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
-from trainer.learner.config import ALGORITHMS
+from trainer.learner.config import ALGORITHMS, Algorithm, starting_from
 from trainer.training.config import BIASED as BIASED_GUIDANCE
 from trainer.training.config import PRESETS, RunConfig
 
 FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
 """Scenario -> distance from start to goal."""
 SCENARIOS = tuple(FULL_PATH_M)
-HUMAN_MODEL, CONSTANT = "human_model", "constant"
-"""In an algorithm's place: the human model alone, and the best constant action. Both are tested
-only, once in each scenario."""
+
+FOREIGN = {
+    "hill": ("examples.tasks:examples/Hill-v0", "examples.tasks:HillExpert"),
+    "racetrack": ("examples.tasks:examples/Racetrack-v0", "examples.racetrack:RacetrackExpert"),
+}
+"""Word of a task that is none of our scenarios -> its environment and its scripted expert."""
+EXPERT, HUMAN_MODEL, CONSTANT = "expert", "human_model", "constant"
+"""In an algorithm's place: the scripted expert or the human model alone, or the best constant
+action. They are tested only, once in each scenario."""
 TESTED_ONLY = (HUMAN_MODEL, CONSTANT)
+"""Those in the paper's experiments."""
 
 
 @dataclass(frozen=True)
@@ -35,18 +42,35 @@ class Setting:
     """How the runs of a setting differ from the normal ones."""
 
     meaning: str
-    preset: str = "ours"
-    """Where its settings start from."""
     run: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the run's config that it changes."""
+    preset: str = "ours"
+    """Where its settings start from."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters that it changes."""
+    human: str = ""  # Who guides: the scripted ``expert``; empty: a human model
 
 
 NORMAL, ONE_FRAME, RANDOM, BIASED, PRINTED = "normal", "one_frame", "random", "biased", "printed"
 POOR_SHARE = 1.0 / 3.0
 """Share of the human's actions that poor guidance replaces (section VII-E)."""
+GOOD, MODEL = "good", "model"
+IMPERFECT: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "third_random": ("a third of the actions is random", {"poor_guidance_share": POOR_SHARE}),
+    "late": ("0.3 to 0.8 s late", {"late_from_s": 0.3, "late_to_s": 0.8}),
+    "seldom": ("overlooks two of three reasons", {"missed_share": 2.0 / 3.0}),
+    "gives_up": ("leaves after 20 episodes", {"guided_until_episode": 20}),
+    "slower": ("drives slower than is best", {"human_shift": -0.4}),
+}
+"""The good human's one fault, and the run's settings that make it."""
+HUMANS: Mapping[str, Setting] = {
+    GOOD: Setting("the scripted expert", human=EXPERT),
+    MODEL: Setting("the paper's model of it: one frame, 50 episodes"),
+    **{name: Setting(*fault, human=EXPERT) for name, fault in IMPERFECT.items()},
+}
+"""Who guides in the table of human guidance, the same for all rows."""
 SETTINGS: Mapping[str, Setting] = {
+    **HUMANS,
     NORMAL: Setting("two frames, good guidance"),
     ONE_FRAME: Setting("one frame, the paper's tough setting", learner={"frames": 1}),
     RANDOM: Setting(
@@ -73,6 +97,14 @@ LABELS = {
     "rd2_phil": "RD2-PHIL",
     "phil_without_cloning": "without cloning",
     "phil_without_shaping": "without shaping",
+    "cloning_only": "cloning alone (HG-DAgger)",
+    "rlif_td3": "RLIF-TD3",
+    "pvp_td3": "PVP-TD3",
+    "pvp4real_td3": "PVP4Real-TD3",
+    "ppl_td3": "PPL-TD3",
+    "rlpd_td3": "RLPD-TD3 (HIL-SERL)",
+    "phil_gated": "PHIL-TD3, the robot asks",
+    EXPERT: "scripted expert",
     HUMAN_MODEL: "human model",
     CONSTANT: "best constant action",
 }
@@ -96,7 +128,22 @@ LINES: tuple[tuple[int, str, tuple[str, ...]], ...] = (
     (8, NORMAL, WEIGHTS),
 )
 """Everything that is computed: priority (what comes first), setting, algorithms."""
-DEFAULT_SEEDS = 5
+DEFAULT_SEEDS, MANY = 5, 1000
+GUIDANCE = "guidance"  # The fair table of human guidance, which is not the paper's
+ROWS = (
+    *FOUR, "cloning_only", "rlif_td3", "pvp_td3", "pvp4real_td3", "rlpd_td3", "ppl_td3",
+    "phil_gated",
+)  # fmt: skip
+HELPED = tuple(name for name in ROWS if ALGORITHMS[name].guided)
+GUIDANCE_LINES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], int], ...] = (
+    (GOOD, (EXPERT,), (*SCENARIOS, *FOREIGN), 0),
+    (MODEL, (HUMAN_MODEL,), SCENARIOS, 0),
+    (GOOD, ROWS, SCENARIOS, MANY),
+    (MODEL, HELPED, SCENARIOS, MANY),
+    *((name, HELPED, LEFT, 3) for name in IMPERFECT),
+    (GOOD, ROWS, tuple(FOREIGN), 3),
+)
+"""Human, rows, tasks and how many seeds at most, in the order of work; 0: tested only."""
 
 
 class Experiment(NamedTuple):
@@ -151,6 +198,12 @@ class Plan:
     """Actions on each of the two grids of that search."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
+    slow: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Task -> fields of the plan that are others in it, since its steps take long."""
+
+    def of(self, scenario: str) -> Plan:
+        """The plan for one task."""
+        return replace(self, **self.slow.get(scenario, {}))
 
 
 PLAN = Plan(steps={"left_turn": 6_000, "congestion": 6_000})
@@ -166,6 +219,13 @@ QUICK = Plan(
     learner={"batch_size": 4, "warmup_steps": 16},
 )
 """A look at everything in a minute or two; its numbers mean nothing."""
+GUIDANCE_PLAN = Plan(
+    steps={**dict.fromkeys(SCENARIOS, 4_000), "hill": 4_000, "racetrack": 3_000},
+    evaluate_every_steps=250,
+    test_runs=100,
+    slow={"racetrack": {"evaluate_every_steps": 500, "evaluation_runs": 10, "test_runs": 20}},
+)
+QUICK_GUIDANCE = replace(QUICK, steps=dict.fromkeys((*SCENARIOS, *FOREIGN), 250))
 UNLIMITED_EPISODES = 10**6
 """So many that steps decide."""
 PAPER_TESTS = 50
@@ -186,19 +246,43 @@ class Unit(NamedTuple):
     @property
     def trained(self) -> bool:
         """Whether anything is trained for it."""
-        return self.algorithm not in TESTED_ONLY
+        return self.algorithm in ALGORITHMS
 
     @property
     def needs_human(self) -> bool:
         """Whether a human model decides its result."""
-        return self.algorithm == HUMAN_MODEL or (self.trained and ALGORITHMS[self.algorithm].guided)
+        guided = self.trained and ALGORITHMS[self.algorithm].guided
+        return self.algorithm == HUMAN_MODEL or (guided and not SETTINGS[self.setting].human)
+
+    @property
+    def environment(self) -> str:
+        """What the environment is made by."""
+        return FOREIGN.get(self.scenario, (self.scenario, EXPERT))[0]
+
+    @property
+    def scripted_human(self) -> str:
+        """The environment's expert, by which a driver is made."""
+        return FOREIGN.get(self.scenario, (self.scenario, EXPERT))[1]
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Those under which it is tested."""
+        return ("nominal", "noise") if self.scenario in FOREIGN else tuple(CONDITIONS)
 
 
 def units_of(names: Collection[str], seeds: int, scenario: str | None = None) -> list[Unit]:
-    """The units of some experiments, or of ``all``, each once, in the order of work.
+    """The units of some experiments, or of ``all`` of the paper's, each once, in the order of work.
 
     Seed by seed within a priority, so that work that stops early leaves balanced results.
     """
+    if GUIDANCE in names:
+        return [
+            Unit(where, row, human, seed)
+            for human, rows, tasks, most in GUIDANCE_LINES
+            for seed in (range(1, min(seeds, most) + 1) if most else [0])
+            for where, row in product(tasks, rows)
+            if scenario in (None, where)
+        ]
     chosen = EXPERIMENTS.values() if "all" in names else [EXPERIMENTS[name] for name in names]
     wanted = {
         line
@@ -219,28 +303,49 @@ def units_of(names: Collection[str], seeds: int, scenario: str | None = None) ->
 
 def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
     """The settings of a unit's training."""
-    setting = SETTINGS[unit.setting]
+    setting, plan = SETTINGS[unit.setting], plan.of(unit.scenario)
     start = PRESETS[setting.preset]
     return replace(
         start,
-        scenario=unit.scenario,
+        scenario=unit.environment,
         algorithm=unit.algorithm,
         seed=unit.seed,
         episodes=UNLIMITED_EPISODES,
         steps=plan.steps[unit.scenario],
-        human=str(humans / unit.scenario) if unit.needs_human else "expert",
+        human=str(humans / unit.scenario) if unit.needs_human else unit.scripted_human,
         evaluate_every_steps=plan.evaluate_every_steps,
         evaluation_runs=plan.evaluation_runs,
         checkpoint_every=plan.checkpoint_every,
         threads=1,
-        learner=replace(start.learner, **{**plan.learner, **setting.learner}),
+        learner=replace(
+            starting_from(start.learner, ALGORITHMS[unit.algorithm]),
+            **{**plan.learner, **setting.learner},
+        ),
         **setting.run,
     )
 
 
 ID_LENGTH = 12
-NOT_DECIDING = ("device", "threads", "checkpoint_every", "human")
+NOT_DECIDING = ("device", "threads", "checkpoint_every", "human", "snapshots")
 """Fields of a run's config that do not decide its result; the human model's contents do."""
+
+LATER = (
+    "guided_until_episode", "late_from_s", "late_to_s", "missed_share", "human_shift",
+    "delay_known",
+    "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
+    "foresight", "preference_beta",
+)  # fmt: skip
+"""Fields of a run's config and of an algorithm's row that came after the first records. They decide
+only where they differ from their default: what they leave alone is what it was before them."""
+
+
+def decided(values: Mapping[str, Any], default: Any, left_out: Collection[str]) -> dict[str, Any]:
+    """The fields of a config or a row that decide, with ``default`` as the dataclass makes it."""
+    return {
+        name: decided(value, default.learner, ()) if name == "learner" else value
+        for name, value in values.items()
+        if name not in left_out and not (name in LATER and value == getattr(default, name))
+    }
 
 
 def obstacle(unit: Unit, humans: Path) -> str | None:
@@ -256,25 +361,29 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
     if reason:
         raise UserError(f"{unit}: {reason}; see `python -m trainer human --help`")
     values: dict[str, Any] = {"unit": unit._asdict(), "human": None}
+    scene = unit.environment, "nominal", unit.scripted_human
     if unit.needs_human:
         model = read_bytes(humans / unit.scenario / MODEL_FILE, "human model")
         values["human"] = hashlib.sha256(model).hexdigest()[:ID_LENGTH]
     if unit.trained:
         config = run_config(unit, plan, humans)
-        kept = {k: v for k, v in config.as_dict().items() if k not in NOT_DECIDING}
-        values["config"] = kept
-        values["switches"] = asdict(ALGORITHMS[unit.algorithm])
-        values["scene"] = behaviour(unit.scenario, "nominal", config.printed_reward)
+        values["config"] = decided(config.as_dict(), RunConfig(), NOT_DECIDING)
+        # The row's hyper-parameters are in the config.
+        switches = asdict(ALGORITHMS[unit.algorithm])
+        values["switches"] = decided(switches, Algorithm(), ["settings"])
+        values["scene"] = behaviour(*scene, config.printed_reward)
     if unit.algorithm == CONSTANT:
         values["search"] = [plan.search_runs, plan.search_points]
-        values["scene"] = behaviour(unit.scenario, "nominal")
+    if unit.algorithm in (CONSTANT, EXPERT):
+        values["scene"] = behaviour(*scene)
     return values
 
 
 def testing(unit: Unit, plan: Plan) -> dict[str, Any]:
     """What decides a unit's tests, beside its training."""
-    scenes = {name: behaviour(unit.scenario, name) for name in CONDITIONS}
-    return {"runs": plan.test_runs, "noise_std": COMMAND_NOISE, "scenes": scenes}
+    where, human = unit.environment, unit.scripted_human
+    scenes = {name: behaviour(where, name, human) for name in unit.conditions}
+    return {"runs": plan.of(unit.scenario).test_runs, "noise_std": COMMAND_NOISE, "scenes": scenes}
 
 
 def training_id(unit: Unit, plan: Plan, humans: Path) -> str:
@@ -294,15 +403,16 @@ def digest(values: Mapping[str, Any]) -> str:
 
 
 @cache
-def behaviour(scenario: str, condition: str, printed_reward: bool = False) -> str:
+def behaviour(
+    scenario: str, condition: str, human: str = EXPERT, printed_reward: bool = False
+) -> str:
     """Hash of what a scene does: pictures, rewards and the human's take-overs in three drives.
 
     It sees what a list of numbers from configs would miss, a changed line of code, and leaves
     alone what changes nothing. Numbers are rounded, since libraries differ in their last bits.
     """
     env = make_environment(scenario, condition, printed_reward)
-    expert = EXPERTS[scenario](env)
-    guide = HumanGuide(expert, TRIGGERS[scenario](expert))
+    guide = HumanGuide(expert_of(env, human), expert_of(env, human))
     seen = hashlib.sha256()
     for seed in range(3):
         observation, info = env.reset(seed=seed)

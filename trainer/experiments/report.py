@@ -5,7 +5,6 @@ A summary, a part for each experiment; figures 7 to 15, the ablation, the printe
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -36,9 +35,11 @@ from trainer.experiments.data import (
     TRAINING,
     Line,
     Place,
+    Result,
     Results,
     Scene,
     load,
+    mean_estimate,
     words,
 )
 from trainer.experiments.plan import (
@@ -55,6 +56,8 @@ from trainer.experiments.plan import (
     units_of,
 )
 from trainer.experiments.run import Store
+from trainer.pictures import write_figure
+from trainer.training import metrics
 
 COMMAND = "python -m trainer experiment"
 PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -231,7 +234,8 @@ def _cost(results: Results) -> Iterator[str]:
     """Steps and human effort of every line, and how much of the best policy is left at the end."""
     yield (
         f"Means of the seeds. Steps until the policy alone reaches {LEARNED:.0%} of its validation "
-        f"drives, of those seeds that do; late: the validations of the last {END_STEPS:,} steps."
+        f"drives, and the seconds that the human drove until it reached {LEARNED:.0%} and "
+        f"{WELL:.0%}, of those seeds that do; late: validations of the last {END_STEPS:,} steps."
     )
     yield ""
     rows = []
@@ -247,24 +251,41 @@ def _cost(results: Results) -> Iterator[str]:
                 words(scenario),
                 f"{np.mean(there):,.0f}" if there else "–",
                 f"{len(there)} of {len(found)}",
+                *(human_seconds(found, level) for level in (LEARNED, WELL)),
                 f"{100 * np.mean([r.unlearned for r in found]):.1f}",
                 f"{100 * max(r.unlearned for r in found):.1f}",
-                *(f"{cost:,.0f}" for cost in np.mean([r.costs for r in found], axis=0)),
+                *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
             )
         )
     learned = f"steps to {LEARNED:.0%}"
     late = ("late below best, points", "at most")
-    head = ("", "scenario", learned, "seeds", *late, "human steps", "take-overs", "failures")
+    seconds = [f"human s to {level:.0%}" for level in (LEARNED, WELL)]
+    head = (
+        "",
+        "scenario",
+        learned,
+        "seeds",
+        *seconds,
+        *late,
+        "human steps",
+        "take-overs",
+        "failures",
+    )
     yield from markdown_table(head, rows)
 
 
-LEARNED = 0.9
-"""Success of the policy alone at which it counts as learned."""
+def human_seconds(found: Sequence[Result], level: float) -> str:
+    """How long the human drove until a level, of those that reach it; in brackets how many do."""
+    there = [cost.human_s for result in found if (cost := result.until(level))]
+    return f"{mean_estimate(there).text(0)} ({len(there)})" if there else "–"
+
+
+LEARNED, WELL = metrics.LEARNED
+"""Success of the policy alone at which it counts as learned, and as learned well."""
 MORE = {"fig9": _tests, "time": _times, "floor": _floor, "cost": _cost}
 """Experiment -> its tables beside its claims."""
 
 
-DOTS_PER_INCH = 110
 COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", HUMAN_MODEL: "C1"}
 OTHERS = ("C4", "C5", "C6", "C8", "C9", "black")
 """For algorithms without a colour of their own, by their place in the figure."""
@@ -402,10 +423,3 @@ FIGURES: Mapping[str, Callable[[Results], Figure]] = {
     },
 }
 """Name of the experiment, and of the PNG -> how it is drawn."""
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH)
-    write_atomic(path, buffer.getvalue())

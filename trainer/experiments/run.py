@@ -31,20 +31,13 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.drivers import (
-    BEST_FILE,
-    CHECKPOINT_FILE,
-    CONDITIONS,
-    constant_driver,
-    load_actor,
-    load_driver,
-    make_environment,
-)
-from trainer.drivers import CONSTANT as CONSTANT_DRIVER
-from trainer.evaluate import drive_together
+from trainer import drivers
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
+from trainer.environments import make_environment
+from trainer.evaluation import drive_episodes, drive_together
 from trainer.experiments.plan import (
     CONSTANT,
-    SCENARIOS,
+    EXPERT,
     Plan,
     Unit,
     deciding,
@@ -107,8 +100,6 @@ NOT_VALIDATED = ("", "nan")
 DIGITS = 5
 PATIENCE_S = 1.0
 """How long a unit may be held before it counts as another process's work."""
-NICENESS = 5
-"""So that a machine on which somebody works stays usable."""
 EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 """Exit status of a unit's process -> how the unit ended."""
 
@@ -170,7 +161,8 @@ class Store:
 
     def find(self, units: Iterable[Unit]) -> tuple[dict[Unit, dict[str, Any]], list[Unit]]:
         """The records of these units, and those units whose record is of other settings."""
-        records = {scenario: self.records(scenario) for scenario in SCENARIOS}
+        units = list(units)
+        records = {where: self.records(where) for where in {unit.scenario for unit in units}}
         found, stale = {}, []
         for unit in units:
             record = records[unit.scenario].get(unit)
@@ -263,17 +255,20 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
         record["training"] = _columns(rows, TRAINING_COLUMNS)
         record["validation"] = _columns(validated, VALIDATION_COLUMNS)
-        record["totals"] = totals(rows)
+        record["period_s"] = make_environment(unit.environment).control_period_s
+        record["totals"] = totals(rows, record["period_s"])
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
         policy = str(run_dir)
     elif unit.algorithm == CONSTANT:
         record["action"], record["success_of"] = best_constant(unit.scenario, store.plan)
-        policy = f"{CONSTANT_DRIVER}{record['action']}"
+        policy = f"{drivers.CONSTANT}{record['action']}"
+    elif unit.algorithm == EXPERT:
+        policy = unit.scripted_human
     else:
         policy = str(store.humans / unit.scenario)
     tested_s = time.monotonic()
-    record["tests"] = drive_tests(unit.scenario, policy, store.plan)
+    record["tests"] = drive_tests(unit, policy, store.plan.of(unit.scenario))
     if not unit.trained:
         seconds["search_s"] = round(tested_s - began_s)
     seconds["tests_s"] = round(time.monotonic() - tested_s)
@@ -332,13 +327,18 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
-def drive_tests(scenario: str, policy: str, plan: Plan) -> dict[str, dict[str, list[Any]]]:
+def drive_tests(unit: Unit, policy: str, plan: Plan) -> dict[str, dict[str, list[Any]]]:
     """The test drives of a policy: condition -> column -> a value a drive."""
-    tests = {}
-    driver: Any = load_driver(policy, make_environment(scenario))[0]
-    for condition in CONDITIONS:
-        envs = [make_environment(scenario, condition) for _ in range(plan.together)]
-        drives = drive_together(envs, driver.act_together, range(plan.test_runs), condition)
+    tests, seeds = {}, range(plan.test_runs)
+    for condition in unit.conditions:
+        env = make_environment(unit.environment, condition)
+        driver: Any = load_driver(policy, env)[0]
+        if drivers.is_expert(policy):  # it has a memory, and drives its own environment only
+            drives = drive_episodes(env, driver, seeds, condition)
+        else:
+            more = range(min(plan.together, plan.test_runs) - 1)
+            envs = [env, *(make_environment(unit.environment, condition) for _ in more)]
+            drives = drive_together(envs, driver.act_together, seeds, condition)
         tests[condition] = {
             name: [rounded(getattr(drive, name)) for drive in drives] for name in TEST_COLUMNS
         }
@@ -357,7 +357,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     def search(grid: Iterable[float]) -> float:
         for action in (round(float(value), 3) for value in grid):
             if action not in worth:
-                results = drive_together(envs, constant_driver(action).act_together, drives)
+                results = drive_together(envs, drivers.constant_driver(action).act_together, drives)
                 success = np.mean([result.outcome == GOAL for result in results])
                 worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
         return max(worth, key=lambda action: (*worth[action], -abs(action)))
@@ -382,11 +382,14 @@ def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
             while waiting or working:
                 while waiting and len(working) < jobs:
                     task = waiting.popleft()
+                    if time.time() > task.stop_at_s:  # a process takes seconds to find that out
+                        ends[STOPPED] += 1
+                        continue
                     process = context.Process(target=_work, args=(task,), daemon=True)
                     with interrupts_blocked():
                         process.start()
                     working[process.sentinel] = process, task
-                for sentinel in wait([*working]):
+                for sentinel in wait([*working]) if working else ():
                     process, task = working.pop(sentinel)
                     process.join()
                     end = EXITS.get(process.exitcode, FAILED)
@@ -407,7 +410,7 @@ def say(line: str) -> None:
 
 def _work(task: Task) -> None:
     """A process's life: its exit status tells how the unit ended."""
-    os.nice(NICENESS)
+    os.nice(5)  # a machine on which somebody works stays usable
     threading.Thread(target=die_with_parent, daemon=True).start()
     end, why = FAILED, ""
     try:
@@ -425,8 +428,6 @@ def _work(task: Task) -> None:
 
 WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
 """What a unit goes on from."""
-RETRIES = 3
-"""How often a unit is begun again when the node under it dies."""
 Files = dict[str, bytes]
 Parcel = tuple[Task, Files, Files]
 """A task on its way to a node: with its human model, and with what it goes on from."""
@@ -466,7 +467,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
         UserError: Ray is not installed, or nothing answers at the address.
     """
     ray = _connected(address)
-    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(compute_parcel)
+    remote = ray.remote(num_cpus=1, max_retries=3)(compute_parcel)  # for nodes that die
     ends: Counter[str] = Counter()
     with ExitStack() as locks:
         waiting = {}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Driver, Reason, Trigger
+from trainer.human.guide import Driver, Reason
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
@@ -21,10 +21,8 @@ class CongestionExpert(Driver):
     constant of 1.3 s without overshoot.
     """
 
-    AHEAD_M = 12.0
-    """How far ahead a car counts as a neighbour, centre to centre ..."""
-    BEHIND_M = 6.0
-    """... and how far behind."""
+    AHEAD_M = 12.0  # How far ahead a car counts as a neighbour, centre to centre ...
+    BEHIND_M = 6.0  # ... and how far behind
     MIDDLE_LIMIT_M = 0.4
     """The middle is sought no further than this from the lane's: a gap in a neighbouring lane is
     no invitation."""
@@ -35,7 +33,7 @@ class CongestionExpert(Driver):
     def __init__(self, env: CongestionEnv) -> None:
         self.env = env
 
-    def act(self, observation: Observation) -> NDArray[np.float32]:
+    def act(self, observation: Observation | None = None) -> NDArray[np.float32]:
         """The expert's steering, float32 [1]: from the true state, whatever the picture shows."""
         ego = self.env.ego
         limit = self.HEADING_LIMIT_RAD
@@ -62,25 +60,24 @@ class CongestionExpert(Driver):
         return min(max(0.5 * (left_m + right_m), -limit), limit)
 
 
-class CongestionTrigger(Trigger):
-    """Judges the policy's action before it is carried out."""
+class CongestionHuman(CongestionExpert):
+    """The expert who also judges the policy's action before it is carried out."""
 
     HORIZON_S = 0.6
     """How far the judged steering is followed. Long enough that the human always gets out of it,
     and no longer: a human who takes over from the first drift keeps the policy from all that it
     could learn by. Without imitation (HI-TD3) it then learns hardly anything."""
-    MARGIN_M = 0.25
-    """Room to other cars within which one counts as hit."""
+    MARGIN_M = 0.25  # Room to other cars within which one counts as hit
     HEADING_RAD = 0.2
-    OFFSET_M = 1.1
-    """From the lane's middle."""
+    OFFSET_M = 1.1  # From the lane's middle
 
-    def __init__(self, expert: CongestionExpert) -> None:
-        self.expert = expert
+    def may_return(self) -> bool:
+        """Whether control can be handed back: anywhere."""
+        return True
 
-    def judge(self, action: NDArray) -> Reason | None:
+    def wants_control(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
-        env = self.expert.env
+        env = self.env
         steps = round(self.HORIZON_S / env.config.control_period_s)
         angle_rad = float(action[0]) * env.config.lambda_rad
         motion = self._motion(angle_rad, steps)
@@ -93,7 +90,7 @@ class CongestionTrigger(Trigger):
 
     def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
         """The ego car's footprints under a held steering angle, at its present speed."""
-        env = self.expert.env
+        env = self.env
         shape, dt_s = env.ego.footprint, env.config.control_period_s
         slip_rad = math.atan(0.5 * math.tan(angle_rad))
         move_m = env.ego.speed * dt_s
@@ -114,7 +111,7 @@ class CongestionTrigger(Trigger):
         Only sideways: room ahead is the pedals' matter.
         """
         wider = ego._replace(width=ego.width + 2.0 * self.MARGIN_M)
-        for car in self.expert.env.traffic:
+        for car in self.env.traffic:
             if car.lane.start[1] == 0.0:
                 continue
             shape = car.footprint

@@ -6,7 +6,6 @@ The person is the scripted expert, or a real one in recorded sittings.
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, fields
@@ -18,7 +17,7 @@ from edge_runtime.cli import examples
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import options
-from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.environments import expert_of, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
 from trainer.person.recording import demonstrate, find_recordings
@@ -31,7 +30,6 @@ EXAMPLE = examples(
 )
 FIXED = ("learning_rate", "batch_size")
 FIELDS = [field.name for field in fields(HumanModelConfig) if field.name not in FIXED]
-"""Settings that are options."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,16 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
         "their directories, or such a training run (default: the scripted expert)",
     )
-    parser.add_argument(
-        "--leave-out",
-        nargs="+",
-        type=_place,
-        default=(),
-        metavar="SITTING[:EPISODE]",
-        help="what is not to be imitated of --from: 3 is sitting-0003.mcap, 3:7 its episode 7, as "
-        "the window shows it; an episode that was discarded at the wheel is left out anyway "
-        "(default: nothing)",
-    )
     options.add_time_limit(
         parser,
         "begin no episode after this time; the refining steps shrink in proportion to the episodes",
@@ -67,24 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_threads(parser)
 
 
-def _place(word: str) -> str:
-    """A sitting's number, or that and an episode's."""
-    if not re.fullmatch(r"[0-9]+(:[0-9]+)?", word):
-        raise argparse.ArgumentTypeError(f"{word!r} is no SITTING or SITTING:EPISODE, as 3 or 3:7")
-    return ":".join(str(int(number)) for number in word.split(":"))
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Train the model, showing progress; returns the exit status."""
     options.set_threads(arguments.threads)
-    scripted = arguments.recordings is None
-    if not scripted and (arguments.label_every_step or arguments.unaided_share):
-        raise UserError(
-            "--label-every-step and --unaided-share ask the scripted expert; "
-            "a recording holds no more"
-        )
-    if scripted and arguments.leave_out:
-        raise UserError("--leave-out names recorded episodes: it goes with --from")
+    if arguments.recordings is not None and arguments.label_every_step:
+        raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
     config = HumanModelConfig(**{name: getattr(arguments, name) for name in FIELDS})
     directory = Path(arguments.out)
     with claimed(directory):
@@ -102,8 +77,10 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         model, episodes = training.model, training.episodes()
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
-        model = HumanModel(config, arguments.seed)
-        taken_over = demonstrate(model, recordings, arguments.scenario, arguments.leave_out)
+        env = make_environment(arguments.scenario)
+        size, space = env.action_space.shape[0], env.observation_space
+        model = HumanModel(config, arguments.seed, size, space)
+        taken_over = demonstrate(model, recordings, arguments.scenario)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert: in place of an episode, those that follow one.
         episodes = (
@@ -151,11 +128,10 @@ class HumanTraining:
 
     def __init__(self, env: Any, config: HumanModelConfig, seed: int) -> None:
         self.env, self.config, self.seed = env, config, seed
-        self.expert = EXPERTS[env.scenario](env)
-        # With a memory of its own: a person who takes over looks at the scene afresh.
-        self.adviser = EXPERTS[env.scenario](env)
-        self.guide = HumanGuide(self.expert, TRIGGERS[env.scenario](self.expert))
-        self.model = HumanModel(config, seed, env.action_space.shape[0])
+        # Each with a memory of its own: a person who takes over looks at the scene afresh.
+        self.expert, self.adviser = expert_of(env), expert_of(env)
+        self.guide = HumanGuide(self.expert, expert_of(env))
+        self.model = HumanModel(config, seed, env.action_space.shape[0], env.observation_space)
 
     def episodes(self) -> Iterator[HumanEpisode]:
         """Drive and learn, episode by episode."""
@@ -171,7 +147,6 @@ class HumanTraining:
         demonstrated = c.demonstrated_share and episode % c.demonstrated_share == (
             c.demonstrated_share - 1
         )
-        unaided = c.unaided_share and episode % c.unaided_share == 0
         seed = episode_seed(self.seed, Purpose.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
@@ -179,8 +154,7 @@ class HumanTraining:
         interventions, ended = 0, False
         while not ended:
             action = self.model.act(observation)
-            watched = not (demonstrated or unaided)
-            intervention = self.guide.watch(observation, action) if watched else None
+            intervention = None if demonstrated else self.guide.watch(observation, action)
             if demonstrated or intervention is not None:
                 action = (
                     self.expert.act(observation) if intervention is None else intervention.action

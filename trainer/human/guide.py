@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Protocol
 
-from trainer.scenarios.environment import Action, Observation
+import numpy as np
+from numpy.typing import NDArray
 
-Reason = Literal["collision", "lane", "stuck", "heading", "offset", "person"]
-"""Why the human takes over: hardly a way out of a crash, a car that stops in the traffic's lane,
-one that waits for nothing, one that turns aside or is aside; a person has reasons of their own."""
+Action = NDArray[np.float32]
+Observation = NDArray[Any]
+"""The two frames, or another environment's: of several entries a structured array."""
+Reason = str  # Why the human takes over
+STUCK, ASKED = "stuck", "asked"
+REASONS: tuple[Reason, ...] = ("collision", "lane", STUCK, "heading", "offset", "person", ASKED)
+"""Hardly a way out of a crash, a car that stops in the traffic's lane, one that waits for nothing,
+one that turns aside or is aside; a person has reasons of their own; the robot asked for help.
+Another environment's expert may have others."""
 
 
 class Driver(Protocol):
@@ -20,7 +28,7 @@ class Driver(Protocol):
         return
 
     def act(self, observation: Observation) -> Action:
-        """The action for an observation uint8 [2, 45, 80]."""
+        """The action, float32 [n], for an observation."""
         ...
 
 
@@ -31,7 +39,7 @@ class Trigger(Protocol):
         """Forget the last episode, where there is something to forget."""
         return
 
-    def judge(self, action: Action) -> Reason | None:
+    def wants_control(self, action: Action) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
         ...
 
@@ -40,14 +48,21 @@ class Trigger(Protocol):
         return True
 
 
+class Expert(Trigger, Protocol):
+    """The scripted human of an environment: drives from the true state, and says when."""
+
+    def act(self, observation: Any = None) -> Action:
+        """The expert's action, float32 [n]."""
+        ...
+
+
 @dataclass(frozen=True)
 class Intervention:
     """A step at which the human acts."""
 
     action: Action
     reason: Reason
-    first: bool
-    """Whether the human took over at this step (eq. 17's intervention time)."""
+    first: bool  # Whether the human took over at this step (eq. 17's intervention time)
 
 
 class Guide(Protocol):
@@ -59,6 +74,82 @@ class Guide(Protocol):
     def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
         """What the human does about ``policy_action``: None lets it pass. Once a step."""
         ...
+
+
+class Asking(Trigger):
+    """The robot asks for help where its critics differ most, and the human need not watch.
+
+    That is where their doubt is among the ``share`` of the highest of late. Until it knows what is
+    high the human watches, as in AIM's first drives (2506.09176).
+    """
+
+    MEMORY = 500  # Control periods
+
+    def __init__(self, human: Trigger, share: float) -> None:
+        self.human, self.share = human, share
+        self.doubts: deque[float] = deque(maxlen=self.MEMORY)
+
+    def may_return(self) -> bool:
+        """Whether the human would give control back here."""
+        return self.human.may_return()
+
+    def reset(self) -> None:
+        """Forget the last episode, but no doubt."""
+        self.human.reset()
+
+    def wants_control(self, action: Action) -> Reason | None:
+        """Whether the last of ``doubts``, which is that about ``action``, is a high one."""
+        watched = self.human.wants_control(action)
+        if len(self.doubts) < self.MEMORY:
+            return watched
+        return ASKED if self.doubts[-1] > np.quantile(self.doubts, 1.0 - self.share) else None
+
+
+class Inattentive(Trigger):
+    """A human that comes late, or not at all: what is overlooked is not looked at for a while.
+
+    Args:
+        trigger: when this human should take over.
+        late_steps: the least and the longest delay, in control periods; each is drawn anew.
+        missed_share: how often nothing is noticed at all.
+        random: what is drawn from.
+    """
+
+    BLIND_STEPS = 15
+
+    def __init__(
+        self,
+        trigger: Trigger,
+        late_steps: tuple[float, float],
+        missed_share: float,
+        random: np.random.Generator,
+    ) -> None:
+        self.trigger, self.random = trigger, random
+        self.late_steps, self.missed_share = late_steps, missed_share
+        self._reason: Reason | None = None
+        self._steps_left = 0
+
+    def may_return(self) -> bool:
+        """Whether the human would give control back here."""
+        return self.trigger.may_return()
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self.trigger.reset()
+        self._steps_left = 0
+
+    def wants_control(self, action: Action) -> Reason | None:
+        """The reason, so much later; once begun a take-over is not given up."""
+        reason = self.trigger.wants_control(action)
+        if self._steps_left == 0:
+            if reason is None:
+                return None
+            missed = self.random.random() < self.missed_share
+            self._reason = None if missed else reason
+            late = self.BLIND_STEPS if missed else round(self.random.uniform(*self.late_steps))
+            self._steps_left = late + 1
+        self._steps_left -= 1
+        return self._reason if self._steps_left == 0 else None
 
 
 class HumanGuide:
@@ -81,7 +172,7 @@ class HumanGuide:
 
     def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
         """What the human does about ``policy_action``: None lets it pass. Once a step."""
-        trigger = self.trigger.judge(policy_action)
+        trigger = self.trigger.wants_control(policy_action)
         before = self._reason
         if trigger is not None:
             self._steps_left = self.hold_steps

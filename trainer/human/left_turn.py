@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Driver, Reason, Trigger
+from trainer.human.guide import Driver, Reason
 from trainer.scenarios.environment import EgoVehicle, Observation
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
@@ -28,8 +28,7 @@ class PedalPlan:
     hold_s: float = 0.0
     then_mps: float | None = None
     """Full throttle up to this speed; None keeps the speed that the pedal led to."""
-    then_brake: float = 0.0
-    """Instead of that: this share of the full brake, until the car stands."""
+    then_brake: float = 0.0  # Instead of that: this share of the full brake, until the car stands
 
 
 class Crossing:
@@ -134,8 +133,7 @@ class LeftTurnExpert(Driver):
     APPROACH_MPS2 = 1.5
     """Comfortable deceleration towards the stop line; full brake is kept for surprises."""
     CRUISE_MPS = 5.2
-    SIDE_CLEARANCE_M = 0.3
-    """Room to the sides of a passing car."""
+    SIDE_CLEARANCE_M = 0.3  # Room to the sides of a passing car
     GO = PedalPlan(then_mps=CRUISE_MPS)
 
     def __init__(self, env: LeftTurnEnv) -> None:
@@ -151,7 +149,7 @@ class LeftTurnExpert(Driver):
         """Whether a driver standing here would start now."""
         return self.crossing.clear(self.HORIZON_S, self.START_MARGIN_M, self.GO)
 
-    def act(self, observation: Observation) -> NDArray[np.float32]:
+    def act(self, observation: Observation | None = None) -> NDArray[np.float32]:
         """The expert's pedal, float32 [1]: from the true state, whatever the picture shows."""
         if self._beyond_return():
             self.going = True
@@ -178,8 +176,8 @@ class LeftTurnExpert(Driver):
         return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)
 
 
-class LeftTurnTrigger(Trigger):
-    """Judges the policy's action before it is carried out.
+class LeftTurnHuman(LeftTurnExpert):
+    """The expert who also judges the policy's action before it is carried out.
 
     A person lets an action pass that leaves a way out and does not stop in the lane. A judge that
     asked only where the present pedal leads would object to each brisk approach to the stop line,
@@ -187,8 +185,7 @@ class LeftTurnTrigger(Trigger):
     takes over.
     """
 
-    HOLD_S = 0.5
-    """How long the judged pedal is taken to be held: a person's reaction time."""
+    HOLD_S = 0.5  # How long the judged pedal is taken to be held: a person's reaction time
     RESCUE_BRAKE = 0.85
     """Share of the full brake with which the car could then still be stopped in time; the rest is
     room for a human model."""
@@ -203,28 +200,27 @@ class LeftTurnTrigger(Trigger):
     """A car that would then be slower than this within the lane is stopping there: nobody's plan,
     since the traffic does not yield."""
     STANDING_MPS = 0.3
-    STANDING_STEPS = 15
-    """Steps that a car stands before anybody thinks of it as stuck."""
+    STANDING_STEPS = 15  # Steps that a car stands before anybody thinks of it as stuck
     OPEN_STEPS = 5
     """Steps that the way must then have been free: a person's reaction time once more."""
-    START_PEDAL = 0.2
-    """Least throttle that counts as driving on by oneself."""
+    START_PEDAL = 0.2  # Least throttle that counts as driving on by oneself
 
-    def __init__(self, expert: LeftTurnExpert) -> None:
-        self.expert = expert
+    def __init__(self, env: LeftTurnEnv) -> None:
+        super().__init__(env)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
+        super().reset()
         self.standing_steps = self.open_steps = 0
 
-    def judge(self, action: NDArray) -> Reason | None:
+    def wants_control(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
         pedal = float(action[0])
-        standing = self.expert.env.ego.speed < self.STANDING_MPS
+        standing = self.env.ego.speed < self.STANDING_MPS
         self.standing_steps = self.standing_steps + 1 if standing else 0
         waiting = self.standing_steps > self.STANDING_STEPS
-        self.open_steps = self.open_steps + 1 if waiting and self.expert.would_go() else 0
+        self.open_steps = self.open_steps + 1 if waiting and self.would_go() else 0
         if not self._leaves_a_way_out(pedal):
             return "collision"
         if self._stops_in_the_lane(pedal):
@@ -236,27 +232,27 @@ class LeftTurnTrigger(Trigger):
 
         A human that stands there gives up: a human model might stand there for ever.
         """
-        standing = self.expert.env.ego.speed < self.STANDING_MPS
-        return standing or not self.expert.crossing.in_lane(self.expert.env.distance_m)
+        standing = self.env.ego.speed < self.STANDING_MPS
+        return standing or not self.crossing.in_lane(self.env.distance_m)
 
     def _stops_in_the_lane(self, pedal: float) -> bool:
         """Whether after this pedal the car hardly moves, with its nose in the lane."""
         if pedal >= self.START_PEDAL:
             return False
         held = PedalPlan(pedal, self.HESITATION_S)
-        at_m, speed_mps = self.expert.crossing.state_after(self.HESITATION_S, held)
-        return speed_mps < self.CRAWL_MPS and self.expert.crossing.in_lane(at_m)
+        at_m, speed_mps = self.crossing.state_after(self.HESITATION_S, held)
+        return speed_mps < self.CRAWL_MPS and self.crossing.in_lane(at_m)
 
     def _leaves_a_way_out(self, pedal: float) -> bool:
         """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
-        expert, crossing = self.expert, self.expert.crossing
+        crossing = self.crossing
         stop = PedalPlan(pedal, self.HOLD_S, then_brake=self.RESCUE_BRAKE)
-        if crossing.state_after(expert.HORIZON_S, stop)[0] <= self.STOP_BY_M or self._stays(pedal):
+        if crossing.state_after(self.HORIZON_S, stop)[0] <= self.STOP_BY_M or self._stays(pedal):
             return True
-        go = PedalPlan(pedal, self.HOLD_S, then_mps=expert.CRUISE_MPS)
-        return crossing.clear(expert.HORIZON_S, self.RESCUE_MARGIN_M, go)
+        go = PedalPlan(pedal, self.HOLD_S, then_mps=self.CRUISE_MPS)
+        return crossing.clear(self.HORIZON_S, self.RESCUE_MARGIN_M, go)
 
     def _stays(self, pedal: float) -> bool:
         """Whether the car stands outside of the lane, and goes on standing."""
-        ego_at_m, last_m = self.expert.env.distance_m, self.expert.POINT_OF_NO_RETURN_M
-        return pedal <= 0.0 and self.expert.env.ego.speed == 0.0 and ego_at_m <= last_m
+        ego_at_m, last_m = self.env.distance_m, self.POINT_OF_NO_RETURN_M
+        return pedal <= 0.0 and self.env.ego.speed == 0.0 and ego_at_m <= last_m

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
+from trainer.environments import make_environment
 from trainer.human.guide import Driver
-from trainer.learner.networks import Actor
+from trainer.learner.networks import PICTURES, Actor, tensors
 from trainer.util import (
     FROM_ONE,
     FROM_ZERO,
@@ -25,8 +27,7 @@ from trainer.util import (
 )
 
 MODEL_FILE = "human_model.pt"
-REFINING_PARTS = 20
-"""Steps in which the learning rate falls while a model is refined."""
+REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is refined
 RANGES = {
     "frames": (1, 2),
     "learning_rate": FROM_ZERO,
@@ -34,10 +35,8 @@ RANGES = {
     "episodes": FROM_ONE,
     "updates_per_episode": FROM_ONE,
     "demonstrated_share": FROM_ZERO,
-    "unaided_share": FROM_ZERO,
     "refining_updates": FROM_ZERO,
 }
-"""What each number may be."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +62,6 @@ class HumanModelConfig:
     """Whether the person also says, at every step that the model drives, what they would do. A
     scripted expert can (DAgger as of Ross et al. 2011), a person cannot. Interventions alone leave
     the model without an answer where it errs and nobody need step in, as too far from the line."""
-    unaided_share: int = 0
-    """In one episode in this many, from the first on, nobody takes over from the model, though
-    every step is labelled; 0: never. Those that the person drives alone stay theirs. A model that
-    always gets help at once never learns what to do after a mistake, such as stopping in the lane.
-    """
     refining_updates: int = 0
     """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
     paper. On few examples 2,000 made no difference; on 22,000 examples 12,000 brought the left
@@ -75,8 +69,6 @@ class HumanModelConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
-        if self.unaided_share and not self.label_every_step:
-            raise UserError("--unaided-share needs --label-every-step: nothing else teaches there")
 
 
 class HumanModel(Driver):
@@ -88,14 +80,20 @@ class HumanModel(Driver):
     aggregation.
     """
 
-    def __init__(self, config: HumanModelConfig, seed: int, action_size: int = 1) -> None:
-        self.config = config
+    def __init__(
+        self,
+        config: HumanModelConfig,
+        seed: int,
+        action_size: int = 1,
+        space: Space[Any] = PICTURES,
+    ) -> None:
+        self.config, self._pictures = config, space.shape == PICTURES.shape
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.actor = Actor(action_size, config.frames)
+            self.actor = Actor(action_size, config.frames, space)
         self.optimiser = torch.optim.Adam(self.actor.parameters(), config.learning_rate)
         self.random = random_stream(seed, Purpose.HUMAN_BATCHES)
-        self._observations: list[NDArray[np.uint8]] = []
+        self._observations: list[NDArray[Any]] = []
         self._actions: list[NDArray[np.float32]] = []
 
     @property
@@ -103,14 +101,14 @@ class HumanModel(Driver):
         """How many of the human's steps it has seen."""
         return len(self._actions)
 
-    @torch.no_grad()
-    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """What the human would do, float32 [action size], for uint8 [2, 45, 80]."""
-        return self.actor(torch.from_numpy(observation)[None])[0].numpy()
+    def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+        """What the human would do, float32 [action size]."""
+        return self.actor.act(observation[None])[0]
 
-    def add(self, observation: NDArray[np.uint8], action: NDArray[np.float32]) -> None:
+    def add(self, observation: NDArray[Any], action: NDArray[np.float32]) -> None:
         """Aggregate one step of the human's."""
-        self._observations.append(observation[-self.config.frames :].copy())
+        seen = observation[-self.config.frames :] if self._pictures else observation
+        self._observations.append(seen.copy())
         self._actions.append(np.asarray(action, dtype=np.float32))
 
     def learn(self, updates: int) -> float:
@@ -121,7 +119,7 @@ class HumanModel(Driver):
         loss = torch.tensor(float("nan"))
         for _ in range(updates):
             rows = self.random.integers(len(actions), size=self.config.batch_size)
-            predicted = self.actor(torch.from_numpy(observations[rows]))
+            predicted = self.actor(*tensors(observations[rows]))
             loss = (torch.from_numpy(actions[rows]) - predicted).square().sum(dim=1).mean()
             self.optimiser.zero_grad()
             loss.backward()
@@ -155,15 +153,15 @@ class HumanModel(Driver):
 def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
     """The network of a HUMAN_DIR and what is known of it.
 
-    Raises:
-        UserError: no human model there.
+    Raises UserError: no human model there.
     """
     path = directory / MODEL_FILE
     if not path.is_file():
         raise UserError(f"no human model in {directory} (expected {MODEL_FILE})")
     state = load_torch(path)
     try:
-        actor = Actor(state["action_size"], state["frames"])
+        space = make_environment(state["scenario"]).observation_space
+        actor = Actor(state["action_size"], state["frames"], space)
         actor.load_state_dict(state.pop("actor"))
         about = {"scenario": state["scenario"], **state}
     except (KeyError, TypeError, RuntimeError) as error:

@@ -5,7 +5,10 @@ The hyper-parameters are tables A5 and A6, what differs from them, and what the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from edge_runtime.util import UserError
 from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
@@ -30,17 +33,44 @@ class Algorithm:
     which one is drawn goes by how much there is in each."""
     advantage_weight: float = 1.0
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
+    q_term: bool = True  # The actor climbs the critic (eq. 23, first term)
+    rewarded: bool = True
+    """The environment's reward counts. Without it only take-overs do, and so each of them: one
+    from a car that waits too long, too."""
+    proxy_values: bool = False
+    """The critics are told what the human's action and the overruled one are worth: 1 and -1."""
+    human_share: float = 0.0  # Of each minibatch; 0: what the priorities make of it
+    updates_per_step: int = 1
+    asks: float = 0.0
+    """Share of the control periods in which the robot asks for help, since its critics disagree
+    most; 0: the human watches, and takes over by itself."""
+    foresight: int = 0
+    """Control periods for which a preference holds in what the overruled action would have led to;
+    0: there is none. A loss of the actor, beside its other terms."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Hyper-parameters that this row starts from instead of the common ones: its paper's, where
+    ours do not fit what it learns from."""
 
 
 PHIL = Algorithm()
+IA = replace(PHIL, advantage_weight=0.0)
+UNIFORM = {"alpha": 0.0}
+UNIT_VALUES = {"saturation_weight": 3e-3}
+"""Values lie between -1 and 1, a tenth of what our rewards make, and so does the price that the
+actor weighs against them."""
+PVP = Algorithm(
+    penalty=False, behaviour_cloning=False, advantage_weight=0.0, rewarded=False,
+    proxy_values=True, human_share=0.5,
+    settings={**UNIFORM, **UNIT_VALUES, "return_steps": 1, "cloning_weight": 1.0},
+)  # fmt: skip
 
 ALGORITHMS: dict[str, Algorithm] = {
     "phil_td3": PHIL,
-    "ia_td3": replace(PHIL, advantage_weight=0.0),
-    "hi_td3": replace(PHIL, advantage_weight=0.0, behaviour_cloning=False),
+    "ia_td3": IA,
+    "hi_td3": replace(IA, behaviour_cloning=False),
     # The paper does not say whether RD2-TD3 clones; here it does, so that each row differs from
     # PHIL-TD3 in what figure 13 is about.
-    "rd2_td3": replace(PHIL, advantage_weight=0.0, separate_buffers=True),
+    "rd2_td3": replace(IA, separate_buffers=True),
     "rd2_phil": replace(PHIL, separate_buffers=True),
     "per_td3": Algorithm(
         guided=False, penalty=False, behaviour_cloning=False, advantage_weight=0.0
@@ -51,8 +81,67 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
     "phil_without_shaping": replace(PHIL, penalty=False),
-}
-"""Command-line name -> switches. The first six are the paper's; the rest take PHIL-TD3 apart."""
+    # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning.
+    "cloning_only": replace(IA, q_term=False),
+    # RLIF (2311.12996): -1 where an intervention begins, which here is charged to the action that
+    # the human overruled, and 0 elsewhere.
+    "rlif_td3": replace(
+        IA, behaviour_cloning=False, rewarded=False,
+        settings={**UNIT_VALUES, "intervention_penalty": -1.0},
+    ),
+    # Proxy value propagation (2502.03369, NeurIPS 2023), and with cloning (2503.04969).
+    "pvp_td3": PVP,
+    "pvp4real_td3": replace(PVP, behaviour_cloning=True),
+    # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
+    # Layer normalisation in the critics all rows have. Two critics, not ten. Beside a human who
+    # lets nothing fail the critics see no failure, and find every action good.
+    "rlpd_td3": Algorithm(
+        penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
+        updates_per_step=2, settings={**UNIFORM, "return_steps": 1},
+    ),
+    # Predictive preference learning (2510.01545): in the L = 4 states that the overruled action
+    # would have led to, the human's is the better one. Cloning counts as much. No Q term.
+    "ppl_td3": replace(
+        IA, penalty=False, q_term=False, rewarded=False, human_share=0.5, foresight=4,
+        settings={**UNIFORM, **UNIT_VALUES, "cloning_weight": 1.0},
+    ),
+    # The robot asks, as in AIM (2506.09176), but by the critics' disagreement instead of a critic
+    # of its own. What it asked for is no objection: nothing is penalised.
+    "phil_gated": replace(PHIL, penalty=False, asks=0.05),
+}  # fmt: skip
+"""Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
+and the others are what came after it."""
+PLUGIN_GROUP = "phil.algorithms"
+"""Entry points that are rows of their own."""
+
+
+def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
+    """The hyper-parameters with which a row starts, where all others start from ``start``."""
+    return replace(start, **row.settings)
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The row of this name: of the table, of an installed package, or ``module:ROW``.
+
+    Raises:
+        UserError: no such row.
+    """
+    if name in ALGORITHMS:
+        return ALGORITHMS[name]
+    places = list(entry_points(group=PLUGIN_GROUP, name=name))
+    if not places and ":" in name:
+        places = [EntryPoint(name, name, PLUGIN_GROUP)]
+    if not places:
+        plugged = entry_points(group=PLUGIN_GROUP).names
+        known = ", ".join([*ALGORITHMS, *sorted(plugged)])
+        raise UserError(f"no algorithm {name!r}; there is {known}, or module:ROW")
+    try:
+        row = places[0].load()
+    except Exception as error:  # A module may raise anything when it is imported.
+        raise UserError(f"no algorithm {name!r}: {type(error).__name__}: {error}") from error
+    if not isinstance(row, Algorithm):
+        raise UserError(f"{name!r} is no Algorithm of trainer.learner.config")
+    return row
 
 
 @dataclass(frozen=True)
@@ -130,6 +219,9 @@ class LearnerConfig:
     """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen
     on single runs, in which a small weight let the policy forget the human before the critic knew
     better."""
+    preference_beta: float = 0.1
+    """How sharply a preference tells two actions apart, per squared distance; the lower, the less
+    it minds that the better one is nearer already (2510.01545: beta)."""
     intervention_penalty: float = -10.0
     """What an intervention costs (eq. 17: r_pen = r_fail)."""
     penalty_on: str = "overruled"
@@ -196,6 +288,7 @@ RANGES = {
     "advantage_bound": FROM_ZERO,
     "beta": SHARE,
     "cloning_weight": FROM_ZERO,
+    "preference_beta": FROM_ZERO,
     "intervention_penalty": ANY,
     "action_bound": FROM_ZERO,
     "picture_shift": (0, 20),

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import softplus
 
 Action = NDArray[np.float32]
 
@@ -125,6 +126,16 @@ def overruled_loss(values: Tensor, penalised: Tensor, penalty: float, weights: T
     return (weights * penalised * (penalty - values).square()).mean()
 
 
+def proxy_value_loss(human_values: Tensor, overruled_values: Tensor, human: Tensor) -> Tensor:
+    """Proxy value propagation (2502.03369): (Q(s, a_human) - 1)^2 + (Q(s, a_overruled) + 1)^2.
+
+    In one mean over the batch [n], to which only the ``human`` rows add. TD without a reward
+    carries these values on to the others.
+    """
+    losses = (human_values - 1.0).square() + (overruled_values + 1.0).square()
+    return (human * losses).mean()
+
+
 def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:
     """First term of eq. 23: -Q_1(s, pi(s)), over the policy's samples only where ``split``."""
     return _masked_mean(-values, ~human) if split else -values.mean()
@@ -133,6 +144,16 @@ def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:
 def behaviour_cloning_loss(actions: Tensor, human_actions: Tensor, human: Tensor) -> Tensor:
     """Second term of eq. 23 without its weight: mean squared distance to the human's actions."""
     return _masked_mean((human_actions - actions).square().sum(dim=1), human)
+
+
+def preference_loss(actions: Tensor, preferred: Tensor, overruled: Tensor, beta: float) -> Tensor:
+    """Contrastive preference (2510.01545): -log sigmoid(beta log pi(a+) - beta log pi(a-)), a mean.
+
+    A policy without noise counts as a normal distribution around its ``actions``, so that the two
+    logarithms differ as the squared distances do.
+    """
+    nearer = (overruled - actions).square().sum(dim=1) - (preferred - actions).square().sum(dim=1)
+    return softplus(-beta * nearer).mean()
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:

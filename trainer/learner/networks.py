@@ -4,6 +4,10 @@ Two 6x6 convolutions (6 and 16 filters), each followed by ReLU and 2x2 max pooli
 connected layers of 256, 128 and 64. Frames come as uint8 and are normalised to [0, 1] (eq. 28)
 inside the network, so that an exported policy needs no preprocessing.
 
+Another observation than the paper's two frames has other features before the same connected
+layers: pictures of any size those of `Convolutions`, numbers themselves, several entries all of
+theirs.
+
 Nearly all products are in the convolutions and in what the first connected layer makes of the
 picture: ``embed``. It follows the ``torch.autocast`` around it, and is computed once a picture for
 all that is asked of it; the rest is small, and always in single precision.
@@ -13,10 +17,14 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box, Dict, Space
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from trainer.learner.kernel import trunk_features
@@ -53,11 +61,42 @@ FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME
 """Length of a picture's feature vector (1,792)."""
 
 
+PICTURES = Box(0, 255, (2, FRAME_ROWS, FRAME_COLUMNS), np.uint8)
+"""The paper's observation: frames [t-1, t]."""
+UNBOUNDED = 1e6
+"""A bound beyond this is none: a number is not divided by it."""
+SMALL_SIDE = 8
+"""A picture is halved until it is no larger."""
+
+
+def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
+    """Whether an entry of an observation is a picture: uint8, with rows and columns."""
+    return dtype == np.uint8 and len(shape) in (2, 3)
+
+
+def channels_last(shape: tuple[int, ...]) -> bool:
+    """Whether a picture is [rows, columns, channels], and not the channels first."""
+    return len(shape) == 3 and shape[2] < shape[0]
+
+
+def tensors(observations: NDArray[Any], device: Any = "cpu") -> list[Tensor]:
+    """The entries of observations [n, ...], in their order, as networks take them."""
+    names = observations.dtype.names
+    parts = [observations[name] for name in names] if names else [observations]
+    return [torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in parts]
+
+
 class Trunk(nn.Module):
-    """The two convolutions. Maps frames uint8 [batch, n, 45, 80] to features [batch, 1792]."""
+    """The two convolutions. Maps frames uint8 [batch, n, 45, 80] to features [batch, 1792].
+
+    Only the newest ``frames`` of them count.
+    """
+
+    features = FEATURES
 
     def __init__(self, frames: int = 2) -> None:
         super().__init__()
+        self.frames = frames
         self.conv1 = nn.Conv2d(frames, FILTERS[0], KERNEL)
         self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], KERNEL)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -67,30 +106,101 @@ class Trunk(nn.Module):
         first, second = self.conv1, self.conv2
         assert first.bias is not None
         assert second.bias is not None
+        frames = frames[:, -self.frames :]
         return trunk_features(frames, first.weight, first.bias, second.weight, second.bias)
 
 
+class Convolutions(nn.Module):
+    """3x3 convolutions that halve a picture until it is small; for pictures of any size."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.last = channels_last(shape)
+        channels, *sides = np.roll(shape, 1) if self.last else (1, *shape)[-3:]
+        layers: list[nn.Module] = []
+        for filters in chain((16,), repeat(32)):
+            layers += [nn.Conv2d(int(channels), filters, 3, 2, 1), nn.ReLU()]
+            channels, sides = filters, [(side + 1) // 2 for side in sides]
+            if max(sides) <= SMALL_SIDE:
+                break
+        self.layers = nn.Sequential(*layers, nn.Flatten())
+        self.features = int(channels * sides[0] * sides[1])
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """[batch, features] from uint8 [batch, rows, columns], or with channels."""
+        if pictures.dim() == 3:
+            pictures = pictures.unsqueeze(1)
+        if self.last:
+            pictures = pictures.permute(0, 3, 1, 2)
+        return self.layers(pictures.float() / 255.0)
+
+
+class Numbers(nn.Module):
+    """Numbers of any shape, each brought from its bounds to [-1, 1] where it has some."""
+
+    middle: Tensor
+    reach: Tensor
+
+    def __init__(self, space: Box) -> None:
+        super().__init__()
+        low, high = (ends.astype(np.float64).reshape(-1) for ends in (space.low, space.high))
+        bounded = (low > -UNBOUNDED) & (high < UNBOUNDED) & (low < high)
+        low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        self.features = len(low)
+        self.register_buffer("middle", torch.from_numpy((low + high) / 2).float())
+        self.register_buffer("reach", torch.from_numpy((high - low) / 2).float())
+
+    def forward(self, numbers: Tensor) -> Tensor:
+        """[batch, features] from [batch, ...] of any type."""
+        return (numbers.reshape(-1, self.features).float() - self.middle) / self.reach
+
+
+class Entries(nn.Module):
+    """Features of several entries, one after the other."""
+
+    def __init__(self, parts: list[Any]) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(parts)
+        self.features = sum(part.features for part in parts)
+
+    def forward(self, *entries: Tensor) -> Tensor:
+        """[batch, features] from a tensor each."""
+        seen = zip(self.parts, entries, strict=True)
+        return torch.cat([part(entry).float() for part, entry in seen], 1)
+
+
+def make_trunk(space: Space[Any], frames: int) -> Any:
+    """What makes features of an observation: a Box, or a flat Dict of such."""
+    if isinstance(space, Dict):
+        return Entries([make_trunk(part, frames) for part in space.values()])
+    assert isinstance(space, Box)
+    if not is_picture(space.dtype, space.shape):
+        return Numbers(space)
+    return Trunk(frames) if space.shape == PICTURES.shape else Convolutions(space.shape)
+
+
 class Picture(nn.Module):
-    """Convolutions, and the picture's share of the first connected layer.
+    """What is seen, as features, and its share of the first connected layer.
 
     Args:
         frames: how many of the newest frames the network sees. The input is always the
             observation [batch, 2, 45, 80], so that every network is run and exported alike.
         more_inputs: of that layer beside the features; they count in its initial weights.
+        space: of the observations.
     """
 
-    def __init__(self, frames: int = 2, more_inputs: int = 0) -> None:
+    def __init__(self, frames: int = 2, more_inputs: int = 0, space: Space[Any] = PICTURES) -> None:
         super().__init__()
         self.frames = frames
-        self.trunk = Trunk(frames)
-        self.layer = nn.Linear(FEATURES, HIDDEN[0])
-        bound = (FEATURES + more_inputs) ** -0.5
-        nn.init.uniform_(self.layer.weight, -bound, bound)
-        nn.init.uniform_(self.layer.bias, -bound, bound)
+        self.trunk = make_trunk(space, frames)
+        self.layer = nn.Linear(self.trunk.features, HIDDEN[0])
+        self.bound = (self.trunk.features + more_inputs) ** -0.5
+        nn.init.uniform_(self.layer.weight, -self.bound, self.bound)
+        nn.init.uniform_(self.layer.bias, -self.bound, self.bound)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """float32 [batch, 256], before the activation, from frames uint8 [batch, 2, 45, 80]."""
-        return self.layer(self.trunk(frames[:, -self.frames :])).float()
+    def forward(self, *seen: Tensor) -> Tensor:
+        """float32 [batch, 256], before the activation, from a tensor [batch, ...] an entry."""
+        return self.layer(self.trunk(*seen)).float()
 
 
 class Head(nn.Module):
@@ -118,22 +228,28 @@ class Head(nn.Module):
 class Actor(nn.Module):
     """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4)."""
 
-    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+    def __init__(self, action_size: int = 1, frames: int = 2, space: Space[Any] = PICTURES) -> None:
         super().__init__()
-        self.picture = Picture(frames)
+        self.picture = Picture(frames, space=space)
         self.head = Head(action_size)
 
-    def embed(self, frames: Tensor) -> Tensor:
-        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80]."""
-        return self.picture(frames)
+    def embed(self, *seen: Tensor) -> Tensor:
+        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80], or a tensor an entry."""
+        return self.picture(*seen)
 
     def score(self, embedded: Tensor) -> Tensor:
         """The action before tanh squashes it, [batch, n]."""
         return self.head(embedded)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80]."""
-        return torch.tanh(self.score(self.embed(frames)))
+    def forward(self, *seen: Tensor) -> Tensor:
+        """The action [batch, n] in [-1, 1] from what ``embed`` takes."""
+        return torch.tanh(self.score(self.embed(*seen)))
+
+    @torch.no_grad()
+    def act(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+        """Actions float32 [batch, n] in [-1, 1] for observations [batch, ...]."""
+        seen = tensors(observations, self.head.output.weight.device)
+        return self(*seen).cpu().numpy()
 
 
 class Critic(nn.Module):
@@ -145,6 +261,7 @@ class Critic(nn.Module):
         action_bound: of the action's initial weights; 0: as one more feature among 1,792.
         normalised: whether the picture's share of the first connected layer, and each hidden layer,
             is normalised to mean 0 and variance 1 (layer normalisation).
+        space: of the observations.
     """
 
     def __init__(
@@ -153,18 +270,19 @@ class Critic(nn.Module):
         frames: int = 2,
         action_bound: float = 0.0,
         normalised: bool = False,
+        space: Space[Any] = PICTURES,
     ) -> None:
         super().__init__()
-        self.picture = Picture(frames, more_inputs=action_size)
+        self.picture = Picture(frames, action_size, space)
         self.action = nn.Linear(action_size, HIDDEN[0], bias=False)
-        bound = action_bound or (FEATURES + action_size) ** -0.5
+        bound = action_bound or self.picture.bound
         nn.init.uniform_(self.action.weight, -bound, bound)
         self.norm = nn.LayerNorm(HIDDEN[0]) if normalised else nn.Identity()
         self.head = Head(1, normalised)
 
-    def embed(self, frames: Tensor) -> Tensor:
-        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80], whatever the action."""
-        return self.picture(frames)
+    def embed(self, *seen: Tensor) -> Tensor:
+        """float32 [batch, 256] from what an actor's ``embed`` takes, whatever the action."""
+        return self.picture(*seen)
 
     def value(self, embedded: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from an embedded picture [batch, 256] and actions [batch, n]."""
@@ -178,16 +296,10 @@ class Critic(nn.Module):
 class CriticPair(nn.Module):
     """The two critics of TD3, whose smaller value is believed. Arguments as ``Critic``'s."""
 
-    def __init__(
-        self,
-        action_size: int = 1,
-        frames: int = 2,
-        action_bound: float = 0.0,
-        normalised: bool = False,
-    ) -> None:
+    def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__()
-        self.first = Critic(action_size, frames, action_bound, normalised)
-        self.second = Critic(action_size, frames, action_bound, normalised)
+        self.first = Critic(*arguments, **named)
+        self.second = Critic(*arguments, **named)
 
     @property
     def pair(self) -> tuple[Critic, Critic]:

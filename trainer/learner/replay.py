@@ -1,12 +1,14 @@
 """The prioritised human-demonstration replay buffer (section IV-C, table A6).
 
 One buffer for what the policy and what the human did (eq. 10, 19). Each picture is stored once:
-a transition points at three of them, so 100,000 transitions take 380 MB instead of 1.4 GB.
+a transition points at three of them, so 100,000 transitions take 380 MB instead of 1.4 GB. Of
+other observations it points at two.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,7 +65,17 @@ class SumTree:
         return self.find(masses)
 
 
-FRAME_SHAPE = (45, 80)
+class Layout(NamedTuple):
+    """How an observation lies in an array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    """Of several entries: a structured one."""
+    stacked: bool = False
+    """It is [older, newer], and its newer half is the older one of the next observation."""
+
+
+PAPERS = Layout((2, 45, 80), np.dtype(np.uint8), stacked=True)
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
 Lost = list[int]
@@ -75,18 +87,20 @@ class RingIndex:
 
     Args:
         capacity: transitions kept.
+        layout: of the observations. One that is not stacked counts as a picture.
     """
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
+    def __init__(self, capacity: int, layout: Layout = PAPERS) -> None:
+        self.capacity, self.stacked = capacity, layout.stacked
         self.frame_slots = int(capacity * FRAMES_PER_TRANSITION) + 3
-        self.pictures = np.empty((self.frame_slots, *FRAME_SHAPE), np.uint8)
-        self.frame_ids = np.zeros((capacity, 3), np.int64)
-        """The running numbers of each transition's three pictures, oldest first."""
+        shape = layout.shape[1:] if layout.stacked else layout.shape
+        self.pictures = np.empty((self.frame_slots, *shape), layout.dtype)
+        self.frame_ids = np.zeros((capacity, 2 + layout.stacked), np.int64)
+        """The running numbers of each transition's three (or two) pictures, oldest first."""
         self.added = self.frames_added = 0
         self.oldest = 0
         """Running number of the oldest transition that is not forgotten."""
-        self._current: tuple[int, int] | None = None
+        self._current: tuple[int, ...] | None = None
 
     def __len__(self) -> int:
         return self.added - self.oldest
@@ -101,17 +115,20 @@ class RingIndex:
         """Slots of the transitions that are not forgotten, oldest first."""
         return np.arange(self.oldest, self.added, dtype=np.int64) % self.capacity
 
-    def start_episode(self, frames: NDArray[np.uint8]) -> Lost:
-        """Take the first observation [2, 45, 80] of an episode; a picture seen twice once only."""
+    def start_episode(self, frames: NDArray[Any]) -> Lost:
+        """Take the first observation of an episode; a picture seen twice once only."""
         lost: Lost = []
+        if not self.stacked:
+            self._current = (self._add_picture(frames, lost),)
+            return lost
         older = newer = self._add_picture(frames[0], lost)
         if not np.array_equal(frames[0], frames[1]):
             newer = self._add_picture(frames[1], lost)
         self._current = (older, newer)
         return lost
 
-    def add(self, picture: NDArray[np.uint8]) -> tuple[int, Lost]:
-        """Number a transition that led to a picture; its slot.
+    def add(self, frames: NDArray[Any]) -> tuple[int, Lost]:
+        """Number a transition that led to an observation; its slot.
 
         Raises:
             RuntimeError: no episode has begun.
@@ -119,24 +136,25 @@ class RingIndex:
         if self._current is None:
             raise RuntimeError("start_episode comes before add")
         lost: Lost = []
-        newest = self._add_picture(picture, lost)
+        newest = self._add_picture(frames[1] if self.stacked else frames, lost)
         slot = self.added % self.capacity
         self.frame_ids[slot] = *self._current, newest
         self.added += 1
         self.oldest = max(self.oldest, self.added - self.capacity)
-        self._current = (self._current[1], newest)
+        self._current = (*self._current[1:], newest)
         return slot, lost
 
-    def frames(self, slots: Indices, first: int) -> NDArray[np.uint8]:
-        """The two pictures from ``first`` on of each transition, [n, 2, 45, 80]."""
-        return self.pictures[self.frame_ids[slots, first : first + 2] % self.frame_slots]
+    def frames(self, slots: Indices, first: int) -> NDArray[Any]:
+        """What each transition began with (``first`` is 0) or led to (1), [n, 2, 45, 80]."""
+        pictures = slice(first, first + 2) if self.stacked else first
+        return self.pictures[self.frame_ids[slots, pictures] % self.frame_slots]
 
     def follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
         """Whether each transition begins with the picture that another ended with, [n].
 
         Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
         """
-        return self.frame_ids[slots, 2] == self.frame_ids[following, 1]
+        return self.frame_ids[slots, -1] == self.frame_ids[following, -2]
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""
@@ -145,7 +163,8 @@ class RingIndex:
             "frames_added": self.frames_added,
             "oldest": self.oldest,
             "frame_ids": self.frame_ids[: self.used],
-            "pictures": self.pictures[: self.frames_added],
+            # Bytes: a checkpoint knows no structured array.
+            "pictures": self.pictures[: self.frames_added].view(np.uint8),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -154,10 +173,11 @@ class RingIndex:
         self.frames_added = state["frames_added"]
         self.oldest = state["oldest"]
         self.frame_ids[: self.used] = state["frame_ids"]
-        self.pictures[: self.frames_added] = state["pictures"]
+        kept = self.pictures[: self.frames_added].view(np.uint8)
+        kept[:] = state["pictures"]
         self._current = None
 
-    def _add_picture(self, picture: NDArray[np.uint8], lost: Lost) -> int:
+    def _add_picture(self, picture: NDArray[Any], lost: Lost) -> int:
         """Store a picture; its running number. Forget the transitions that lose theirs by it."""
         number = self.frames_added
         self.frames_added += 1
@@ -173,6 +193,8 @@ COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
 """What is kept of a transition beside its pictures."""
+AHEAD = "foreseen_"
+"""What the names of the foreseen ones' state begin with."""
 
 
 @dataclass(frozen=True)
@@ -180,14 +202,14 @@ class Batch:
     """A minibatch of ``n`` transitions."""
 
     indices: Indices
-    frames: NDArray[np.uint8]
-    """s, [n, 2, 45, 80]."""
+    frames: NDArray[Any]
+    """s, [n, 2, 45, 80], or [n, ...] of another layout."""
     actions: NDArray[np.float32]
     """a, the action that was carried out, [n, action size]."""
     rewards: NDArray[np.float32]
     """r after shaping: the discounted sum over ``spans`` steps, [n]."""
-    next_frames: NDArray[np.uint8]
-    """s' after those steps, [n, 2, 45, 80]."""
+    next_frames: NDArray[Any]
+    """s' after those steps, likewise."""
     terminals: NDArray[np.float32]
     """1 where s' ends the episode for good, or the policy's action in s' is overruled and
     penalised; a timeout is not terminal, [n]."""
@@ -201,6 +223,8 @@ class Batch:
     """What the policy would have done where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_] | None = None
     """Whether the overruled action is penalised (eq. 17), [n]; None: in no row."""
+    foreseen: Batch | None = None
+    """Others, whose ``next_frames`` are what an overruled action would have led to, or None."""
 
 
 class _Returns(NamedTuple):
@@ -227,6 +251,10 @@ class ReplayBuffer:
         gamma: their discount factor.
         overruled_value: what a penalised action is worth, if a sum that reaches one is to end with
             it; None: a sum goes on with what the human did instead.
+        layout: of the observations.
+        human_share: share of the human's among what is drawn, once there are both kinds, which
+            are then drawn apart; 0: not fixed.
+        foresees: keep what overruled actions would have led to, and draw as many from it.
     """
 
     def __init__(
@@ -238,10 +266,13 @@ class ReplayBuffer:
         steps: int = 1,
         gamma: float = 1.0,
         overruled_value: float | None = None,
+        layout: Layout = PAPERS,
+        human_share: float = 0.0,
+        foresees: bool = False,
     ) -> None:
-        self.capacity, self.alpha = capacity, alpha
+        self.capacity, self.alpha, self.human_share = capacity, alpha, human_share
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
-        self._ring = RingIndex(capacity)
+        self._ring = RingIndex(capacity, layout)
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
@@ -249,7 +280,10 @@ class ReplayBuffer:
         self._overruled = np.zeros((capacity, action_size), np.float32)
         self._penalised = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
-        self._trees = [SumTree(capacity) for _ in range(2 if separate else 1)]
+        self._trees = [SumTree(capacity) for _ in range(2 if separate or human_share else 1)]
+        self._foreseen: ReplayBuffer | None = None
+        if foresees:
+            self._foreseen = ReplayBuffer(capacity, action_size, alpha=0.0, layout=layout)
 
     def __len__(self) -> int:
         return len(self._ring)
@@ -270,33 +304,35 @@ class ReplayBuffer:
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
-    def start_episode(self, frames: NDArray[np.uint8]) -> None:
-        """Take the first observation [2, 45, 80] of an episode."""
+    def start_episode(self, frames: NDArray[Any]) -> None:
+        """Take the first observation of an episode."""
         self._forget(self._ring.start_episode(frames))
 
     def add(
         self,
         action: NDArray[np.float32],
         reward: float,
-        next_frames: NDArray[np.uint8],
+        next_frames: NDArray[Any],
         terminal: bool,
         human: bool,
         overruled: NDArray[np.float32] | None = None,
         penalised: bool = False,
+        foreseen: Sequence[NDArray[Any]] = (),
     ) -> None:
         """Store a transition with the highest priority that any other has (algorithm 1).
 
         Args:
             action: what was carried out.
             reward: after shaping.
-            next_frames: what it led to, [2, 45, 80].
+            next_frames: the observation that it led to.
             terminal: whether that ends the episode for good.
             human: whether the human acted.
             overruled: the policy's action in its place, if so.
             penalised: whether that action is penalised.
+            foreseen: the observation before, and what the policy's action would have led to.
         """
         priority = float(self._priorities[: self._ring.used].max()) if len(self) else 1.0
-        slot, lost = self._ring.add(next_frames[1])
+        slot, lost = self._ring.add(next_frames)
         self._forget(lost)
         self._actions[slot] = action
         self._rewards[slot] = reward
@@ -305,24 +341,32 @@ class ReplayBuffer:
         self._overruled[slot] = action if overruled is None else overruled
         self._penalised[slot] = penalised
         self.update_priorities(np.array([slot]), np.array([priority]))
+        if self._foreseen is not None and foreseen:
+            self._foreseen.start_episode(foreseen[0])
+            for frames in foreseen[1:]:
+                self._foreseen.add(action, 0.0, frames, True, True, overruled)
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
         """Draw a minibatch by priority."""
+        batch = self._gather(self._draw(count, random))
+        if self._foreseen:  # there, and not empty
+            batch = replace(batch, foreseen=self._foreseen.sample(count, random))
+        return batch
+
+    def _draw(self, count: int, random: np.random.Generator) -> Indices:
         if len(self._trees) == 1:
-            return self._gather(self._trees[0].sample(count, random))
+            return self._trees[0].sample(count, random)
         # Stratified over both: each kind gets its share of the samples, to one.
         strata = (np.arange(count) + random.random(count)) / count
-        policys_share = 1.0 - self.human_count / len(self)
+        policys_share = 1.0 - self._humans_share()
         policys = strata[strata < policys_share] / policys_share
         humans = (strata[strata >= policys_share] - policys_share) / (1.0 - policys_share)
-        return self._gather(
-            np.concatenate(
-                [
-                    tree.find(share * tree.total)
-                    for tree, share in zip(self._trees, (policys, humans), strict=True)
-                    if len(share)
-                ]
-            )
+        return np.concatenate(
+            [
+                tree.find(share * tree.total)
+                for tree, share in zip(self._trees, (policys, humans), strict=True)
+                if len(share)
+            ]
         )
 
     def update_priorities(self, indices: Indices, priorities: NDArray[np.float64]) -> None:
@@ -335,7 +379,9 @@ class ReplayBuffer:
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
         columns = {name: getattr(self, f"_{name}")[: self._ring.used] for name in COLUMNS}
-        return {**self._ring.state_dict(), **columns}
+        ahead = {} if self._foreseen is None else self._foreseen.state_dict()
+        named = {f"{AHEAD}{name}": value for name, value in ahead.items()}
+        return {**self._ring.state_dict(), **columns, **named}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
@@ -347,6 +393,9 @@ class ReplayBuffer:
         alive = self._ring.alive
         if len(alive):
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
+        if self._foreseen is not None:
+            own = {n.removeprefix(AHEAD): v for n, v in state.items() if n.startswith(AHEAD)}
+            self._foreseen.load_state_dict(own)
 
     def _gather(self, indices: Indices) -> Batch:
         returns = self._returns(indices)
@@ -396,9 +445,14 @@ class ReplayBuffer:
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         if len(self._trees) == 1:
             return self._trees[0][indices] / self._trees[0].total
-        human, share = self._human[indices], self.human_count / len(self)
+        human, share = self._human[indices], self._humans_share()
         policys, humans = (tree[indices] / max(tree.total, 1e-300) for tree in self._trees)
         return np.where(human, share * humans, (1.0 - share) * policys)
+
+    def _humans_share(self) -> float:
+        """Of what is drawn, where the two kinds are drawn apart."""
+        there = self.human_count / len(self)
+        return self.human_share if self.human_share and 0.0 < there < 1.0 else there
 
     def _set_weights(self, indices: Indices, weights: NDArray[np.float64]) -> None:
         if len(self._trees) == 1:

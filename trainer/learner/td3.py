@@ -11,12 +11,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
 from trainer.learner import equations
 from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
-from trainer.learner.networks import Actor, CriticPair, multiplies_bfloat16
+from trainer.learner.networks import (
+    PICTURES,
+    Actor,
+    CriticPair,
+    channels_last,
+    is_picture,
+    multiplies_bfloat16,
+    tensors,
+)
 from trainer.learner.replay import Batch
 
 
@@ -47,6 +56,7 @@ class TD3Learner:
         seed: of the initial weights and of the smoothing noise.
         action_size: length of an action.
         device: where the networks are.
+        space: of the observations.
     """
 
     def __init__(
@@ -56,15 +66,16 @@ class TD3Learner:
         seed: int,
         action_size: int = 1,
         device: str = "cpu",
+        space: Space[Any] = PICTURES,
     ) -> None:
         self.config, self.algorithm, self.device = config, algorithm, torch.device(device)
         if self.device.type == "cuda":
             _calculate_exactly()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.actor = Actor(action_size, config.frames).to(self.device)
+            self.actor = Actor(action_size, config.frames, space).to(self.device)
             critics = CriticPair(
-                action_size, config.frames, config.action_bound, config.critic_norm
+                action_size, config.frames, config.action_bound, config.critic_norm, space
             )
             self.critics = critics.to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
@@ -80,20 +91,24 @@ class TD3Learner:
                 group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
+        # Numbers lose by it what a picture does not have.
+        self._reduces = isinstance(space, Box) and is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
-    def act(self, frames: NDArray[np.uint8], averaged: bool = False) -> NDArray[np.float32]:
-        """pi(s) for one observation [2, 45, 80], or the target actor's: float32 [action size]."""
+    def act(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
+        """pi(s) for one observation, or the target actor's: float32 [action size]."""
         return self.act_together(frames[None], averaged)[0]
 
+    def act_together(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
+        """The same for observations [n, ...]: float32 [n, action size]."""
+        return (self.target_actor if averaged else self.actor).act(frames)
+
     @torch.no_grad()
-    def act_together(
-        self, frames: NDArray[np.uint8], averaged: bool = False
-    ) -> NDArray[np.float32]:
-        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
-        actor = self.target_actor if averaged else self.actor
-        actions: NDArray[np.float32] = actor(torch.from_numpy(frames).to(self.device)).cpu().numpy()
-        return actions
+    def doubt(self, frames: NDArray[Any], action: NDArray[np.float32]) -> float:
+        """How much the two critics differ about an action in one observation: |Q_1 - Q_2|."""
+        seen, actions = tensors(frames[None], self.device), self._tensor(action[None])
+        one, other = (critic.value(critic.embed(*seen), actions) for critic in self.critics.pair)
+        return float((one - other).abs())
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""
@@ -103,17 +118,19 @@ class TD3Learner:
         batch = replace(
             batch, frames=self._shift(batch.frames), next_frames=self._shift(batch.next_frames)
         )
-        frames, actions = self._tensor(batch.frames), self._tensor(batch.actions)
+        seen, actions = tensors(batch.frames, self.device), self._tensor(batch.actions)
         human = self._tensor(batch.human)
         targets = self._targets(batch)
         with self._precision():
-            pictures = [critic.embed(frames) for critic in self.critics.pair]
-            own_picture = self.actor.embed(frames)
+            pictures = [critic.embed(*seen) for critic in self.critics.pair]
+            own_picture = self.actor.embed(*seen)
         critic_loss, errors, value = self._critic_loss(batch, pictures, actions, targets, beta)
         score = self.actor.score(own_picture)
         own_actions = torch.tanh(score)
         policy, cloning = self._actor_losses(pictures[0].detach(), own_actions, actions, human)
-        priorities = self._priorities(errors, frames, actions, human, own_actions.detach())
+        priorities = self._priorities(errors, seen, actions, human, own_actions.detach())
+        if self.algorithm.foresight and batch.foreseen is not None:
+            policy = policy + self._preference_loss(batch.foreseen)
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
@@ -167,15 +184,30 @@ class TD3Learner:
 
     def _precision(self) -> torch.autocast:
         kind = self.device.type
-        reduced = self.config.precision == "bfloat16" and multiplies_bfloat16(kind)
-        return torch.autocast(kind, torch.bfloat16, enabled=reduced)
+        reduced = self.config.precision == "bfloat16" and self._reduces
+        enabled = reduced and multiplies_bfloat16(kind)
+        return torch.autocast(kind, torch.bfloat16, enabled=enabled)
 
     def _tensor(self, column: NDArray[Any]) -> Tensor:
         return torch.from_numpy(column).to(self.device)
 
-    def _shift(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Each picture [n, 2, 45, 80] a few pixels aside; its border is repeated."""
-        most = self.config.picture_shift
+    def _shift(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Each picture [n, 2, 45, 80] a few pixels aside; its border is repeated.
+
+        Of a small picture that is at most an eighth. Numbers stay as they are.
+        """
+        if frames.dtype.names:
+            moved = frames.copy()
+            for name in frames.dtype.names:
+                moved[name] = self._shift(frames[name])
+            return moved
+        if not is_picture(frames.dtype, frames.shape[1:]):
+            return frames
+        if frames.ndim == 3:
+            return self._shift(frames[:, None])[:, 0]
+        if channels_last(frames.shape[1:]):
+            return np.moveaxis(self._shift(np.moveaxis(frames, -1, 1)), 1, -1)
+        most = min(self.config.picture_shift, min(frames.shape[2:]) // 8)
         if not most:
             return frames
         padded = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
@@ -189,10 +221,10 @@ class TD3Learner:
 
     @torch.no_grad()
     def _targets(self, batch: Batch) -> Tensor:
-        c, next_frames = self.config, self._tensor(batch.next_frames)
+        c, seen = self.config, tensors(batch.next_frames, self.device)
         with self._precision():
-            own_picture = self.target_actor.embed(next_frames)
-            pictures = [critic.embed(next_frames) for critic in self.target_critics.pair]
+            own_picture = self.target_actor.embed(*seen)
+            pictures = [critic.embed(*seen) for critic in self.target_critics.pair]
         next_actions = torch.tanh(self.target_actor.score(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
@@ -222,15 +254,20 @@ class TD3Learner:
         if self._charges_overruled and batch.penalised is not None and batch.penalised.any():
             assert batch.overruled is not None
             penalised = self._tensor(batch.penalised)
-            values = self._values(pictures, self._tensor(batch.overruled))
+            overruled = self._values(pictures, self._tensor(batch.overruled))
             first, second = (
                 equations.overruled_loss(value, penalised, c.intervention_penalty, weights)
-                for value in values
+                for value in overruled
             )
             loss = loss + first + second
             # A row is drawn again as often as the worse known of its two actions deserves.
-            missed = (c.intervention_penalty - values[0].detach()) * penalised
+            missed = (c.intervention_penalty - overruled[0].detach()) * penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
+        if self.algorithm.proxy_values and batch.human.any():
+            assert batch.overruled is not None
+            overruled = self._values(pictures, self._tensor(batch.overruled))
+            for pair in zip(values, overruled, strict=True):
+                loss = loss + equations.proxy_value_loss(*pair, human)
         return loss, errors, mean
 
     def _values(self, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
@@ -244,16 +281,36 @@ class TD3Learner:
         self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The two terms of eq. 23, unweighted; without cloning the first is over all samples."""
-        cloned = self.algorithm.behaviour_cloning
-        values = self.critics.first.value(picture, own_actions)
-        policy = equations.policy_loss(values, human, self.config.split_loss and cloned)
+        row, nothing = self.algorithm, torch.zeros((), device=self.device)
+        cloned, policy = row.behaviour_cloning, nothing
+        if row.q_term:
+            values = self.critics.first.value(picture, own_actions)
+            policy = equations.policy_loss(values, human, self.config.split_loss and cloned)
         if not cloned:
-            return policy, torch.zeros((), device=self.device)
+            return policy, nothing
         return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
+
+    def _preference_loss(self, foreseen: Batch) -> Tensor:
+        """The human's action before the overruled one, where the latter would have led to."""
+        assert foreseen.overruled is not None
+        seen = tensors(self._shift(foreseen.next_frames), self.device)
+        with self._precision():
+            picture = self.actor.embed(*seen)
+        actions, pair = (
+            torch.tanh(self.actor.score(picture)),
+            (foreseen.actions, foreseen.overruled),
+        )
+        preferred, overruled = map(self._tensor, pair)
+        return equations.preference_loss(actions, preferred, overruled, self.config.preference_beta)
 
     @torch.no_grad()
     def _priorities(
-        self, errors: Tensor, frames: Tensor, actions: Tensor, human: Tensor, own_actions: Tensor
+        self,
+        errors: Tensor,
+        seen: list[Tensor],
+        actions: Tensor,
+        human: Tensor,
+        own_actions: Tensor,
     ) -> Tensor:
         """Eq. 21; the target critic looks only at the human's samples, the only ones that count."""
         c, row = self.config, self.algorithm
@@ -263,7 +320,7 @@ class TD3Learner:
             critic = self.target_critics.first
             # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
             with self._precision():
-                picture = critic.embed(frames.index_select(0, looked_at))
+                picture = critic.embed(*(entry.index_select(0, looked_at) for entry in seen))
             advantage[looked_at] = equations.q_advantage(
                 critic.value(picture, actions[looked_at]),
                 critic.value(picture, own_actions[looked_at]),

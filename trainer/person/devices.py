@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,16 +18,9 @@ from numpy.typing import NDArray
 
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
-from trainer.person.interface import (
-    KEY_HELP,
-    LET_GO,
-    WISH_HELP,
-    WISHES,
-    Moving,
-    Reading,
-    View,
-    Wish,
-)
+from trainer.person.coach import Coaching
+from trainer.person.controls import Amount, amount, controls_of, vector
+from trainer.person.interface import LET_GO, WISH_HELP, WISHES, Moving, Reading, View, Wish
 from trainer.person.profile import SHIPPED, Profile, read_profile
 from trainer.scenarios.picture import draw_scene
 
@@ -38,17 +33,12 @@ WISH_KEYS: dict[int, Wish] = {
 }
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}
 PERIOD_S = 0.1
-KEYS = {
-    "left_turn": {pygame.K_UP: 1.0, pygame.K_w: 1.0, pygame.K_DOWN: -1.0, pygame.K_s: -1.0},
-    "congestion": {pygame.K_LEFT: -1.0, pygame.K_a: -1.0, pygame.K_RIGHT: 1.0, pygame.K_d: 1.0},
-}
-RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
-"""How quickly a key presses: a pedal is down in 0.2 s; a tap turns the wheel a little."""
-SIZE = (1040, 680)
-"""The drawn picture's; the window shows it larger or smaller."""
-SCREEN_SHARE = 0.9
-"""The window takes this much of a small screen: frame and desktop bars need some."""
+SIZE = (1300, 680)  # The drawn picture's; the window shows it larger or smaller
+SCREEN_SHARE = 0.9  # The window takes this much of a small screen: frame and desktop bars need some
 SCENE_SIZE = (736, 400)
+COACH_LEFT, COACH_WIDTH = 1040, 244
+CURVE_HEIGHT = 130
+LEAST_S = 30.0  # Of the human's time, from left to right of the curves
 FRAME_SCALE = 3
 MARGIN = 16
 COLOURS = {
@@ -72,8 +62,7 @@ def open_keyboard(arguments: argparse.Namespace) -> Window:
 def open_joystick(arguments: argparse.Namespace) -> Window:
     """A gamepad or a wheel, with a window.
 
-    Raises:
-        UserError: no screen, no such device, or a wrong profile.
+    Raises UserError: no screen, no such device, or a wrong profile.
     """
     word = arguments.human
     path = Path(arguments.profile or SHIPPED_PROFILES[word])
@@ -85,7 +74,7 @@ def open_joystick(arguments: argparse.Namespace) -> Window:
         raise UserError(
             f"no {word} that fits the profile {path.name} ({profile.match or 'any'}): "
             f"{f'there is {there}' if there else 'none is plugged in'}; "
-            f"`python -m trainer drive --human {word} --calibrate F.toml` makes a profile"
+            f"`python -m pygame.examples.joystick` shows what to write into a profile of your own"
         )
     return window
 
@@ -102,12 +91,12 @@ class KeyboardHands:
     moving = Moving()
 
     def __init__(self, scenario: str) -> None:
-        self._keys, self._rate_per_s = KEYS[scenario], RATES_PER_S[scenario]
-        self.help = KEY_HELP[scenario]
-        self._down: set[int] = set()
-        self._tapped: set[int] = set()
+        self._controls = controls_of(scenario)
+        self.help = self._controls.help
+        self._down: set[str] = set()
+        self._tapped: set[str] = set()
         """Pressed since the last reading: a tap shorter than a control period counts for one."""
-        self._action = 0.0
+        self._pressed: Amount = 0.0
         self._read_s: float | None = None
 
     def plug_in(self) -> None:
@@ -116,10 +105,10 @@ class KeyboardHands:
     def handle(self, event: Any) -> None:
         """Follow the keys up and down."""
         if event.type == pygame.KEYDOWN:
-            self._down.add(event.key)
-            self._tapped.add(event.key)
+            self._down.add(pygame.key.name(event.key))
+            self._tapped.add(pygame.key.name(event.key))
         elif event.type == pygame.KEYUP:
-            self._down.discard(event.key)
+            self._down.discard(pygame.key.name(event.key))
         elif event.type == pygame.WINDOWFOCUSLOST:
             self._down.clear()  # The key's release goes to another window.
 
@@ -129,16 +118,19 @@ class KeyboardHands:
         self._tapped.clear()
         since_s = PERIOD_S if self._read_s is None else min(now_s - self._read_s, PERIOD_S)
         self._read_s = now_s
-        driving = held & self._keys.keys()
-        if not driving and pygame.K_SPACE not in held:
-            self._action = 0.0
-            return LET_GO
-        target = min(max(sum(self._keys[key] for key in driving), -1.0), 1.0)
-        if target * self._action < 0.0:
-            self._action = 0.0  # The other direction begins at once, from rest.
-        step = self._rate_per_s * since_s
-        self._action += min(max(target - self._action, -step), step)
-        return Reading(action=self._action, engaged=True)
+        keys, rest = self._controls.keys, self._controls.rest
+        driving = held & keys.keys()
+        if not driving and "space" not in held:
+            self._pressed = 0.0
+            return Reading(rest)
+        pressing = sum((np.array(keys[key]) for key in driving), np.zeros(np.size(rest)))
+        target = np.clip(pressing, np.subtract(-1.0, rest), np.subtract(1.0, rest))
+        # The other direction begins at once, from rest.
+        pressed = np.where(target * self._pressed < 0.0, 0.0, self._pressed)
+        step = self._controls.rate_per_s * since_s
+        self._pressed = amount(pressed + np.clip(target - pressed, -step, step))
+        action = amount(np.clip(np.add(rest, self._pressed), -1.0, 1.0))
+        return Reading(action=action, engaged=True)
 
 
 class JoystickHands:
@@ -153,7 +145,8 @@ class JoystickHands:
         self._wishes: set[Wish] = set()
         how = "hold the button"
         if profile.take_over == "moving":
-            how = "turn the wheel" if scenario == "congestion" else "press a pedal"
+            steers = "left" in controls_of(scenario).keys
+            how = "turn the wheel" if steers else "press a pedal"
         self.help = f"{profile.name}: {how} to take over"
 
     @property
@@ -201,8 +194,7 @@ class Window:
 
     Closing the window is quitting.
 
-    Raises:
-        UserError: there is no screen to open it on.
+    Raises UserError: there is no screen to open it on.
     """
 
     def __init__(self, hands: KeyboardHands | JoystickHands) -> None:
@@ -254,10 +246,11 @@ class Window:
         if not pygame.display.get_init():
             return
         self._screen.fill(COLOURS["background"])
-        self._blit(draw_scene(view.scene, ego=COLOURS[view.control]), (0, 0))
+        self._scene(view)
         self._frames(view)
         self._state(view)
         self._bars(view)
+        self._coach(view.coach)
         for row, line in enumerate((*view.help, view.progress)):
             colour = "text" if row < len(view.help) else "dim"
             self._text(line, (MARGIN, 588 + 21 * row), colour)
@@ -274,8 +267,21 @@ class Window:
         """Close the window, and SDL with it."""
         pygame.quit()
 
+    def _scene(self, view: View) -> None:
+        """The road from above, or what the environment draws."""
+        if view.scene is not None:
+            self._blit(draw_scene(view.scene, ego=COLOURS[view.control]), (0, 0))
+        elif view.picture is not None:
+            height, width = view.picture.shape[:2]
+            scale = min(SCENE_SIZE[0] / width, SCENE_SIZE[1] / height)
+            surface = pygame.image.frombuffer(view.picture.tobytes(), (width, height), "RGB")
+            size = int(scale * width), int(scale * height)
+            self._screen.blit(pygame.transform.smoothscale(surface, size), (0, 0))
+
     def _frames(self, view: View) -> None:
-        """What the policy sees, the older frame first."""
+        """What the policy sees, the older frame first, where that is two frames."""
+        if view.frames is None:
+            return
         top = SCENE_SIZE[1] + MARGIN + 22
         for place, (frame, when) in enumerate(zip(view.frames, ("0.1 s ago", "now"), strict=True)):
             large = np.repeat(np.repeat(frame, FRAME_SCALE, axis=0), FRAME_SCALE, axis=1)
@@ -290,9 +296,11 @@ class Window:
         who = "nobody drives" if nobody else CONTROL_TEXT[view.control]
         self._text(who, (left, top), view.control, 38)
         late = f"{view.late_ticks} control periods began late" if view.late_ticks else ""
+        speed = "" if math.isnan(view.speed_mps) else f"{view.speed_mps:.1f} m/s"
+        way = f"{view.distance_m:.1f} of {view.goal_m:.0f} m"
         for y, line, colour, size in (
-            (44, f"{view.speed_mps:.1f} m/s", "text", 24),
-            (72, f"{view.distance_m:.1f} of {view.goal_m:.0f} m", "text", 24),
+            (44, speed, "text", 24),
+            (72, "" if math.isnan(view.goal_m) else way, "text", 24),
             (100, f"{view.time_s:.1f} s", "text", 24),
             (128, f"episode {view.episode}, step {view.step}", "text", 24),
             (156, late, "warning", 20),
@@ -303,10 +311,10 @@ class Window:
     def _bars(self, view: View) -> None:
         """The three actions, one above the other, -1 to 1."""
         left, width = 2 * (MARGIN + 80 * FRAME_SCALE) + 2 * MARGIN, 400
-        words = ("left", "right") if view.scenario == "congestion" else ("brake", "throttle")
+        names = controls_of(view.scenario).names
         top = SCENE_SIZE[1] + MARGIN
-        self._text(words[0], (left, top), "dim")
-        self._text(words[1], (left + width, top), "dim", right=True)
+        self._text(f"- {', '.join(names)}", (left, top), "dim")
+        self._text("+", (left + width, top), "dim", right=True)
         rows = (
             ("policy", view.policy_action or 0.0, "policy"),
             ("you", view.human_action, "human"),
@@ -316,12 +324,60 @@ class Window:
             y = top + 24 + 42 * row
             box = pygame.Rect(left, y, width, 18)
             pygame.draw.rect(self._screen, COLOURS["panel"], box)
-            reach = int(action * width / 2)
-            bar = pygame.Rect(left + width // 2 + min(reach, 0), y, abs(reach), 18)
-            pygame.draw.rect(self._screen, COLOURS[colour], bar)
+            values = vector(action).tolist()
+            for line, value in enumerate(values):
+                reach, high = int(value * width / 2), 18 // len(values)
+                place = (left + width // 2 + min(reach, 0), y + line * high)
+                pygame.draw.rect(self._screen, COLOURS[colour], (place, (abs(reach), high)))
             bottom = (box.centerx, box.bottom - 1)
             pygame.draw.line(self._screen, COLOURS["dim"], box.midtop, bottom)
-            self._text(f"{name} {action:+.2f}", (left, y + 20), "dim")
+            said = " ".join(f"{value:+.2f}" for value in values)
+            self._text(f"{name} {said}", (left, y + 20), "dim")
+
+    def _coach(self, coach: Coaching | None) -> None:
+        """The column at the right: advice, the policy alone beside what is typical, episodes."""
+        if coach is None:
+            return
+        left, top = COACH_LEFT, MARGIN
+        for line in textwrap.wrap(coach.advice, 30):
+            self._text(line, (left, top), "text", 24)
+            top += 24
+        top = 140
+        for line in (f"policy alone: {coach.alone or '–'}", *textwrap.wrap(coach.said, 36)):
+            self._text(line, (left, top), "dim")
+            top += 20
+        self._curves(coach, pygame.Rect(left, 220, COACH_WIDTH, CURVE_HEIGHT))
+        rows = [
+            (str(one.number), one.outcome, f"{one.human_s:.1f}", str(one.takeovers))
+            for one in reversed(coach.episodes)
+        ]
+        for row, (number, outcome, human_s, takeovers) in enumerate(
+            [("", "", "you, s", "take-overs"), *rows]
+        ):
+            y = 384 + 19 * row
+            self._text(outcome, (left + 36, y), "text")
+            for cell, end in ((number, 26), (human_s, 154), (takeovers, COACH_WIDTH)):
+                self._text(cell, (left + end, y), "dim", right=True)
+
+    def _curves(self, coach: Coaching, box: pygame.Rect) -> None:
+        """Success by the human's seconds; the upright line is where the person is."""
+        pygame.draw.rect(self._screen, COLOURS["panel"], box)
+        xs = [x for x, _ in (*coach.curve, *coach.typical)]
+        end_s = max(LEAST_S, coach.human_s, *xs)
+        wide, high = box.width - 2, box.height - 4
+        now = box.left + coach.human_s / end_s * wide
+        pygame.draw.line(self._screen, COLOURS["human"], (now, box.top), (now, box.bottom - 1))
+        self._text(f"{end_s:.0f} s of you", (box.right, box.bottom + 4), "dim", right=True)
+        for curve, colour, name, place in (
+            (coach.curve, "policy", "alone", 0),
+            (coach.typical, "dim", "typical", 50),
+        ):
+            self._text(name * bool(curve), (box.left + place, box.bottom + 4), colour)
+            places = [(box.left + x / end_s * wide, box.bottom - 2 - y * high) for x, y in curve]
+            if len(places) > 1:
+                pygame.draw.lines(self._screen, COLOURS[colour], False, places, 2)
+            elif places:
+                pygame.draw.circle(self._screen, COLOURS[colour], places[0], 3)
 
     def _text(
         self, text: str, place: tuple[int, int], colour: str, size: int = 20, right: bool = False

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_runtime.cli import positive_number, whole_number
 from edge_runtime.util import UserError
+from trainer.person.controls import Amount
+
+if TYPE_CHECKING:  # It needs torch, which takes two seconds.
+    from trainer.person.coach import Coaching
 
 Wish = Literal["pause", "restart", "discard", "quit"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard`` also
@@ -21,26 +25,20 @@ WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
 """What decides the applied action; ``returning``: the person has let go, and the action is on its
 way back to the policy's, which still counts as the person's."""
-KEY_HELP = {
-    "left_turn": "hold to take over    Up / W: throttle    Down / S: brake    Space: neither",
-    "congestion": "hold to take over    Left / A, Right / D: steer    Space: straight on",
-}
-"""Scenario -> what its keys do, in a window and in the browser alike."""
 WISH_HELP = (
     "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
     "    Q: quit, all is kept"
 )
-PERSON = "person"
-"""``RunConfig.human`` of every device: a run may go on with another one."""
+PERSON = "person"  # ``RunConfig.human`` of every device: a run may go on with another one
 
 
 @dataclass(frozen=True)
 class Reading:
     """What the person does now."""
 
-    action: float = 0.0
-    """The scenario's one action, in [-1, 1]: the pedal in the left turn (1 full throttle, -1 full
-    brake), the steering in the congestion (negative to the left)."""
+    action: Amount = 0.0
+    """In [-1, 1]: the pedal in the left turn (1 full throttle, -1 full brake), the steering in the
+    congestion (negative to the left)."""
     engaged: bool = False
     """Whether the person holds what takes over. A lost connection or device is letting go."""
     wishes: frozenset[Wish] = frozenset()
@@ -57,8 +55,7 @@ LET_GO = Reading()
 class Moving:
     """When moving a wheel or a pedal takes over, and when its resting hands control back."""
 
-    threshold: float = 0.15
-    """How far from rest ``Reading.action`` must be to take over."""
+    threshold: float = 0.15  # How far from rest ``Reading.action`` must be to take over
     rest: float = 0.05
     """Below this it rests. Less than ``threshold``, so that a hand that trembles there does not
     take over time and again."""
@@ -71,32 +68,33 @@ class View:
     """What a person sees of one control period."""
 
     scenario: str
-    scene: dict[str, Any]
-    """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first."""
-    frames: NDArray[np.uint8]
-    """What the policy sees: [2, 45, 80], the older frame first."""
-    policy_action: float | None
-    """None where the person drives alone."""
-    human_action: float
-    """What the device says, in control or not."""
-    applied_action: float
+    scene: dict[str, Any] | None
+    """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first.
+    None: there is ``picture`` instead."""
+    frames: NDArray[np.uint8] | None
+    """What the policy sees: [2, 45, 80], the older frame first; None: something else."""
+    policy_action: Amount | None  # None where the person drives alone
+    human_action: Amount  # What the device says, in control or not
+    applied_action: Amount
     control: Control
-    speed_mps: float
+    speed_mps: float  # nan where the environment does not tell, as ``goal_m``
     distance_m: float
     goal_m: float
     episode: int
     step: int
-    time_s: float
-    """Simulated time since the episode's start."""
-    late_ticks: int = 0
-    """Control periods of this sitting that began too late."""
+    time_s: float  # Simulated time since the episode's start
+    late_ticks: int = 0  # Control periods of this sitting that began too late
     paused: bool = False
-    progress: str = ""
-    """One line on the learner; empty without one."""
+    progress: str = ""  # One line on the learner; empty without one
+    cost: Mapping[str, float] = field(default_factory=dict)
+    """What the person has given so far: ``human_s`` at the wheel, ``takeovers``, and ``failures``,
+    the episodes that missed the goal."""
+    coach: Coaching | None = None  # Episodes, learning curve and advice; None: nothing yet
     message: str = ""
     """What is going on besides driving: "saving", "episode ended: goal"; mostly empty."""
-    help: tuple[str, ...] = ()
-    """The device's keys, one line each."""
+    help: tuple[str, ...] = ()  # The device's keys, one line each
+    picture: NDArray[np.uint8] | None = None
+    """What the environment draws, [height, width, 3], where it has no scene."""
 
 
 class Person(Protocol):
@@ -106,8 +104,7 @@ class Person(Protocol):
     than a few milliseconds.
     """
 
-    help: tuple[str, ...]
-    """What to press for what, one short line each."""
+    help: tuple[str, ...]  # What to press for what, one short line each
     moving: Moving
 
     @property

@@ -1,26 +1,20 @@
-"""What the axes and buttons of a wheel or gamepad mean: a TOML file, and asking for its values."""
+"""What the axes and buttons of a wheel or gamepad mean: a TOML file."""
 
 from __future__ import annotations
 
-import json
-import os
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal
 
 import msgspec
 
-from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError, read_toml
+from trainer.person.controls import Amount, controls_of
 from trainer.person.interface import Moving, Wish
 
 SHIPPED = Path(__file__).parent / "profiles"
 Number = Annotated[int, msgspec.Meta(ge=0, le=63)]
-Place = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
-"""Of an axis, as SDL gives it."""
-SHORTEST = 0.02
-"""The shortest travel of a wheel or pedal: its noise must not be a full action."""
+Place = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]  # Of an axis, as SDL gives it
+SHORTEST = 0.02  # The shortest travel of a wheel or pedal: its noise must not be a full action
 DeadZone = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
 
@@ -34,8 +28,7 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     larger than ``right`` where the axis is reversed."""
     centre: Place = 0.0
     right: Place = 1.0
-    dead_zone: DeadZone = 0.02
-    """The share of the way from the centre in which nothing happens."""
+    dead_zone: DeadZone = 0.02  # The share of the way from the centre in which nothing happens
 
     def __post_init__(self) -> None:
         if not (self.left < self.centre < self.right or self.left > self.centre > self.right):
@@ -91,15 +84,18 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.take_over == "holding" and not self.buttons.get("hold"):
             raise ValueError("take_over is by holding, but buttons.hold is empty")
 
-    def action(self, scenario: str, places: dict[int, float]) -> float:
-        """The scenario's action from the axes' places; an axis not in ``places`` is at rest."""
-        if scenario == "congestion":
-            return self.steering.action(places.get(self.steering.axis, self.steering.centre))
-        throttle, brake = (
+    def action(self, scenario: str, places: dict[int, float]) -> Amount:
+        """The scenario's action from the axes' places; an axis not in ``places`` is at rest.
+
+        The wheel presses the environment's key left or right, the pedals press up and down.
+        """
+        turned = self.steering.action(places.get(self.steering.axis, self.steering.centre))
+        up, down = (
             pedal.action(places.get(pedal.axis, pedal.released))
             for pedal in (self.throttle, self.brake)
         )
-        return throttle - brake
+        shares = {"left": max(-turned, 0.0), "right": max(turned, 0.0), "up": up, "down": down}
+        return controls_of(scenario).mix(shares)
 
 
 def read_profile(path: Path) -> Profile:
@@ -115,148 +111,3 @@ def _share(place: float, start: float, end: float, dead_zone: float) -> float:
     """The share of the way from start to end, beyond the dead zone, in [0, 1]."""
     way = (place - start) / (end - start)
     return min(max((way - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
-
-
-MOVED = 0.2
-"""How far an axis must go to be the one that was asked for."""
-STEADY, STEADY_S = 0.02, 0.7
-"""How still it must then be held, and for how long."""
-FIRST_S = 2.0
-"""For pressing and turning everything once."""
-LOOK_S = 0.02
-PATIENCE_S = 60.0
-"""How long a question is asked."""
-Answer = TypeVar("Answer")
-WRITTEN = """\
-# Written by `python -m trainer drive --calibrate`.
-name = {name}
-match = {name}
-take_over = "moving"  # or "holding": a button of buttons.hold alone
-
-[steering]
-axis = {left.axis}
-left = {left.place:.3f}
-centre = {left.rest:.3f}
-right = {right.place:.3f}
-dead_zone = 0.03
-
-[throttle]
-axis = {throttle.axis}
-released = {throttle.rest:.3f}
-pressed = {throttle.place:.3f}
-dead_zone = 0.05
-
-[brake]
-axis = {brake.axis}
-released = {brake.rest:.3f}
-pressed = {brake.place:.3f}
-dead_zone = 0.05
-
-[buttons]
-hold = [{hold}]
-"""
-
-
-class Found(NamedTuple):
-    """An axis, where it was held, and where it rests."""
-
-    axis: int
-    place: float
-    rest: float
-
-
-def calibrate(word: str, out: Path) -> None:
-    """Ask on the terminal about the first device there is, and write the profile.
-
-    Raises:
-        UserError: no device, no answer, or a file that cannot be written.
-    """
-    check_writable(out)
-    # Axes are read without a window, too, but not without SDL's video.
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from trainer.person.devices import joysticks, pygame
-
-    pygame.display.init()
-    pygame.joystick.init()
-    try:
-        devices = joysticks()
-        if not devices:
-            raise UserError(f"no {word} is plugged in")
-        print(f"{devices[0].get_name()}:")
-        profile = ask(devices[0], pygame.event.pump, lambda line: print(line, flush=True))
-        write_atomic(out, profile.encode())
-    finally:
-        pygame.quit()
-    print(out)
-
-
-def ask(joystick: Any, pump: Callable[[], object], say: Callable[[str], None]) -> str:
-    """The profile, as TOML, from what the person does with the joystick (pygame's) when told.
-
-    ``pump`` lets SDL look at its devices. UserError: no answer, or a contradictory one.
-    """
-
-    def places() -> list[float]:
-        pump()
-        return [joystick.get_axis(axis) for axis in range(joystick.get_numaxes())]
-
-    def until(answer: Callable[[], Answer | None]) -> Answer:
-        """The first answer that is neither None nor False."""
-        end_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end_s:
-            given = answer()
-            if given is not None and given is not False:
-                return given
-            time.sleep(LOOK_S)
-        raise UserError("nothing was pressed for a minute; no profile was written")
-
-    def still() -> bool:
-        """Whether all axes stay where they are for a while."""
-        before, end_s = places(), time.monotonic() + STEADY_S
-        while time.monotonic() < end_s:
-            time.sleep(LOOK_S)
-            if any(abs(a - b) > STEADY for a, b in zip(places(), before, strict=True)):
-                return False
-        return True
-
-    def held() -> Found | None:
-        """The axis that is held away from its rest, where it is once it is still."""
-        away = [abs(here - there) for here, there in zip(places(), rest, strict=True)]
-        axis = max(range(len(away)), key=away.__getitem__)
-        if away[axis] <= MOVED or not still():
-            return None
-        return Found(axis, places()[axis], rest[axis])
-
-    def ask_axis(what: str) -> Found:
-        say(what)
-        found = until(held)
-        say("  and let go.")
-        until(lambda: abs(places()[found.axis] - found.rest) < MOVED)
-        return found
-
-    def pressed() -> int | None:
-        pump()
-        return next(filter(joystick.get_button, range(joystick.get_numbuttons())), None)
-
-    name = joystick.get_name()
-    if not joystick.get_numaxes():
-        raise UserError(f"{name} has no axes to calibrate")
-    say("Press every pedal and turn the wheel once, then let go of everything.")
-    time.sleep(FIRST_S)
-    until(still)
-    rest = places()
-    left = ask_axis("Turn LEFT as far as full steering is to be, and hold.")
-    right = ask_axis("Turn RIGHT as far, and hold.")
-    if left.axis != right.axis:
-        raise UserError(f"left was axis {left.axis}, right axis {right.axis}: begin again")
-    throttle = ask_axis("Press the THROTTLE fully, and hold.")
-    brake = ask_axis("Press the BRAKE fully, and hold.")
-    say("Press the button that is to take over while it is held.")
-    return WRITTEN.format(
-        name=json.dumps(name, ensure_ascii=False),  # in TOML a string is written as in JSON
-        left=left,
-        right=right,
-        throttle=throttle,
-        brake=brake,
-        hold=until(pressed),
-    )

@@ -9,10 +9,13 @@ ever overwritten: sittings add up.
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,17 +28,19 @@ from bridge.recording import Records
 from edge_runtime.util import UserError, open_regular
 from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
+from trainer.learner.replay import Layout
+from trainer.person.controls import Amount, vector
 from trainer.person.interface import Control
 from trainer.training.delayed import Store
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")
 """Begin the topics of a recording of the wire, and their copies for viewers."""
-DIRECTORY = "sittings"
-"""Where a training run keeps its recordings."""
+DIRECTORY = "sittings"  # Where a training run keeps its recordings
+STOPPED, RESTARTED = "stopped", "restarted"  # Outcomes of an episode that the person ended
 DISCARDED = "discarded"
 """Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
-FRAME_SHAPE = (45, 80)
+FRAME, FRAMES = "('|u1', (45, 80))", "('|u1', (2, 45, 80))"  # Layouts, as in ``Step.layout``
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
 
@@ -43,50 +48,58 @@ class Step(msgspec.Struct, frozen=True):
     """One control period, whole: a transition, and what each did in it."""
 
     sitting: int
-    index: int
-    """The step's number in the sitting, from 0."""
+    index: int  # The step's number in the sitting, from 0
     scenario: str
-    seed: int
-    """The episode's."""
+    seed: int  # The episode's
     episode: int
-    step: int
-    """In the episode, from 0."""
-    time_ns: int
-    """When the hands were asked: wall time, ns since 1970."""
-    time_s: float
-    """Simulated, since the episode's start."""
-    frames: bytes
-    """s: what the policy saw, uint8 [2, 45, 80]."""
+    step: int  # In the episode, from 0
+    time_ns: int  # When the hands were asked: wall time, ns since 1970
+    time_s: float  # Simulated, since the episode's start
+    frames: bytes  # s: what the policy saw, uint8 [2, 45, 80], or as ``layout`` says
     next_frame: bytes
-    """The newer frame of s', uint8 [45, 80]; the older is the newer of s."""
-    policy_action: float | None
-    human_action: float
-    """What the device said."""
-    action: float
-    """What was applied."""
+    """The newer frame of s', uint8 [45, 80]; the older is the newer of s. With ``layout``: s'."""
+    policy_action: Amount | None
+    human_action: Amount  # What the device said
+    action: Amount  # What was applied
     control: Control
-    human: bool
-    """The mask Delta."""
-    first: bool
-    """Whether an intervention began here."""
-    reward: float
-    """Without the shaping of eq. 17."""
+    human: bool  # The mask Delta
+    first: bool  # Whether an intervention began here
+    reward: float  # Without the shaping of eq. 17
     terminated: bool
     truncated: bool
     speed_mps: float
-    outcome: str = ""
-    """How the episode ended here, if it did."""
+    outcome: str = ""  # How the episode ended here, if it did
+    layout: str = ""  # NumPy's description of an observation and its shape; empty for two frames
 
     @property
-    def observation(self) -> NDArray[np.uint8]:
-        """s, uint8 [2, 45, 80]."""
-        return np.frombuffer(self.frames, np.uint8).reshape(2, *FRAME_SHAPE)
+    def observation(self) -> NDArray[Any]:
+        """s, uint8 [2, 45, 80], or as ``layout`` says."""
+        return _array(self.frames, self.layout or FRAMES)
 
     @property
-    def next_observation(self) -> NDArray[np.uint8]:
-        """s', uint8 [2, 45, 80]."""
-        newer = np.frombuffer(self.next_frame, np.uint8).reshape(FRAME_SHAPE)
-        return np.stack([self.observation[1], newer])
+    def next_observation(self) -> NDArray[Any]:
+        """s', likewise."""
+        if self.layout:
+            return _array(self.next_frame, self.layout)
+        return np.stack([self.observation[1], _array(self.next_frame, FRAME)])
+
+
+def layout_text(layout: Layout) -> str:
+    """An observation's layout as ``Step.layout`` has it."""
+    if layout.stacked:
+        return ""
+    return repr((np.lib.format.dtype_to_descr(layout.dtype), tuple(layout.shape)))
+
+
+@cache
+def _read_layout(text: str) -> tuple[Any, tuple[int, ...]]:
+    descr, shape = ast.literal_eval(text)
+    return np.lib.format.descr_to_dtype(descr), shape
+
+
+def _array(data: bytes, layout: str) -> NDArray[Any]:
+    dtype, shape = _read_layout(layout)
+    return np.frombuffer(data, dtype).reshape(shape)
 
 
 class Recorder:
@@ -94,8 +107,7 @@ class Recorder:
 
     def __init__(self, directory: Path) -> None:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
-        self.index = 0
-        """The next step's number."""
+        self.index = 0  # The next step's number
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
         self._file = FlushedFile(self.path)
         self._mcap = start_mcap(self._file)
@@ -156,8 +168,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
 def read_steps(path: Path) -> Iterator[Step]:
     """The steps of a recording, up to its end or to where a kill has cut it off.
 
-    Raises:
-        UserError: no such file, or not one of ours.
+    Raises UserError: no such file, or not one of ours.
     """
     try:
         with open_regular(path) as stream:
@@ -217,7 +228,7 @@ def store_again(
         for known, step in zip(episode, episode[ticks_late:], strict=False):
             if step is episode[ticks_late]:
                 store.start_episode(known.observation)
-            action = np.array([step.action], np.float32)
+            action = vector(step.action)
             policy = step.action if step.policy_action is None else step.policy_action
             by_person = Intervention(action, "person", step.first) if step.human else None
             store.add(
@@ -226,7 +237,7 @@ def store_again(
                 known.next_observation,
                 step.terminated,
                 step.human,
-                overruled=np.array([policy], np.float32),
+                overruled=vector(policy),
                 penalised=penalises(by_person),
             )
             stored += 1
@@ -234,37 +245,27 @@ def store_again(
     return stored, human
 
 
-def demonstrate(
-    model: HumanModel, recordings: Sequence[Path], scenario: str, left_out: Sequence[str] = ()
-) -> int:
+def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
     """Give the model every recorded step in which the person was in control.
 
     During a hand-over the model gets the hands' action, not the blend that was applied; on the
-    way back to the policy the hands have let go. Episodes that the person discarded are left out,
-    and ``left_out``: ``3`` for sitting 3, ``3:7`` for its episode 7.
+    way back to the policy the hands have let go. Episodes that the person discarded are left out.
 
     Returns:
         How many take-overs the recordings hold; a whole episode driven alone is one.
 
-    Raises:
-        UserError: a recording of another scenario, none in which a person drove, or something left
-            out that is not there.
+    Raises UserError: a recording of another scenario, or none in which a person drove.
     """
-    interventions, unknown = 0, set(left_out)
+    interventions = 0
     for path in recordings:
         for episode in read_episodes(read_steps(path)):
             first = episode[0]
             if first.scenario != scenario:
                 raise UserError(f"{path} was driven in {first.scenario}, not in {scenario}")
-            names = {f"{first.sitting}", f"{first.sitting}:{first.episode}"}
-            unknown -= names
-            if names.isdisjoint(left_out):
-                interventions += sum(step.first for step in episode)
-                for step in episode:
-                    if step.control == "human":
-                        model.add(step.observation, np.array([step.human_action], np.float32))
-    if unknown:
-        raise UserError(f"--leave-out {min(unknown)}: there is no such episode in these recordings")
+            interventions += sum(step.first for step in episode)
+            for step in episode:
+                if step.control == "human":
+                    model.add(step.observation, vector(step.human_action))
     if not model.demonstrations:
         raise UserError("nobody took over in these recordings: there is nothing to imitate")
     return interventions

@@ -20,26 +20,29 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-import torch
-
+from bridge.report import GOAL
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
 from trainer.human.guide import Guide, Intervention
-from trainer.learner.config import ALGORITHMS
+from trainer.learner.config import find_algorithm
+from trainer.person.alone import BehindTheScenes, Check
+from trainer.person.coach import Coach, typical_curve
+from trainer.person.controls import amount, vector
 from trainer.person.interface import Person, open_person
 from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
 from trainer.training.delayed import Store, behind, ticks_late
 from trainer.training.learning import Action, LearningThread, Observation
-from trainer.training.metrics import EpisodeMetrics
+from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
 from trainer.training.run import TrainingRun, divergence_said
+from trainer.util import Purpose, episode_seed
 
 NICENESS = 10
 """Of the updates' thread, and those that torch starts from it: the person's loop goes first."""
-LOOK_S = 0.002
-"""Between two looks whether an update is done, where it must be waited for."""
+LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
+PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share", "human_shift")
+"""What makes a scripted human imperfect."""
 
 
 @contextmanager
@@ -93,6 +96,14 @@ class PersonRun(TrainingRun):
         super().__init__(config, run_dir, resume)
         recorder = Recorder(run_dir / DIRECTORY)
         self.sitting = Sitting(person, recorder, self.env, speed=speed)
+        before = [row for row in read_metrics(run_dir) if int(row["episode"]) < self.episode]
+        given = spent(before, self.env.control_period_s)
+        given["failures"] = sum(given["failures"].values())
+        self.sitting.cost.update({name: given[name] for name in self.sitting.cost})
+        coach = Coach(typical_curve(config.scenario, config.algorithm), learning=True)
+        coach.recall(before, self.env.control_period_s)
+        self.sitting.coach = coach
+        self.behind_the_scenes = BehindTheScenes(config)
         self.guide = PersonGuide(self.sitting)
         self.kept_back = KeptBack(self.learning)
         self.policy = behind(self.network, self.kept_back, self.env)
@@ -111,6 +122,7 @@ class PersonRun(TrainingRun):
         except SittingOver:
             self.save()
         finally:
+            self.behind_the_scenes.close()
             self.sitting.close()
 
     def quit(self) -> bool:
@@ -156,11 +168,15 @@ class PersonRun(TrainingRun):
         return self.sitting.stop or super()._must_stop(deadline_s)
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
-        """Only at a sitting's end, behind its closed window: a person is not to wait."""
+        """Behind the scenes, and once more at a sitting's end, behind its closed window: a person
+        is not to wait.
+        """
         if not at_end:
+            self._check_alone(metrics)
             return
         self.save()
         self.sitting.close()
+        self.behind_the_scenes.close()
         if self.config.evaluate_every_steps:
             runs = self.config.evaluation_runs
             said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
@@ -169,6 +185,27 @@ class PersonRun(TrainingRun):
             super()._validate(metrics, at_end)
         except KeyboardInterrupt:
             print("validation left out", file=sys.stderr)
+
+    def _check_alone(self, metrics: EpisodeMetrics) -> None:
+        """Take the validation that is done, into this episode's row, and begin one that is due."""
+        coach, found = self.sitting.coach, self.behind_the_scenes.take()
+        if found is not None:
+            check, drives = found
+            runs = self.config.evaluation_runs
+            self.validation.take(drives[:runs], check.actor, metrics, check.episode)
+            goals = [drive.outcome == GOAL for drive in drives[runs:]]
+            mastered = dict(zip(check.seeds, goals, strict=True))
+            coach.take(check.human_s, metrics.validation_success, mastered)
+        due = self.config.evaluate_every_steps and super()._due(metrics.steps)
+        if due and metrics.updates and not self.behind_the_scenes.busy:
+            actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
+            seeds = {
+                number: episode_seed(self.config.seed, Purpose.TRAINING, number)
+                for number in coach.to_check()
+            }
+            given_s = self.sitting.cost["human_s"]
+            self.behind_the_scenes.begin(Check(actor, self.episode, given_s, seeds))
+        coach.checking = self.behind_the_scenes.busy
 
     def _due(self, last_steps: int) -> bool:
         return True  # A person's run has no other end than a sitting's.
@@ -181,18 +218,28 @@ class PersonRun(TrainingRun):
         sitting, index = state["recorded"]
         steps = steps_since(self.run_dir / DIRECTORY, (sitting, index))
         self.recovered = store_again(
-            self.learning, steps, self._shape, self._penalises, ticks_late(self.network)
+            self.learning,
+            steps,
+            self._shape,
+            self._penalises,
+            ticks_late(self.network, self.env.control_period_s),
         )
 
 
 def check_settings(config: RunConfig) -> None:
     """Refuse what a person cannot be a part of; raises UserError."""
-    if not ALGORITHMS[config.algorithm].guided:
+    row = find_algorithm(config.algorithm)
+    if not row.guided:
         raise UserError(f"{config.algorithm} takes no guidance: nobody could take over")
+    if row.asks:
+        raise UserError(f"{config.algorithm} asks a scripted human or its model, and no person yet")
+    if config.delay_known:
+        raise UserError("a person's recordings hold no actions under way: no delay_known")
     if config.guided_share != 1:
         raise UserError("a person watches every episode: guided_share is 1")
-    if config.poor_guidance_share:
-        raise UserError("a person's actions are not replaced: poor_guidance_share is 0")
+    for name in PRETENDED:
+        if getattr(config, name):
+            raise UserError(f"a person's actions are not replaced: {name} is 0")
 
 
 class PersonGuide:
@@ -210,8 +257,8 @@ class PersonGuide:
         In a hand-over that is neither the person's action nor the policy's; the replay buffer
         takes it for the person's.
         """
-        applied = self._sitting.decide(observation, float(policy_action[0]))
-        action = np.array([applied.action], np.float32)
+        applied = self._sitting.decide(observation, amount(policy_action))
+        action = vector(applied.action)
         return Intervention(action, "person", applied.first) if applied.human else None
 
 
@@ -257,10 +304,9 @@ class UnhurriedLearning:
         """Transitions stored since the run began."""
         return self._inner.added
 
-    @torch.no_grad()
     def act(self, observation: Observation) -> Action:
         """The action of the actor's copy, float32 [action size]."""
-        return self._actor(torch.from_numpy(observation)[None])[0].numpy()
+        return self._actor.act(observation[None])[0]
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored, unless the last one is still under way."""

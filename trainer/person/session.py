@@ -6,37 +6,49 @@ In ``drive`` a policy or the person drives, every step is recorded, and nothing 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec import structs
 
+from bridge.fork import ForkedEnvironment, add_place, find_fork
+from bridge.report import failed
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.util import UserError, counted
-from trainer.drivers import load_driver, make_environment
-from trainer.human.guide import Driver
+from trainer.drivers import load_driver
+from trainer.environments import Adapted, layout_of, make_environment, scenario_of
+from trainer.human.guide import Action, Driver, Observation
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
+from trainer.person.coach import Coach, Episode
+from trainer.person.controls import Amount, amount, vector
 from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
-from trainer.person.recording import DISCARDED, Recorder, Step
+from trainer.person.recording import (
+    DISCARDED,
+    RESTARTED,
+    STOPPED,
+    Recorder,
+    Step,
+    layout_text,
+)
 from trainer.person.takeover import Applied, Intent, TakeOver
-from trainer.scenarios.environment import Action, Observation
-from trainer.scenarios.environment import Step as EnvironmentStep
+from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer drive --human keyboard --out runs/drives",
     "python -m trainer drive --policy runs/phil_1 --human wheel --profile my.toml \\\n"
     "    --out runs/drives",
-    "python -m trainer drive --human wheel --calibrate my.toml",
+    "python -m trainer drive --from drive.mcap --at 3s --human web --out runs/drives",
 )
-REST_S = 1.0
-"""Between two episodes: time to see how it ended, and to take the hands to rest."""
-STOPPED, RESTARTED = "stopped", "restarted"
-"""Outcomes of an episode that the person ended; or ``recording.DISCARDED``."""
+REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 LATE_S = 0.02
 """A period that begins later than this is counted: a fifth of it is about what a person feels."""
 
@@ -50,11 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
-    goal = parser.add_mutually_exclusive_group()
+    forked = "drive on in this recorded drive, again and again: its scene, and what was done in it"
+    add("--from", dest="recording", metavar="F.mcap", help=f"{forked} until --at")
+    add_place(parser)
     out = "the directory of the recordings; sittings add up there"
-    goal.add_argument("--out", metavar="REC_DIR", default="runs/drives", help=out)
-    ask = "instead of driving, ask for a wheel's or gamepad's axes and buttons, and write a profile"
-    goal.add_argument("--calibrate", metavar="F.toml", help=ask)
+    add("--out", metavar="REC_DIR", default="runs/drives", help=out)
     add("--episodes", type=positive, metavar="N", help="stop after so many (default: no end)")
     add_seed(parser, "the episodes, which are others in every sitting")
     add_person(parser)
@@ -63,15 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits; returns the exit status."""
-    if arguments.calibrate is not None:
-        if arguments.human not in ("gamepad", "wheel"):
-            raise UserError("--calibrate asks a --human gamepad or wheel")
-        from trainer.person.profile import calibrate
-
-        calibrate(arguments.human, Path(arguments.calibrate))
-        return 0
     set_threads(arguments.threads)
-    env = make_environment(arguments.scenario)
+    env, seed_of = _environment(arguments)
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
@@ -79,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         recorder = Recorder(Path(arguments.out))
         made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         with closing(made) as sitting, quit_on_signals(sitting.quit):
-            outcomes = drive(sitting, policy, arguments.seed, arguments.episodes)
+            outcomes = drive(sitting, policy, seed_of, arguments.episodes)
     print(
         f"episodes: {_listed(outcomes) or 'none'}; {counted(recorder.index, 'step')}, "
         f"{sitting.human_steps} of them yours in "
@@ -91,13 +96,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+SeedOf = Callable[[int], int]  # Of an episode, given its number over all sittings
+
+
+def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
+    """What is driven: episodes that are others in every sitting, or one recorded drive's."""
+    if asked.recording is None:
+        if asked.at or asked.episode is not None or asked.vehicle_id:
+            raise UserError("--at, --episode and --vehicle-id are of a recording: --from F.mcap")
+        seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
+        return make_environment(asked.scenario), seed_of
+    recorded, step = find_fork(asked.recording, asked)
+    own = recorded.environment(asked.scenario if ":" in asked.scenario else None)
+    name = scenario_of(recorded.origin.environment)
+    is_ours = name in SCENARIOS
+    env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
+    return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed
+
+
 def drive(
-    sitting: Sitting, policy: Driver | None, run_seed: int, episodes: int | None
+    sitting: Sitting, policy: Driver | None, seed_of: SeedOf, episodes: int | None
 ) -> Counter[str]:
     """Drive until the person quits, or so many episodes (None: no end).
 
-    The policy drives until the person takes over; without one, the person drives alone. The seed
-    decides the episodes, which are others in every sitting.
+    The policy drives until the person takes over; without one, the person drives alone.
 
     Returns:
         How often an episode ended how.
@@ -105,7 +127,7 @@ def drive(
     outcomes = Counter[str]()
     number = sitting.recorder.sitting
     while not sitting.stop and outcomes.total() != episodes:
-        seed = episode_seed(run_seed, Purpose.SITTINGS, (number << 32) + sitting.episode)
+        seed = seed_of((number << 32) + sitting.episode)
         try:
             observation, _ = sitting.reset(seed)
         except SittingOver:
@@ -114,9 +136,9 @@ def drive(
             policy.reset()
         ended = False
         while not ended:
-            policy_action = None if policy is None else float(policy.act(observation)[0])
+            policy_action = None if policy is None else amount(policy.act(observation))
             applied = sitting.decide(observation, policy_action)
-            action = np.array([applied.action], np.float32)
+            action = vector(applied.action)
             observation, _, terminated, truncated, info = sitting.step(action)
             ended = terminated or truncated
         outcomes[sitting.rest(info["outcome"])] += 1
@@ -146,21 +168,28 @@ class Sitting:
     ) -> None:
         self.env = env
         self.person, self.recorder, self.alone = person, recorder, alone
-        self.pacer = Pacer(env.config.control_period_s / speed)
-        self.stop = False
-        """The sitting is to end: asked for by the person, or by a signal."""
+        self.pacer = Pacer(env.control_period_s / speed)
+        self.stop = False  # The sitting is to end: asked for by the person, or by a signal
         self.closed = False
-        self.episode = 0
-        """The number of the episode, or of the next one; the loop counts."""
+        self.episode = 0  # The number of the episode, or of the next one; the loop counts
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = self.discarded = 0
         """The last counts what the others leave out."""
+        self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
+        """What the person has given so far, seconds of simulated time, in discarded episodes, too,
+        and the episodes that missed the goal. A run that goes on adds what it had."""
+        self.coach = Coach()
+        self._taken_over_at = math.nan
+        """The step at which the last take-over began."""
         self._paused = False
         self._last_step: Step | None = None
         """Of an episode that has ended, until it is known whether the person discards it."""
         self._frames: Observation | None = None
         """What the policy sees; None before the first episode, when there is nothing to show."""
-        self._policy_action: float | None = None
+        self._policy_action: Amount | None = None
+        self._layout = layout_of(env)
+        self._rest = amount(env.rest_action)
+        self._info: dict[str, Any] = {}
         self._forget(0)
 
     def __getattr__(self, name: str) -> Any:
@@ -168,7 +197,7 @@ class Sitting:
 
     def reset(self, seed: int) -> tuple[Observation, dict[str, Any]]:
         """Start an episode as soon as the person is there; SittingOver where the person quits."""
-        self._frames, info = self.env.reset(seed=seed)
+        self._frames, self._info = self.env.reset(seed=seed)
         self._forget(seed)
         while not self.person.present and not self.stop:
             self._idle("waiting for the person's device")
@@ -176,12 +205,12 @@ class Sitting:
             raise SittingOver
         self._restart = self._discard = False
         self.pacer.restart()
-        return self._frames, info
+        return self._frames, self._info
 
-    def decide(self, observation: Observation, policy_action: float | None) -> Applied:
+    def decide(self, observation: Observation, policy_action: Amount | None) -> Applied:
         """Show what is, wait for the control period, and ask the hands as late as possible.
 
-        ``policy_action`` is what the policy would do about the observation uint8 [2, 45, 80], in
+        ``policy_action`` is what the policy would do about the observation, in
         [-1, 1]; None where the person drives alone.
         """
         self._frames, self._policy_action = observation, policy_action
@@ -200,25 +229,28 @@ class Sitting:
             first = self._number == 0 or not self._applied.human
             self._applied = Applied(self._reading.action, "human", True, first)
         else:  # The car rolls, and that demonstrates nothing.
-            self._applied = Applied(0.0, "policy", False, False)
+            self._applied = Applied(self._rest, "policy", False, False)
         return self._applied
 
-    def step(self, action: Action) -> EnvironmentStep:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period; it is recorded. The person may end the episode after it."""
         assert self._frames is not None
+        now = self._now()
         observation, reward, terminated, truncated, info = self.env.step(action)
+        self._info = info
         if self._to_end and not (terminated or truncated):
             truncated = True
             info = {**info, "outcome": STOPPED if self.stop else RESTARTED}
         applied = self._applied
         step = Step(
-            **self._now(),
+            **now,
+            layout=layout_text(self._layout),
             sitting=self.recorder.sitting,
             index=self.recorder.index,
             seed=self._seed,
             time_ns=self._read_ns,
             frames=self._frames.tobytes(),
-            next_frame=observation[1].tobytes(),
+            next_frame=(observation[1] if self._layout.stacked else observation).tobytes(),
             action=applied.action,
             human=applied.human,
             first=applied.first,
@@ -233,17 +265,23 @@ class Sitting:
             self.recorder.write(step)
         self._human_steps += applied.human
         self._interventions += applied.first
+        if applied.first:
+            self._taken_over_at = self._number
+        self.cost["human_s"] += applied.human * self.env.control_period_s
+        self.cost["takeovers"] += applied.first
         self._number += 1
         return observation, reward, terminated, truncated, info
 
     def rest(self, outcome: str) -> str:
         """Show how the episode ended, which the person may still discard; how it really ended."""
-        end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
+        end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.control_period_s
         while not self.stop and time.monotonic() < end_s:
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
             if self._discard:
                 self._write_last_step()  # At once: no kill shall take that back.
         self._write_last_step()
+        self.cost["failures"] += failed(outcome)
+        self._tell_coach(DISCARDED if self._discard else outcome)
         if self._discard:
             self.discarded += 1
             return DISCARDED
@@ -256,16 +294,20 @@ class Sitting:
         """Show what is, and a line on what is going on besides driving."""
         if self._frames is None or self.closed:
             return
+        scene = self.env.scene()
         view = View(
             **self._now(),
-            scene=self.env.scene(),
-            frames=self._frames,
+            scene=scene,
+            picture=self.env.render() if scene is None else None,
+            frames=self._frames if self._layout.stacked else None,
             applied_action=self._applied.action,
-            distance_m=float(self.env.distance_m),
-            goal_m=float(self.env.config.goal_m),
+            distance_m=float(self._info["distance_m"]),
+            goal_m=float(self.env.goal_m),
             late_ticks=self.pacer.late,
             paused=self._paused,
             progress=self.progress,
+            cost=dict(self.cost),
+            coach=self.coach.show(self.cost),
             message=message,
             help=self.person.help,
         )
@@ -277,12 +319,21 @@ class Sitting:
             "scenario": self.env.scenario,
             "episode": self.episode,
             "step": self._number,
-            "time_s": self._number * self.env.config.control_period_s,
+            "time_s": self._number * self.env.control_period_s,
             "policy_action": self._policy_action,
             "human_action": self._reading.action,
             "control": self._applied.control,
-            "speed_mps": float(self.env.ego.speed),
+            "speed_mps": float(self._info["speed_mps"]),
         }
+
+    def _tell_coach(self, outcome: str) -> None:
+        """Tell how the episode ended."""
+        period_s = self.env.control_period_s
+        driven_s, since_s = (
+            steps * period_s for steps in (self._human_steps, self._number - self._taken_over_at)
+        )
+        episode = Episode(self.episode, outcome, driven_s, self._interventions, since_s)
+        self.coach.episodes.append(episode)
 
     def quit(self) -> bool:
         """Ask for the end of the sitting; False where it is over already."""
@@ -311,17 +362,20 @@ class Sitting:
     def _forget(self, seed: int) -> None:
         """Nothing of an episode has happened yet."""
         self._seed, self._number = seed, 0
-        self._take_over, self._intent = TakeOver(), Intent(self.person.moving)
+        self._take_over, self._intent = TakeOver(), Intent(self.person.moving, self._rest)
         self._reading, self._read_ns = LET_GO, 0
-        self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
+        self._applied = Applied(self._rest, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None
         self._human_steps = self._interventions = 0
+        self._taken_over_at = math.nan
         self._restart = self._discard = False
 
     def _read(self) -> None:
         """Ask the hands, and heed what they wish."""
         self._read_ns = time.time_ns()
         self._reading = self.person.poll(time.monotonic())
+        if np.size(self._reading.action) != np.size(self._rest):  # of hands that are off
+            self._reading = replace(self._reading, action=self._rest)
         wishes = self._reading.wishes
         self.stop |= "quit" in wishes
         self._restart |= "restart" in wishes
@@ -345,8 +399,7 @@ class Pacer:
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
-        self.late = 0
-        """Periods that began too late."""
+        self.late = 0  # Periods that began too late
         self.restart()
 
     def restart(self) -> None:

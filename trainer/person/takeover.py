@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
+from trainer.person.controls import Amount, amount, distance
 from trainer.person.interface import LET_GO, WISHES, Control, Moving, Reading, Wish
 
-SILENCE_S = 0.5
-"""A driver who is not heard for this long has let go."""
+SILENCE_S = 0.5  # A driver who is not heard for this long has let go
 MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
@@ -39,13 +40,11 @@ action moves by just that: the car never jumps at a hand-over, and feels it at o
 class Applied:
     """One control period's decision."""
 
-    action: float
-    """What the car is told, in [-1, 1]."""
+    action: Amount  # What the car is told, in [-1, 1]
     control: Control
     human: bool
     """Whether the step counts as the person's (mask Delta): all but the policy's own action."""
-    first: bool
-    """Whether an intervention begins here (eq. 17's intervention time)."""
+    first: bool  # Whether an intervention begins here (eq. 17's intervention time)
 
 
 class TakeOver:
@@ -53,17 +52,20 @@ class TakeOver:
 
     def __init__(self) -> None:
         self.state: State = "policy"
-        self._applied: float | None = None
+        self._applied: Amount | None = None
 
-    def step(self, policy_action: float, human_action: float, holds: bool) -> Applied:
+    def step(self, policy_action: Amount, human_action: Amount, holds: bool) -> Applied:
         """Decide one control period; ``holds``: whether the person wants control (``Intent``)."""
         goal = human_action if holds else policy_action
         # At an episode's start there is nothing to leave from but the policy's action.
         last = policy_action if self._applied is None else self._applied
         before = self.state
-        self.state = NEXT[before, holds][abs(goal - last) <= MAX_SLEW]
+        self.state = NEXT[before, holds][distance(goal, last) <= MAX_SLEW]
         handing_over = self.state in ("taking", "returning")
-        self._applied = last + min(max(goal - last, -MAX_SLEW), MAX_SLEW) if handing_over else goal
+        if handing_over:
+            change = np.clip(np.subtract(goal, last), -MAX_SLEW, MAX_SLEW)
+            goal = amount(np.add(last, change))
+        self._applied = goal
         control: Control = "human" if self.state == "taking" else self.state
         human = self.state != "policy"
         return Applied(self._applied, control, human, first=human and before == "policy")
@@ -72,14 +74,14 @@ class TakeOver:
 class Intent:
     """Whether the person wants control: holds something, or has moved the wheel."""
 
-    def __init__(self, moving: Moving) -> None:
-        self.moving = moving
+    def __init__(self, moving: Moving, rest: Amount = 0.0) -> None:
+        self.moving, self._rest = moving, rest
         self._moved = False
         self._resting_since_s: float | None = None
 
     def update(self, reading: Reading, now_s: float) -> bool:
         """Whether the person wants control, from the newest reading."""
-        away = abs(reading.action)
+        away = distance(reading.action, self._rest)
         if not reading.by_moving:
             self._moved, self._resting_since_s = False, None
         elif away > self.moving.rest:
@@ -92,18 +94,20 @@ class Intent:
         return reading.engaged or self._moved
 
 
+Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+MOST_ACTIONS = 16
+
+
 class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a page says, at least every 100 ms; saying nothing is letting go."""
 
     at_ms: Annotated[float, msgspec.Meta(ge=0.0, le=1e15)]
     """The page's clock, sent back at once, so that the page knows the round trip."""
-    action: Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+    action: Share | Annotated[tuple[Share, ...], msgspec.Meta(max_length=MOST_ACTIONS)]
     engaged: bool
-    by_moving: bool = False
-    """Whether moving ``action`` takes over, too: a steering wheel."""
+    by_moving: bool = False  # Whether moving ``action`` takes over, too: a steering wheel
     wishes: Annotated[tuple[Wish, ...], msgspec.Meta(max_length=len(WISHES))] = ()
-    seen: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Number of the newest view that was drawn."""
+    seen: Annotated[int, msgspec.Meta(ge=0)] = 0  # Number of the newest view that was drawn
 
 
 class Seat:
@@ -114,7 +118,8 @@ class Seat:
     itself. The server's thread calls ``sit_down``, ``hear`` and ``get_up``, the loop's ``poll``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rest: Amount = 0.0) -> None:
+        self._rest = rest
         self._lock = threading.Lock()
         self._pages: list[object] = []
         self._wishes: set[Wish] = set()
@@ -156,7 +161,7 @@ class Seat:
             self._heard_s = now_s
             self._wishes |= set(said.wishes)
             # Nothing is held, and a wheel that takes over by moving is at rest.
-            resting = not said.by_moving or abs(said.action) <= Moving.rest
+            resting = not said.by_moving or distance(said.action, self._rest) <= Moving.rest
             self._hands_were_off |= resting and not said.engaged
             if not self._hands_were_off:
                 return False

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import errno
 import hmac
+import io
 import logging
 import secrets
 import socket
@@ -24,32 +25,33 @@ from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
+import segno
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
+from PIL import Image
 
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
-from trainer.person.interface import KEY_HELP, WISH_HELP, Moving, Reading, View
+from trainer.person.controls import controls_of, distance
+from trainer.person.interface import WISH_HELP, Moving, Reading, View
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
 TOKEN_BYTES = 16
-MAX_INPUT_BYTES = 1024
-"""A page's message is not longer; the longest honest one is a fifth of this."""
-KEEP_ALIVE_S = 10.0
-"""How long a connection stays open for another request."""
+MAX_INPUT_BYTES = 1024  # A page's message is not longer; the longest honest one is a fifth of this
+KEEP_ALIVE_S = 10.0  # How long a connection stays open for another request
 LOGGER = logging.getLogger(__name__)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-GONE_S = 2.0
-"""A page that is not heard for this long is disconnected, and the next one may drive."""
-CLOSING_S = 0.5
-"""How long a page may take to say good-bye."""
+EVERYWHERE = ("0.0.0.0", "::")
+SOMEWHERE = ("192.0.2.1", 9)  # RFC 5737: no machine has this address
+GONE_S = 2.0  # A page that is not heard for this long is disconnected, and the next one may drive
+CLOSING_S = 0.5  # How long a page may take to say good-bye
 VIEWS_UNDERWAY = 2
 """Views sent before the page says that it has drawn one: a slow page gets fewer, never old ones."""
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
@@ -57,10 +59,8 @@ HEADERS = {
 NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
 NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
-MAX_CONNECTIONS = 32
-"""A page opens some six for its files, and keeps one."""
-HEADERS_S = 5.0
-"""A connection must show the token within this time."""
+MAX_CONNECTIONS = 32  # A page opens some six for its files, and keeps one
+HEADERS_S = 5.0  # A connection must show the token within this time
 BACKLOG = 16
 """Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 INPUT = msgspec.json.Decoder(Input)
@@ -87,6 +87,10 @@ def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
             file=sys.stderr,
         )
     print(f"cockpit: open {cockpit.url}", flush=True)
+    if cockpit.phone_url:
+        print(f"on a phone in this network: {cockpit.phone_url}", flush=True)
+        if sys.stdout.isatty():
+            segno.make(cockpit.phone_url).terminal(compact=True)
     return cockpit
 
 
@@ -95,10 +99,8 @@ class Page:
     """One open page."""
 
     socket: web.WebSocketResponse
-    sent: int = 0
-    """Number of the newest view sent."""
-    seen: int = 0
-    """Number of the newest view that it has drawn."""
+    sent: int = 0  # Number of the newest view sent
+    seen: int = 0  # Number of the newest view that it has drawn
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     """There is a newer view, or room for one."""
 
@@ -114,21 +116,22 @@ class Cockpit:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
         hint = "or slide on the pad, or use a gamepad or wheel"
-        self.help: tuple[str, ...] = (KEY_HELP[scenario], hint, WISH_HELP)
-        self.seat = Seat()
+        self.controls = controls_of(scenario)
+        self.help: tuple[str, ...] = (self.controls.help, hint, WISH_HELP)
+        self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
         # By this name a browser elsewhere finds the cockpit.
-        name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        name = socket.gethostname() if host in EVERYWHERE else host
         self._names = {*LOOPBACK, host.lower(), name.lower()}
-        shown = f"[{name}]" if ":" in name else name
-        self.url = f"http://{shown}:{self.port}/{self._token}/"
+        self.url = self._url_of(name)
+        self.phone_url = None if host in LOOPBACK else self._url_of(lan_address(host))
+        """For another machine in this network; None where the cockpit listens on loopback."""
         self._pages: list[Page] = []
-        self._files = _page_files()
+        self._files = _page_files(self.phone_url)
         self._shown = 0
-        self._newest = (0, "")
-        """The newest view's number and message; pages get it when they can."""
+        self._newest = (0, "")  # The newest view's number and message; pages get it when they can
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._serve, name="cockpit", daemon=True)
@@ -152,6 +155,10 @@ class Cockpit:
         """Tell the pages that it is over, and end the thread."""
         self._tell(self._closing.set)
         self._thread.join(4 * CLOSING_S)
+
+    def _url_of(self, name: str) -> str:
+        shown = f"[{name}]" if ":" in name else name
+        return f"http://{shown}:{self.port}/{self._token}/"
 
     def _tell(self, function: Callable[..., object], *arguments: object) -> None:
         """Call something in the server's thread; nothing once that is closed."""
@@ -247,7 +254,8 @@ class Cockpit:
                 return WSCloseCode.UNSUPPORTED_DATA
             try:
                 said = INPUT.decode(message.data)
-            except msgspec.MsgspecError:
+                distance(said.action, self.controls.rest)
+            except (msgspec.MsgspecError, ValueError):  # or as many numbers as it has not
                 return WSCloseCode.POLICY_VIOLATION
             counts = self.seat.hear(page, said, time.monotonic())
             page.seen = min(max(page.seen, said.seen), page.sent)
@@ -293,10 +301,16 @@ def _encode(kind: str, **fields: Any) -> str:
 def encode_view(view: View, number: int, shown_s: float) -> str:
     """View ``number``, from 1, which the loop gave at ``shown_s`` (``time.monotonic``).
 
-    ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show.
+    ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show; ``picture`` is
+    base64 of a JPEG.
     """
-    left_m, top_m = view.scene.get("view", VIEW)
-    fields = vars(view) | {"frames": view.frames.tobytes()}
+    left_m, top_m = (view.scene or {}).get("view", VIEW)
+    frames = None if view.frames is None else view.frames.tobytes()
+    fields = vars(view) | {"frames": frames, "controls": controls_of(view.scenario)}
+    if view.picture is not None:
+        jpeg = io.BytesIO()
+        Image.fromarray(view.picture).save(jpeg, "JPEG")
+        fields["picture"] = jpeg.getvalue()
     ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
     return _encode("view", number=number, shown_s=shown_s, ground=ground, **fields)
 
@@ -307,9 +321,30 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
     await socket.close(code=WSCloseCode.GOING_AWAY, message=b"over")
 
 
-def _page_files() -> dict[str, bytes]:
+def lan_address(host: str) -> str:
+    """The address by which others in this network find a server that listens on ``host``.
+
+    With several networks it is that of the way to the internet; nothing is sent.
+    """
+    if host not in EVERYWHERE:
+        return host
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(SOMEWHERE)
+        return str(probe.getsockname()[0])
+    return socket.gethostname()  # There is no such way.
+
+
+def _page_files(phone_url: str | None) -> dict[str, bytes]:
     found = {path.name: path.read_bytes() for path in (Path(__file__).parent / "page").glob("*.*")}
     colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
+    if phone_url:
+        picture = segno.make(phone_url).svg_data_uri(scale=4)
+        found["index.html"] = found["index.html"].replace(
+            b"<!-- phone -->",
+            f'<details id="phone"><summary>On a phone in this network</summary>'
+            f'<img alt="the address as a QR code" src="{picture}" /><code>{phone_url}</code>'
+            "</details>".encode(),
+        )
     return {**found, "colours.css": f":root {{ {colours}}}".encode()}
 
 

@@ -4,6 +4,8 @@ from gymnasium.envs.registration import register, registry
 
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario name on the command line -> gymnasium id."""
+LEFT_TURN, CONGESTION = SCENARIOS.values()
+"""What the entry points of the group ``phil.scenarios`` name."""
 _CLASSES = {
     "phil/LeftTurn-v0": "trainer.scenarios.left_turn:LeftTurnEnv",
     "phil/Congestion-v0": "trainer.scenarios.congestion:CongestionEnv",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,28 +43,23 @@ class CongestionConfig(ScenarioConfig):
     """Every number of the scenario, with its reason."""
 
     scaled = "steer_weight"
-    max_steps: int = 300
-    """At 4 m/s the goal takes 200."""
+    max_steps: int = 300  # At 4 m/s the goal takes 200
     lane_width_m: float = 3.5
     goal_m: float = 80.0
     lambda_rad: float = 0.15
     """Front-wheel angle at full action: eq. 29's 5 lambda pi. With 5 pi rad of steering wheel for
     the front wheels' 45 degrees, lambda is 0.19. At 5 m/s the heading then changes by at most
     0.015 rad a step: enough to save a car 2 s before it touches its neighbour."""
-    start_offset_m: Range = (-0.3, 0.3)
-    """The ego car's place in its lane at the start."""
+    start_offset_m: Range = (-0.3, 0.3)  # The ego car's place in its lane at the start
     start_heading_rad: Range = (-0.05, 0.05)
     """Its heading: at the edges of this range the wheels held straight lead 4 m aside."""
-    ego_speed_mps: Range = (4.0, 6.0)
-    """Initial speed of the ego car."""
+    ego_speed_mps: Range = (4.0, 6.0)  # Initial speed of the ego car
     desired_speed_mps: float = 6.0
     """Target of the IDM on the ego car's pedals (section VI-A), and of the cars behind others."""
     brake_mps2: float = 4.0
     """Deceleration of the ego car at most; what the brake of a safe stop does."""
-    traffic_speed_mps: Range = (4.0, 6.0)
-    """Initial speeds of traffic (section VI-A)."""
-    jam_speed_mps: Range = (4.5, 5.5)
-    """Speed of the whole jam, and ..."""
+    traffic_speed_mps: Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
+    jam_speed_mps: Range = (4.5, 5.5)  # Speed of the whole jam, and ...
     lane_speed_mps: Range = (-0.5, 0.5)
     """... what each lane's first car is faster. Lanes that drifted apart at 2 m/s would leave the
     ego car alone before half of the way."""
@@ -75,12 +71,9 @@ class CongestionConfig(ScenarioConfig):
     traffic_mix: Mix = CARS_ONLY
     side_front_m: Range = (9.0, 13.0)
     """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
-    gap_m: Range = (3.5, 5.5)
-    """Between bumpers in a lane, at the start."""
-    ahead_gap_m: Range = (4.0, 9.0)
-    """From the ego car to the one ahead of it."""
-    time_gap_factor: float = 0.5
-    """Share of a vehicle's usual time gap that is kept in the jam."""
+    gap_m: Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
+    ahead_gap_m: Range = (4.0, 9.0)  # From the ego car to the one ahead of it
+    time_gap_factor: float = 0.5  # Share of a vehicle's usual time gap that is kept in the jam
     lane_offset_m: Range = (-0.2, 0.2)
     """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
     ego car in mid-lane, in the variant 1.1 m."""
@@ -119,10 +112,8 @@ SCENES: dict[Scene, CongestionConfig] = {
     ),
 }
 LANES = 3
-EGO_LANE = 1
-"""The middle one, y = 0; lane 0 is to its left."""
-REACH_M = 200.0
-"""How far the road goes on before start and goal."""
+EGO_LANE = 1  # The middle one, y = 0; lane 0 is to its left
+REACH_M = 200.0  # How far the road goes on before start and goal
 
 
 def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
@@ -194,6 +185,11 @@ class CongestionEnv(DrivingEnv):
 
     scenario = "congestion"
     action_names = ("steering",)
+    action_meanings = ("positive turns right, negative left (eq. 29)",)
+    action_units = (f"share of the front wheels' {CongestionConfig().lambda_rad:g} rad",)
+    keys = MappingProxyType({"left": (-1.0,), "a": (-1.0,), "right": (1.0,), "d": (1.0,)})
+    key_rate_per_s = 2.5  # A tap turns the wheel a little.
+    biased_action = 0.5  # Half of the full angle.
     config: CongestionConfig
 
     def __init__(
@@ -211,6 +207,24 @@ class CongestionEnv(DrivingEnv):
             -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]
         )
         self._steering = 0.0
+
+    def expert(self) -> Any:
+        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
+        from trainer.human.congestion import CongestionHuman  # which imports this module
+
+        return CongestionHuman(self)
+
+    @property
+    def car(self) -> dict[str, float]:
+        """Its throttle is the IDM's, which no action reaches; the action +1 turns right."""
+        c = self.config
+        return {
+            "throttle_mps2": CAR.acceleration_mps2,
+            "brake_mps2": c.brake_mps2,
+            "max_speed_mps": c.desired_speed_mps,
+            "full_steering_rad": -c.lambda_rad,
+            "wheelbase_m": EgoVehicle.LENGTH,
+        }
 
     @property
     def brake_action(self) -> Action:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -30,16 +31,12 @@ FAILURES = ("collision", "off_road")
 class ScenarioConfig:
     """The numbers that every scenario has."""
 
-    control_period_s: float = 0.1
-    """Control interval of all vehicles (section VI-A)."""
-    max_steps: int = 200
-    """Steps until the episode is cut off as a timeout."""
-    goal_m: float = 0.0
-    """Distance from start to goal."""
+    control_period_s: float = 0.1  # Control interval of all vehicles (section VI-A)
+    max_steps: int = 200  # Steps until the episode is cut off as a timeout
+    goal_m: float = 0.0  # Distance from start to goal
     goal_reward: float = 10.0
     fail_reward: float = -10.0
-    scaled: ClassVar[str]
-    """The field that scales the third term of the reward."""
+    scaled: ClassVar[str]  # The field that scales the third term of the reward
 
     def with_printed_reward(self) -> Self:
         """The same with eq. 31 or 32 as it is printed, but for the latter's sign."""
@@ -106,7 +103,16 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
     scenario: str
+    observation_name = "frames"
+    observation_meanings: ClassVar = {"frames": "grey pictures from above, [t-1, t]"}
     action_names: tuple[str, ...]
+    action_meanings: tuple[str, ...]
+    action_units: tuple[str, ...]
+    action_range = (np.full(1, -1.0, np.float32), np.full(1, 1.0, np.float32))
+    rest_action = np.zeros(1, np.float32)  # Hands off
+    keys: Mapping[str, tuple[float, ...]]  # Key -> the action while a person holds it
+    key_rate_per_s: float  # How quickly a key presses
+    biased_action: float  # What a human of biased guidance does whenever wrong
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]
@@ -121,6 +127,20 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.steps = 0
         self.distance_m = 0.0
 
+    @property
+    def control_period_s(self) -> float:
+        """T, seconds."""
+        return self.config.control_period_s
+
+    @property
+    def goal_m(self) -> float:
+        """Distance from start to goal."""
+        return self.config.goal_m
+
+    def expert(self) -> Any:
+        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
+        raise NotImplementedError
+
     def render(self) -> NDArray[np.uint8]:
         """The scene from above for a person, uint8 [height, width, 3]."""
         return draw_scene(self.scene(), self.frames, self._caption())
@@ -129,6 +149,11 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     def view_corner_m(self) -> tuple[float, float]:
         """Where on the ground the upper left corner of the policy's picture is, metres."""
         return self.rasteriser.left_m, self.rasteriser.top_m
+
+    @property
+    def car(self) -> dict[str, float]:
+        """What a robot needs in the car's place: the fields of ``edge_runtime.manifest.Car``."""
+        raise NotImplementedError
 
     def scene(self) -> dict[str, Any]:
         """What a viewer needs to draw the scene; plain lists and numbers."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,8 +35,7 @@ from trainer.scenarios.traffic import (
     queue,
 )
 
-LANE_REACH_M = 100.0
-"""How far the main road goes on to either side."""
+LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
 NEAR_LANE: LaneIndex = ("west", "east", 0)
 """The lane of the main road that the ego car must cross; the other one it joins."""
@@ -169,20 +169,15 @@ class LeftTurnConfig(ScenarioConfig):
 
     scaled = "speed_weight"
     lane_width_m: float = 4.0
-    straight_m: float = 10.0
-    """Path on the side road before the turn."""
+    straight_m: float = 10.0  # Path on the side road before the turn
     turn_radius_m: float = 6.0
-    goal_m: float = 21.0
-    """Path length from start to goal."""
+    goal_m: float = 21.0  # Path length from start to goal
     stop_line_m: float = 6.0
     """Where a waiting car stands; its nose is then 1.5 m short of the main road."""
-    ego_speed_mps: Range = (3.0, 5.0)
-    """Initial speed of the ego car."""
+    ego_speed_mps: Range = (3.0, 5.0)  # Initial speed of the ego car
     max_speed_mps: float = 6.0
-    throttle_mps2: float = 3.0
-    """Acceleration at full pedal (+1)."""
-    brake_mps2: float = 4.0
-    """Deceleration at full brake (-1)."""
+    throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
+    brake_mps2: float = 4.0  # Deceleration at full brake (-1)
     traffic_cars: int = 3
     traffic_mix: Mix = CARS_ONLY
     traffic_speed_mps: Range = (4.0, 6.0)
@@ -191,12 +186,9 @@ class LeftTurnConfig(ScenarioConfig):
     """Distance of the first car before the middle of the crossing: too near to turn before it."""
     short_gap_m: Range = (10.0, 16.0)
     """A gap nobody can use, centre to centre (of cars; longer vehicles keep the room between)."""
-    long_gap_m: Range = (32.0, 42.0)
-    """A gap that a driver who is ready can use."""
-    long_gap_share: float = 0.5
-    """How often a gap is a long one."""
-    target_speed_mps: float = 5.0
-    """Target of the reward's speed term (eq. 31)."""
+    long_gap_m: Range = (32.0, 42.0)  # A gap that a driver who is ready can use
+    long_gap_share: float = 0.5  # How often a gap is a long one
+    target_speed_mps: float = 5.0  # Target of the reward's speed term (eq. 31).
     speed_weight: float = 0.02
     """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: seen from the stop
     line the goal, 30 steps off, is worth 10 x 0.95^30 = 2.1, a crash 15 steps off -4.6, waiting
@@ -229,6 +221,11 @@ class LeftTurnEnv(DrivingEnv):
 
     scenario = "left_turn"
     action_names = ("pedal",)
+    action_meanings = ("positive opens the throttle, negative brakes",)
+    action_units = ("aperture",)
+    keys = MappingProxyType({"up": (1.0,), "w": (1.0,), "down": (-1.0,), "s": (-1.0,)})
+    key_rate_per_s = 5.0  # A pedal is down in 0.2 s.
+    biased_action = 1.0  # Full throttle.
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
     """The action that stops the car: what a simulator applies when commands stop."""
@@ -255,6 +252,18 @@ class LeftTurnEnv(DrivingEnv):
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self._offset_m = 0.0
 
+    @property
+    def car(self) -> dict[str, float]:
+        """Its steering is where the path tracker ends: no action of the left turn steers."""
+        c = self.config
+        return {
+            "throttle_mps2": c.throttle_mps2,
+            "brake_mps2": c.brake_mps2,
+            "max_speed_mps": c.max_speed_mps,
+            "full_steering_rad": EgoVehicle.MAX_STEERING_RAD,
+            "wheelbase_m": EgoVehicle.LENGTH,
+        }
+
     def step(self, action: Action) -> Step:
         """Hold the pedal for one control interval."""
         c = self.config
@@ -266,6 +275,12 @@ class LeftTurnEnv(DrivingEnv):
         self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
+
+    def expert(self) -> Any:
+        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
+        from trainer.human.left_turn import LeftTurnHuman  # which imports this module
+
+        return LeftTurnHuman(self)
 
     def pedal_for_speed(self, speed_mps: float) -> float:
         """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.

@@ -51,14 +51,10 @@ class VehicleType:
     name: str
     length_m: float
     width_m: float
-    acceleration_mps2: float
-    """Comfortable acceleration (IDM's a)."""
-    deceleration_mps2: float
-    """Comfortable deceleration (IDM's b)."""
-    time_gap_s: float
-    """Time gap to the leader (IDM's T)."""
-    standstill_gap_m: float = 2.0
-    """Bumper to bumper at rest (IDM's s0)."""
+    acceleration_mps2: float  # Comfortable acceleration (IDM's a)
+    deceleration_mps2: float  # Comfortable deceleration (IDM's b)
+    time_gap_s: float  # Time gap to the leader (IDM's T)
+    standstill_gap_m: float = 2.0  # Bumper to bumper at rest (IDM's s0)
 
 
 CAR = VehicleType("car", 5.0, 2.0, 3.0, 5.0, 0.8)
@@ -70,8 +66,7 @@ VAN = VehicleType("van", 6.5, 2.16, 2.6, 4.5, 1.0)
 TRUCK = VehicleType("truck", 7.1, 2.4, 1.3, 4.0, 1.2)
 MOTORCYCLE = VehicleType("motorcycle", 2.2, 0.9, 6.0, 10.0, 0.6)
 
-Mix = tuple[tuple[VehicleType, float], ...]
-"""Vehicle types and their shares, which sum to 1."""
+Mix = tuple[tuple[VehicleType, float], ...]  # Vehicle types and their shares, which sum to 1
 CARS_ONLY: Mix = tuple((car, 0.2) for car in (BUBBLE_CAR, SMALL_CAR, COMPACT_CAR, CAR, LARGE_CAR))
 """Traffic of the nominal scenes."""
 MIXED: Mix = ((CAR, 0.4), (VAN, 0.2), (TRUCK, 0.2), (MOTORCYCLE, 0.2))
@@ -116,10 +111,8 @@ class TrafficVehicle(IDMVehicle):
     step, out of the loop. All lanes with traffic lead along x, so that a place is one number.
     """
 
-    DISTANCE_WANTED = 7.0
-    """Desired distance to the leader at rest, centre to centre, m."""
-    TIME_WANTED = 0.8
-    """Desired time gap, s."""
+    DISTANCE_WANTED = 7.0  # Desired distance to the leader at rest, centre to centre, m
+    TIME_WANTED = 0.8  # Desired time gap, s
 
     def __init__(
         self,

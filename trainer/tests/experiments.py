@@ -9,13 +9,15 @@ import numpy as np
 
 from bridge.report import COLLISION, GOAL
 from trainer.drivers import MODEL_FILE
-from trainer.evaluate import CONDITIONS
+from trainer.evaluation import CONDITIONS
 from trainer.experiments.data import Result, Results
 from trainer.experiments.plan import CONSTANT, FULL_PATH_M, HUMAN_MODEL, QUICK, SCENARIOS, Unit
 from trainer.experiments.run import Store
 from trainer.human.model import HumanModel, HumanModelConfig
 
-TINY = replace(QUICK, steps=dict.fromkeys(SCENARIOS, 290))
+TINY = replace(
+    QUICK, steps=dict.fromkeys(SCENARIOS, 290), learner={"batch_size": 4, "warmup_steps": 80}
+)
 UNIT = Unit("left_turn", "per_td3", "normal", 1)
 """No human guides it."""
 SKILLS = {

@@ -92,13 +92,25 @@ class ReferenceLearner:
                 )
             missed = c.intervention_penalty - q(first, frames, overruled).detach()
             errors = torch.where(penalised & (missed.abs() > errors.abs()), missed, errors)
+        if row.proxy_values:
+            for critic in self.critics.pair:
+                theirs, ours = q(critic, frames, actions), q(critic, frames, overruled)
+                critic_loss += (human * ((theirs - 1.0) ** 2 + (ours + 1.0) ** 2)).mean()
 
         scores = policy_score(self.actor, frames)
         own_actions, cloned, cloning = torch.tanh(scores), row.behaviour_cloning, torch.zeros(())
         own_values = q(first, frames, own_actions)
-        policy = equations.policy_loss(own_values, human, c.split_loss and cloned)
+        policy = equations.policy_loss(own_values, human, c.split_loss and cloned) * row.q_term
         if cloned:
             cloning = equations.behaviour_cloning_loss(own_actions, actions, human)
+        if row.foresight and batch.foreseen is not None:
+            names = ("next_frames", "actions", "overruled")
+            ahead, better, worse = (torch.from_numpy(getattr(batch.foreseen, n)) for n in names)
+            around = torch.distributions.Normal(
+                torch.tanh(policy_score(self.actor, ahead)), 0.5**0.5
+            )
+            odds = (around.log_prob(better) - around.log_prob(worse)).sum(dim=1)
+            policy = policy - torch.log(torch.sigmoid(c.preference_beta * odds)).mean()
         actor_loss = policy + c.cloning_weight * cloning
         actor_loss = actor_loss + c.saturation_weight * scores.square().mean()
 

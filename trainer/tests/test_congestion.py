@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from trainer.drivers import make_environment
-from trainer.human.congestion import CongestionExpert, CongestionTrigger
+from trainer.environments import make_environment
+from trainer.human.congestion import CongestionExpert, CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
 from trainer.scenarios.traffic import CAR
@@ -210,22 +210,22 @@ def test_the_expert_seeks_the_middle_of_the_gap():
 )
 def test_who_turns_or_is_aside_is_taken_over(side, offset_m, heading_rad, action, reason):
     expert = CongestionExpert(environment(side * offset_m, side * heading_rad, ALONE))
-    assert CongestionTrigger(expert).judge(side * action) == reason
+    assert CongestionHuman(expert.env).wants_control(side * action) == reason
 
 
 def test_who_will_touch_a_car_with_its_side_is_taken_over():
     for offset_m, action, reason in ((0.75, RIGHT, "collision"), (-0.75, STRAIGHT, None)):
         expert = CongestionExpert(environment(offset_m, 0.1))
-        assert CongestionTrigger(expert).judge(action) == reason
+        assert CongestionHuman(expert.env).wants_control(action) == reason
 
 
 @pytest.mark.parametrize("offset_m", [0.2, 0.45, 0.7])
 def test_on_the_way_back_to_the_middle_nobody_is_taken_over(offset_m):
     env = environment(offset_m, -0.08, replace(ALONE, ego_speed_mps=(6.0, 6.0)))
-    trigger = CongestionTrigger(CongestionExpert(env))
+    trigger = CongestionHuman(env)
     for _ in range(40):
-        action = trigger.expert.act(env.frames)
-        assert trigger.judge(action) is None
+        action = trigger.act(env.frames)
+        assert trigger.wants_control(action) is None
         env.step(action)
 
 
@@ -233,16 +233,16 @@ def test_on_the_way_back_to_the_middle_nobody_is_taken_over(offset_m):
 def test_every_crash_is_foreseen(limit, monkeypatch):
     """Also by a trigger that objects to nothing but cars that would be hit."""
     if limit:
-        monkeypatch.setattr(CongestionTrigger, "HEADING_RAD", limit)
-        monkeypatch.setattr(CongestionTrigger, "OFFSET_M", limit)
+        monkeypatch.setattr(CongestionHuman, "HEADING_RAD", limit)
+        monkeypatch.setattr(CongestionHuman, "OFFSET_M", limit)
     env, random = CongestionEnv(), np.random.default_rng(1)
-    trigger, crashes = CongestionTrigger(CongestionExpert(env)), 0
+    trigger, crashes = CongestionHuman(env), 0
     for seed in range(25):
         objected: list[bool] = []
 
         def judged(_, objected=objected):
             action = random.uniform(-1, 1, 1).astype(np.float32)
-            objected.append(trigger.judge(action) is not None)
+            objected.append(trigger.wants_control(action) is not None)
             return action
 
         _, info = drive(env, judged, seed)

@@ -32,6 +32,11 @@ TARGETS, VALUES = t(1.0, 3.0, 2.0, 1.0), t(1.0, 10.0, 3.0, 20.0)
         (eq.shaped_reward, (0.5, -10.0, False, False), 0.5),
         # ... or on the overruled action.
         (eq.overruled_loss, (t(-9, 5, -10, 5), PENALISED, -10.0, t(2, 1, 1, 1)), 2.0 * 1.0 / 4),
+        # Proxy values: 1 for the human's action, -1 for the overruled one, where a human acted.
+        (eq.proxy_value_loss, (t(9, 2, 9, 1), t(9, 1, 9, -1), HUMAN), (1.0 + 4.0 + 0.0 + 0.0) / 4),
+        # Preference: 0.75 nearer to the better action, and as near to both.
+        (eq.preference_loss, (t(0.5, 0)[:, None], t(1, 1)[:, None], t(-0.5, -1)[:, None], 2.0),
+         (math.log1p(math.exp(-2.0 * 0.75)) + math.log(2.0)) / 2),
         (eq.smoothed_target_action, (t(0, 0, 0.9, -0.9), t(2, -2, 0.3, -0.3), 0.5),
          [0.5, -0.5, 1.0, -1.0]),
         # Eq. 22: the smaller value, and none at terminals; several steps have a power of gamma.

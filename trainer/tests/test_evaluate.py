@@ -1,14 +1,17 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 
+from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import drivers
-from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver, make_environment
-from trainer.evaluate import drive_episodes, drive_together
+from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
+from trainer.environments import make_environment
+from trainer.evaluation import drive_episodes, drive_together
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 
@@ -44,6 +47,20 @@ def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it():
     driver.policy = driver.policy._replace(session=session)
     action = driver.act(np.zeros((2, 45, 80), np.uint8))
     assert (action.dtype, action.tolist()) == (np.float32, [1.0])
+
+
+def test_a_policy_file_changes_as_fast_as_the_edge_lets_it(monkeypatch):
+    policy = load_policy(POLICY, allow_unsigned=True)
+    (row,) = policy.manifest.action
+    slow = msgspec.structs.replace(row, slew_per_s=0.5)
+    manifest = msgspec.structs.replace(policy.manifest, action=[slow])
+    session = SimpleNamespace(run=lambda outputs, inputs: [np.ones((1, 1), np.float32)])
+    policy = policy._replace(manifest=manifest, session=session)
+    monkeypatch.setattr("edge_runtime.policy.load_policy", lambda *_, **__: policy)
+    driver, seen = OnnxDriver(POLICY), np.zeros((2, 45, 80), np.uint8)
+    for _ in range(2):
+        driver.reset()
+        np.testing.assert_allclose([driver.act(seen)[0] for _ in range(3)], [0.05, 0.1, 0.15])
 
 
 @pytest.mark.parametrize("action", ["0", "-1", "0.25"])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data
+from trainer.experiments.guidance import typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
@@ -67,6 +68,18 @@ class TestData:
         assert curve[1] == pytest.approx(values[(steps > 500) & (steps <= 1000)].mean())
         end = result.end(data.TRAINING, data.DISTANCE)
         assert end == pytest.approx(values[steps > 4500].mean())
+
+    def test_typical_curves_are_the_medians_of_the_seeds_that_a_human_guided(self, everything):
+        curves = typical_curves(everything, NORMAL)
+        assert set(curves) == {"left_turn", "congestion"}
+        assert not {"constant", "human_model"} & set(curves["left_turn"])
+        curve = curves["left_turn"]["phil_td3"]
+        found = everything.of("left_turn", claims.PHIL)
+        given, alone = zip(*curve["points"], strict=True)
+        assert (curve["seeds"], len(given)) == (SEEDS, 12)
+        assert given[-1] == pytest.approx(np.median([one.costs.human_s for one in found]), abs=0.1)
+        ends = [one.curve(data.ALONE, data.SUCCESS)[-1] for one in found]
+        assert alone[-1] == pytest.approx(np.median(ends), abs=1e-3)
 
     def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
         assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0
@@ -170,10 +183,17 @@ def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
     success = [0.4, 0.8, 1.0, *[1.0] * 6, 1.0, 0.9, 0.8]
     record["validation"].update(at_step=list(range(500, 6_001, 500)), success=success)
     outcomes = ["collision"] * 7 + ["goal"] * 3
-    record["training"].update(human_steps=[1200, 34], takeovers=[50, 6], outcome=outcomes)
+    record["training"].update(
+        human_steps=[1200, 34, *[0] * 8], takeovers=[50, 6, *[0] * 8], outcome=outcomes,
+        end_step=[600 * number for number in range(1, 11)],
+    )  # fmt: skip
     (row,) = [line for line in _cost(results) if line.startswith("| PHIL-TD3 |")]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    assert cells[1:] == ["left turn", "1,250", "1 of 1", "10.0", "10.0", "1,234", "56", "7"]
+    # The policy alone is at 80 % after 1,000 steps and above 98 after 1,500: the human has given
+    # both of the first two episodes by then, all that there is.
+    seconds = ["123 (1)", "123 (1)"]
+    costs = ["10.0", "10.0", "1,234", "56", "7"]
+    assert cells[1:] == ["left turn", "1,250", "1 of 1", *seconds, *costs]
 
 
 def test_the_report_is_made_of_the_records_alone(store):

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ import pytest
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
-from trainer.evaluate import CONDITIONS
+from trainer.evaluation import CONDITIONS
+from trainer.experiments import guidance
 from trainer.experiments import plan as planned
 from trainer.experiments import run as running
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
@@ -47,7 +49,9 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert record["computed"]["processor"]
     # It says what was trained: enough to train it again by hand.
     config = planned.run_config(UNIT, TINY, straight.humans).as_dict()
-    assert {**config, **record["config"]} == json.loads(json.dumps(config))
+    said = record["config"]
+    said = {**config, **said, "learner": {**config["learner"], **said["learner"]}}
+    assert said == json.loads(json.dumps(config))
     run_dir = straight.run_dir(UNIT)
     assert (run_dir / METRICS_FILE).is_file()
     assert (run_dir / BEST_FILE).is_file()
@@ -73,14 +77,18 @@ def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
-def test_two_processes_share_one_file_of_records(store):
-    """Each of three units is computed once, and no record is lost."""
+def test_two_processes_share_one_file_of_records_and_a_failure_is_one_units(store, capfd):
+    """Each of the others is computed once, and no record is lost."""
     write_human(store)
-    units = [UNIT, GUIDED, planned.Unit("left_turn", planned.HUMAN_MODEL, planned.NORMAL, 0)]
+    bad, alone = GUIDED._replace(scenario="congestion"), GUIDED._replace(seed=0)
+    write_human(store, bad.scenario).write_bytes(b"no human")
+    units = [bad, GUIDED, alone._replace(algorithm=planned.HUMAN_MODEL)]
     ends = running.run_units([running.Task(unit, store) for unit in units], 2)
-    assert ends == {running.FINISHED: 3}
-    assert list(store.records("left_turn")) == sorted(units)
-    assert set(store.find(units)[0]) == set(units)
+    assert ends == {running.FINISHED: 2, running.FAILED: 1}
+    assert list(store.records("left_turn")) == sorted(units[1:])
+    assert set(store.find(units)[0]) == set(units[1:])
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
+    assert str(bad) in line
 
 
 def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
@@ -100,13 +108,6 @@ def test_a_unit_is_not_trained_again_but_tests_that_change_are_driven_with_its_a
     assert ours["id"] != theirs["id"]
     assert ours["training"] == theirs["training"]
     assert {len(ours["tests"][condition]["outcome"]) for condition in CONDITIONS} == {5}
-
-
-def test_a_failure_is_one_units_failure(store, capfd):
-    write_human(store).write_bytes(b"no human")
-    assert running.run_units([running.Task(GUIDED, store)], 1) == {running.FAILED: 1}
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
-    assert str(GUIDED) in line
 
 
 def test_the_floor_is_searched_and_driven(store):
@@ -152,6 +153,11 @@ class TestIds:
         write_human(store, seed=2)
         ids.append(id_of())
         assert len(set(ids)) == len(ids)
+        # What came after the first records decides where it is used only.
+        later = set(planned.LATER)
+        for setting, names in (("normal", set()), ("late", {"late_from_s", "late_to_s"})):
+            found = planned.deciding(GUIDED._replace(setting=setting), TINY, store.humans)
+            assert later & {*found["config"], *found["switches"]} == names
         # Tests do not name the training.
         plans = (replace(TINY, test_runs=number) for number in (2, 9))
         assert len({planned.training_id(UNIT, each, tmp_path) for each in plans}) == 1
@@ -186,12 +192,46 @@ class TestPlan:
         write_human(store)
         units = {setting: GUIDED._replace(setting=setting) for setting in planned.SETTINGS}
         of = {name: planned.run_config(units[name], planned.PLAN, store.humans) for name in units}
-        assert {setting for _, setting, _ in planned.LINES} == set(planned.SETTINGS)
+        papers = {setting for _, setting, _ in planned.LINES}
+        assert (papers | set(planned.HUMANS), len(papers & set(planned.HUMANS))) == (set(of), 0)
         assert of["one_frame"].learner.frames == 1
         assert of["printed"].learner == PRINTED_LEARNER
         assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
         assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
         assert {each.steps for each in of.values()} == {planned.PLAN.steps["left_turn"]}
+
+    def test_the_table_of_guidance_has_every_row_with_every_human_and_none_of_the_papers(self):
+        units = planned.units_of([planned.GUIDANCE], 5)
+        assert len(set(units)) == len(units)
+        lines = {(unit.algorithm, unit.setting) for unit in units if unit.trained}
+        humans, rows = set(planned.HUMANS), set(planned.ROWS)
+        assert lines == {*product(rows - {"per_td3"}, humans), ("per_td3", "good")}
+        assert {unit.scenario for unit in units} == {*planned.SCENARIOS, *planned.FOREIGN}
+        assert not set(units) & set(planned.units_of(["all"], 5))
+        configs = {unit: planned.run_config(unit, planned.GUIDANCE_PLAN, Path("humans"))
+                   for unit in units if unit.trained}  # fmt: skip
+        for unit, config in configs.items():
+            paths = {"model": f"humans/{unit.scenario}"}
+            assert config.human == paths.get(unit.setting, unit.scripted_human)
+            row = ALGORITHMS[unit.algorithm].settings
+            assert {name: getattr(config.learner, name) for name in row} == row
+
+
+def test_a_foreign_task_is_learned_and_reported_beside_its_expert(tmp_path, one_thread):
+    units = [planned.Unit("hill", name, "good", seed)
+             for name, seed in (("expert", 0), ("pvp4real_td3", 1))]  # fmt: skip
+    store = store_in(tmp_path, planned.QUICK_GUIDANCE)
+    for unit in units:
+        assert running.compute(running.Task(unit, store)) == running.FINISHED
+    expert, learned = (store.find(units)[0][unit] for unit in units)
+    assert set(expert["tests"]["nominal"]["outcome"]) == {"goal"}
+    assert learned["totals"]["human_s"] == pytest.approx(
+        sum(learned["training"]["human_steps"]) / 30
+    )
+    page = guidance.write_guidance(store, 1).read_text()
+    assert (store.results / "guidance.png").stat().st_size > 1000
+    (row,) = [line for line in page.splitlines() if line.startswith("| PVP4Real-TD3 | hill | 1 |")]
+    assert f"| {learned['totals']['human_s']:.0f} |" in row
 
 
 UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]

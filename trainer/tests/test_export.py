@@ -8,9 +8,9 @@ import torch
 from deploy.certs import write_key_pair
 from edge_runtime.policy import load_policy, read_onnx
 from edge_runtime.util import UserError
-from trainer import export as export_module
-from trainer.export import Export, export_policy, parity, real_observations, write_policy
+from trainer import policy_file as export_module
 from trainer.learner.networks import Actor
+from trainer.policy_file import Export, export_policy, parity, real_observations, write_policy
 
 LABEL = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 4, "episode": 12}
 
@@ -48,10 +48,10 @@ def test_parity_is_measured_on_observations_that_differ_and_sees_a_difference(ex
     with torch.no_grad():
         assert changed(torch.from_numpy(observations)).std() > 0.01
     assert exported.max_difference < 1e-5
-    assert parity(changed, exported.model, observations) < 1e-5
+    assert parity(changed, exported.model, {"frames": observations}) < 1e-5
     with torch.no_grad():
         changed.head.output.bias.add_(0.01)
-    assert parity(changed, exported.model, observations[:20]) > 1e-3
+    assert parity(changed, exported.model, {"frames": observations[:20]}) > 1e-3
 
 
 def test_an_export_that_fails_parity_writes_nothing(monkeypatch):
@@ -63,7 +63,7 @@ def test_an_export_that_fails_parity_writes_nothing(monkeypatch):
 def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, tmp_path):
     private, public = write_key_pair(tmp_path / "keys")
     path = tmp_path / "policy.onnx"
-    write_policy(exported, path, private)
+    write_policy(exported.model, path, private)
     policy = load_policy(path, public_key=public)
     assert policy.manifest.training["seed"] == 4
     assert policy.manifest.training["config"] == {"gamma": 0.95}
@@ -71,23 +71,23 @@ def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, t
     for frames in real_observations("left_turn", 10):
         with torch.no_grad():
             wanted = make_actor()(torch.from_numpy(frames)[None])[0].numpy()
-        np.testing.assert_allclose(policy.act(frames), wanted, atol=1e-5)
+        np.testing.assert_allclose(policy.act({"frames": frames}), wanted, atol=1e-5)
     # An unsigned export removes the signature of an older file.
-    write_policy(exported, path, None)
+    write_policy(exported.model, path, None)
     assert not (tmp_path / "policy.onnx.sig").exists()
 
 
 def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
     path = tmp_path / "one.onnx"
-    write_policy(export_policy(make_actor(frames=1), LABEL, {}), path, None)
+    write_policy(export_policy(make_actor(frames=1), LABEL, {}).model, path, None)
     policy, frames = load_policy(path, allow_unsigned=True), real_observations("left_turn", 30)[-1]
     past = np.stack([np.zeros_like(frames[0]), frames[1]])
-    assert policy.act(frames) == policy.act(past)
+    assert policy.act({"frames": frames}) == policy.act({"frames": past})
 
 
 def test_a_wrong_key_leaves_no_file(exported, tmp_path):
     key = tmp_path / "wrong.key"
     key.write_text("not a key")
     with pytest.raises(UserError, match="not a private key"):
-        write_policy(exported, tmp_path / "policy.onnx", key)
+        write_policy(exported.model, tmp_path / "policy.onnx", key)
     assert not (tmp_path / "policy.onnx").exists()

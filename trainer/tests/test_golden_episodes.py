@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 
@@ -26,15 +26,15 @@ def random_driver(env, seed):
 
 
 def expert_driver(env, seed):
-    expert = EXPERTS[env.scenario](env)
+    expert = env.expert()
     while True:
         yield expert.act(env.frames), ""
 
 
 def guided_driver(env, seed):
     """A policy that drives on, then one that stands still, under the guide's eyes."""
-    expert = EXPERTS[env.scenario](env)
-    guide = HumanGuide(expert, TRIGGERS[env.scenario](expert))
+    expert = env.expert()
+    guide = HumanGuide(expert, env.expert())
     for action, _ in random_driver(env, seed):
         wanted = -np.abs(action) if seed % 2 else action
         taken = guide.watch(env.frames, wanted)

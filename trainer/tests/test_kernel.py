@@ -129,61 +129,60 @@ def test_other_pictures_take_the_torch_path():
     assert torch.equal(features, kernel._torch_features(_pictures(2), *parameters))
 
 
-_PROGRAM = """
-import torch
-from trainer.learner import kernel
-from trainer.learner.kernel import _torch_features, trunk_features
-frames = torch.randint(0, 256, (5, 2, 45, 80), dtype=torch.uint8)
-layers = torch.nn.Conv2d(2, 6, 6), torch.nn.Conv2d(6, 16, 6)
-parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
-right = _torch_features(frames, *parameters)
-wanted = torch.autograd.grad(right.square().sum(), parameters)
-for reduced in (False, True):
-    with torch.autocast("cpu", torch.bfloat16, enabled=reduced):
-        features = trunk_features(frames, *parameters)
-    torch.testing.assert_close(features, right, rtol=1e-4, atol=1e-5)
-    for gradient, true in zip(torch.autograd.grad(features.square().sum(), parameters), wanted):
-        assert (gradient - true).norm() < 1e-4 * true.norm()
-print("kernel" if kernel.load("trunk") else "torch")
-"""
+@pytest.fixture
+def anew(tmp_path, monkeypatch):
+    """Has this process look for its kernel once more: in another environment, with a new cache."""
 
+    def load(**environment):
+        settings = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PHIL_KERNEL": "1", **environment}
+        for name, value in settings.items():
+            monkeypatch.setenv(name, value)
+        forget()
+        return kernel.load("trunk")
 
-def _start(cache, reduced="False", **environment):
-    """Compares features and gradients with torch's own, and says which path was taken."""
-    settings = {**os.environ, "XDG_CACHE_HOME": str(cache), "PHIL_KERNEL": "1", **environment}
-    program = _PROGRAM.replace("(False, True)", f"(False, {reduced})")
-    command = [sys.executable, "-c", program]
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, env=settings, text=True, **pipes)
+    def forget():
+        kernel.load.cache_clear()
+        kernel._library.cache_clear()
 
-
-def _finish(process):
-    output, errors = process.communicate(timeout=200)
-    assert process.returncode == 0, errors
-    return output.strip(), errors
+    yield load
+    forget()
 
 
 @pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", None])
-def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, compiler):
-    cache = tmp_path / "cache"
+def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, anew, compiler, caplog):
     if compiler is None:
-        cache.write_text("in the way of a directory")
+        (tmp_path / "cache").write_text("in the way of a directory")
     environment = {"CXX": compiler} if compiler else {}
-    output, errors = _finish(_start(cache, **environment))
-    assert (output, len(errors.splitlines())) == ("torch", 1)
-    assert "several times slower" in errors
+    assert anew(**environment) is None
+    for _ in range(2):
+        _check(_pictures(5)[:, :2], _parameters(2))
+    (told,) = caplog.records
+    assert told.levelname == "WARNING"
+    assert "several times slower" in told.message
     assert list(tmp_path.rglob("*.so")) == []
     # It can also be turned off.
-    assert _finish(_start(cache, PHIL_KERNEL="0", **environment)) == ("torch", "")
+    assert anew(PHIL_KERNEL="0", **environment) is None
+    assert len(caplog.records) == 1
 
 
 @needs_kernel
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
 @pytest.mark.parametrize("flags", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
-def test_processors_with_shorter_vectors_compute_the_same(tmp_path, flags):
+def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
     """Also: without bfloat16 instructions, reduced precision is single precision."""
-    process = _start(tmp_path, "True", CXX=f"c++ {flags}")
-    assert _finish(process) == ("kernel", "")
+    assert anew(CXX=f"c++ {flags}") is not None
+    pictures, parameters = _pictures(5)[:, :2], _parameters(2)
+    _check(pictures, parameters)
+    single, reduced = (_gradients(pictures, parameters, _slopes(5), it) for it in (False, True))
+    assert all(map(torch.equal, (single[0], *single[1]), (reduced[0], *reduced[1])))
+    assert caplog.records == []
+
+
+_PROGRAM = """
+from trainer.tests import test_kernel as tests
+tests._check(tests._pictures(5)[:, :2], tests._parameters(2))
+print("kernel" if tests.kernel.load("trunk") else "torch")
+"""
 
 
 @pytest.mark.skipif(
@@ -191,8 +190,15 @@ def test_processors_with_shorter_vectors_compute_the_same(tmp_path, flags):
 )
 def test_two_processes_may_build_at_once(tmp_path):
     # Asks for a compiler only: a kernel that no longer compiles fails here, and is not skipped.
-    processes = [_start(tmp_path) for _ in range(2)]
-    assert [_finish(process) for process in processes] == [("kernel", "")] * 2
+    settings = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PHIL_KERNEL": "1"}
+    command, pipe = [sys.executable, "-c", _PROGRAM], subprocess.PIPE
+    processes = [
+        subprocess.Popen(command, env=settings, text=True, stdout=pipe, stderr=pipe)
+        for _ in range(2)
+    ]
+    for process in processes:
+        assert process.communicate(timeout=200) == ("kernel\n", "")
+        assert process.returncode == 0
     assert [path.suffix for path in (tmp_path / "phil-hil").iterdir()] == [".so"]
 
 

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from trainer.learner.config import PHIL, LearnerConfig
+from trainer.learner.config import ALGORITHMS, PHIL, LearnerConfig
 from trainer.learner.td3 import Losses
 from trainer.tests.test_run_loop import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
@@ -55,6 +55,23 @@ def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learn
     assert 1.0 < episode.policy_priority <= 2.0
     assert np.isnan(none).all()
     assert after.learning_s == after.waiting_s == 0.0
+
+
+def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back():
+    made: Any = LearningThread(SMALL, ALGORITHMS["rlpd_td3"], 1, 1)
+    made.start_episode(PICTURE)
+    for step in range(20):
+        made.add(np.zeros(1, np.float32), 0.0, PICTURE, False, step % 3 == 0)
+    made.learner.update = Mock(return_value=LOSSES)
+    made.replay.update_priorities = Mock()
+    made.begin(0.0)
+    made.finish()
+    made.close()
+    drawn = [call.args[0].indices.tolist() for call in made.learner.update.call_args_list]
+    assert len(drawn) == 2
+    assert drawn[0] != drawn[1]
+    written = made.replay.update_priorities.call_args_list
+    assert [call.args[0].tolist() for call in written] == drawn
 
 
 def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):

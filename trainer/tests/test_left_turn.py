@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from trainer.drivers import constant_driver, make_environment
+from trainer.drivers import constant_driver
+from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide
-from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
+from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnHuman, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL, NOTHING, drive, episode
 
@@ -103,7 +104,7 @@ def environment(**changes) -> LeftTurnEnv:
 
 def triggered(**changes):
     env = environment(**changes)
-    return env, LeftTurnTrigger(LeftTurnExpert(env))
+    return env, LeftTurnHuman(env)
 
 
 def test_foresight_agrees_with_what_then_happens():
@@ -130,16 +131,16 @@ def test_a_near_car_blocks_and_a_far_one_does_not_unless_it_is_long(first_car_m,
 
 def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
     (env, trigger), steps = triggered(first_car_m=(9.0, 9.0)), 0
-    while (reason := trigger.judge(NOTHING)) is None:
+    while (reason := trigger.wants_control(NOTHING)) is None:
         env.step(NOTHING)
         steps += 1
     assert steps > 1
     assert reason == "collision"
-    assert trigger.judge(BRAKE) is None
+    assert trigger.wants_control(BRAKE) is None
     for _ in range(20):
         env.step(BRAKE)
     assert env.ego.speed == 0.0
-    assert env.distance_m < LeftTurnTrigger.STOP_BY_M
+    assert env.distance_m < LeftTurnHuman.STOP_BY_M
 
 
 def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
@@ -148,8 +149,8 @@ def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
     env.ego.speed = 0.0
     for place_m, stays in ((7.8, None), (8.1, "collision")):
         env.distance_m = place_m
-        assert trigger.judge(BRAKE) == stays
-        assert trigger.judge(np.array([0.1], np.float32)) == "collision"
+        assert trigger.wants_control(BRAKE) == stays
+        assert trigger.wants_control(np.array([0.1], np.float32)) == "collision"
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
 def test_nobody_stops_in_the_lane_even_where_nothing_comes(place_m, speed_mps, pedal, reason):
     env, trigger = triggered(traffic_cars=0)
     env.distance_m, env.ego.speed = place_m, speed_mps
-    assert trigger.judge(np.array([pedal], np.float32)) == reason
+    assert trigger.wants_control(np.array([pedal], np.float32)) == reason
 
 
 def test_a_plan_may_end_in_a_stop():
@@ -194,16 +195,16 @@ def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
     expert = LeftTurnExpert(env)
     for seed in range(15):
-        guide = HumanGuide(expert, LeftTurnTrigger(expert))
+        guide = HumanGuide(expert, LeftTurnHuman(expert.env))
         _, info = drive(env, guided(guide, np.array([pedal], np.float32)), seed)
         assert info["outcome"] == "goal"
 
 
 def braking(env):
     """The trigger, and what it says of 40 steps under the brake."""
-    trigger, reasons = LeftTurnTrigger(LeftTurnExpert(env)), []
+    trigger, reasons = LeftTurnHuman(env), []
     for _ in range(40):
-        reasons.append(trigger.judge(BRAKE))
+        reasons.append(trigger.wants_control(BRAKE))
         env.step(BRAKE)
     return trigger, reasons
 
@@ -211,9 +212,9 @@ def braking(env):
 def test_trigger_takes_over_from_a_car_that_waits_for_nothing():
     trigger, reasons = braking(environment(traffic_cars=0))
     first = reasons.index("stuck")
-    assert first > LeftTurnTrigger.STANDING_STEPS + LeftTurnTrigger.OPEN_STEPS
+    assert first > LeftTurnHuman.STANDING_STEPS + LeftTurnHuman.OPEN_STEPS
     assert reasons == [None] * first + ["stuck"] * (40 - first)
-    assert trigger.judge(FULL) is None  # it starts by itself
+    assert trigger.wants_control(FULL) is None  # it starts by itself
 
 
 def test_waiting_for_traffic_is_not_stuck():

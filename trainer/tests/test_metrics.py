@@ -16,7 +16,8 @@ def write(run_dir, lines):
 
 
 def row(episode, names=NAMES, **changes):
-    values = {**dict.fromkeys(names, "1.5"), "episode": str(episode), "outcome": "goal", **changes}
+    known = {"episode": str(episode), "outcome": "goal", "human_steps": "3", "interventions": "1"}
+    values = {**dict.fromkeys(names, "1.5"), "total_steps": "75", **known, **changes}
     return ",".join(values[name] for name in names)
 
 
@@ -28,11 +29,15 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
 
 def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
-    writer = MetricsWriter(tmp_path, 2)
-    writer.add(EpisodeMetrics(2, distance_m=2.5, outcome="goal"))
+    writer = MetricsWriter(tmp_path, 2, period_s=0.2)
+    told = EpisodeMetrics(2, distance_m=2.5, outcome="timeout", human_steps=5, interventions=2)
+    writer.add(told)
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
     assert rows[2]["distance_m"] == "2.5"
+    # The totals go on from the rows before: 3 human steps and a take-over in each.
+    totals_so_far = told.total_human_s, told.total_takeovers, told.total_failures
+    assert totals_so_far == (pytest.approx(2 * 3 * 0.2 + 5 * 0.2), 2 * 1 + 2, 1)
     with Path("/dev/full").open("w") as writer._file:
         writer._csv = csv.DictWriter(writer._file, NAMES)
         with pytest.raises(UserError, match="No space left on device"):
@@ -83,9 +88,12 @@ def test_a_run_is_summed_up():
         "20 0 collision nan", "90 50 goal 0.5", "150 110 timeout 0.9", "210 170 collision 0.9",
         "280 240 goal 0.8",
     )]  # fmt: skip
-    assert totals(rows) == {
-        "episodes": 5, "steps": 280, "updates": 240, "human_steps": 15, "takeovers": 5,
+    assert totals(rows, 0.1) == {
+        "episodes": 5, "steps": 280, "updates": 240,
+        "human_steps": 15, "human_s": 1.5, "takeovers": 5,
         "failures": {"collision": 2, "timeout": 1},
         "validation": {"best": 0.9, "best_at_step": 150, "last": 0.8},
+        "until": {"0.9": {"steps": 150, "human_steps": 9, "human_s": 0.9, "takeovers": 3,
+                          "failures": {"collision": 1, "timeout": 1}}, "0.98": None},
     }  # fmt: skip
-    assert totals([]) == {}
+    assert totals([], 0.1) == {}

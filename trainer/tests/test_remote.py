@@ -5,10 +5,18 @@ import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
-from trainer.drivers import make_environment
-from trainer.evaluate import drive_episodes
+from trainer.environments import make_environment
+from trainer.evaluation import drive_episodes
 from trainer.tests.test_evaluate import brightness
-from trainer.training.delayed import DelayedPolicy, DirectPolicy, VehicleEnd, behind, ticks_late
+from trainer.training.delayed import (
+    UNDER_WAY,
+    DelayAware,
+    DelayedPolicy,
+    DirectPolicy,
+    VehicleEnd,
+    behind,
+    ticks_late,
+)
 
 
 def frames(step):
@@ -30,6 +38,7 @@ class Car:
     """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
 
     brake_action = np.array([-1.0], np.float32)
+    control_period_s = 0.1
     action_space = SimpleNamespace(shape=(1,))
 
 
@@ -43,7 +52,8 @@ class Kept:
     def start_episode(self, observation):
         self.current = observation
 
-    def add(self, action, reward, observation, *ends):
+    def add(self, action, reward, observation, *ends, overruled=None, foreseen=()):
+        self.foreseen = [number(each) for each in foreseen]
         seen = number(self.current), float(action[0]), reward, number(observation)
         self.rows.append((*seen, *ends))
         self.current = np.stack([self.current[1], observation[1]])
@@ -67,7 +77,7 @@ def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
 def test_a_perfect_network_is_none_to_the_bit(scenario):
     env = make_environment(scenario)
     for seed in (0, 1):
-        end = VehicleEnd(env, LatencySpec(), seed)
+        end = VehicleEnd(env, LatencySpec(), seed, frames(0))
         remote: Any = SimpleNamespace(
             reset=brightness.reset, act=lambda seen, end=end: end.tick(seen, brightness.act)
         )
@@ -94,10 +104,22 @@ def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer(
     assert [row for row in rows if row[5]] == [(2, pytest.approx(0.9), 4.0, 3, False, True)]
 
 
+def test_what_is_foreseen_is_seen_as_late_as_all_else():
+    kept: Any = Kept()
+    delayed = DelayedPolicy(kept, Car(), parse_spec("100ms"))
+    delayed.start(frames(0), 0)
+    for tick in range(6):
+        delayed.act(frames(tick), answer)
+        ahead = [frames(each) for each in range(tick, tick + 4)]
+        done = np.zeros(1, np.float32), 0.0, frames(tick + 1), False, True
+        delayed.store(*done, overruled=np.ones(1, np.float32), foreseen=ahead)
+    assert kept.foreseen == [3, 4, 5, 6]
+
+
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
 def test_every_tick_is_stored_with_what_was_carried_out(spec):
     rows, actions = drive_delayed(spec, 60, seed=1)
-    late = ticks_late(parse_spec(spec))
+    late = ticks_late(parse_spec(spec), Car.control_period_s)
     assert [row[0] for row in rows] == list(range(60 - late))
     assert all(row[3] == row[0] + 1 for row in rows)
     assert [row[1] for row in rows] == pytest.approx(actions[late:])
@@ -106,7 +128,7 @@ def test_every_tick_is_stored_with_what_was_carried_out(spec):
 
 
 def test_a_car_that_hears_nothing_brakes_by_itself():
-    end = VehicleEnd(Car(), parse_spec("up.loss=100%"), seed=0)
+    end = VehicleEnd(Car(), parse_spec("up.loss=100%"), 0, frames(0))
     braked = []
     for tick in range(4):
         end.tick(frames(tick), answer)
@@ -119,8 +141,8 @@ def test_a_car_that_hears_nothing_brakes_by_itself():
     [("none", 0), ("12ms", 0), ("12.5ms", 0), ("13ms", 1), ("100ms", 2), ("up.delay=0.3s", 3)],
 )
 def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
-    assert ticks_late(parse_spec(spec)) == ticks
-    end = VehicleEnd(Car(), parse_spec(spec), seed=0)
+    assert ticks_late(parse_spec(spec), Car.control_period_s) == ticks
+    end = VehicleEnd(Car(), parse_spec(spec), 0, frames(0))
     for tick in range(8):
         end.tick(frames(tick), answer)
     assert end.answered_step == 7 - ticks
@@ -130,3 +152,70 @@ def test_without_a_network_nothing_is_between():
     for spec, kind in (("none", DirectPolicy), ("1ms", DelayedPolicy)):
         between: Any = behind(parse_spec(spec), Kept(), Car())
         assert type(between) is kind
+
+
+class Told:
+    """Keeps what a policy that knows the delay is told, and what is stored of it."""
+
+    def __init__(self, spec):
+        self.env, self.spec = make_environment("left_turn"), parse_spec(spec)
+        self.aware = DelayAware(self.env, self.spec)
+        self.asked, self.stored, self.carried = [], [], []
+        self.delayed = DelayedPolicy(self, self.env, self.spec, self.aware)
+        self.delayed.start(frames(0), 0)
+
+    def start_episode(self, observation):
+        self.stored.append(observation)
+
+    def add(self, action, reward, observation, *ends):
+        self.stored.append(observation)
+
+    def act(self, seen):
+        self.asked.append(seen)
+        return answer(seen["observation"])
+
+    def drive(self, ticks, human=()):
+        for tick in range(ticks):
+            action = self.delayed.act(frames(tick), self.act)
+            action = np.array([0.9], np.float32) if tick in human else action
+            self.delayed.store(action, 0.0, frames(tick + 1), False, tick in human)
+            self.carried.append(float(action[0]))
+
+
+def told(observations):
+    """Tick and actions under way of observations, in hundredths."""
+    ticks = [number(seen["observation"]) for seen in observations]
+    return ticks, [np.round(100 * seen[UNDER_WAY]).astype(int).tolist() for seen in observations]
+
+
+def test_a_policy_that_knows_the_delay_sees_what_is_on_its_way_in_order():
+    driven = Told("100ms")
+    driven.drive(7)
+    assert driven.aware.ticks == 2
+    under_way = [[0, 0], [0, 0], [0, 1], [1, 2], [2, 3], [3, 4]]
+    assert told(driven.asked) == (list(range(6)), under_way)
+    assert told(driven.stored) == (list(range(6)), under_way)
+
+
+def test_what_a_human_did_instead_is_stored_as_what_was_on_its_way():
+    driven = Told("100ms")
+    driven.drive(7, human=(4,))
+    assert told(driven.asked)[1][4] == [2, 3]  # It plans on: nobody tells it of the human.
+    assert told(driven.stored)[1][3:] == [[1, 90], [90, 3], [3, 4]]
+
+
+@pytest.mark.parametrize("spec", ["up.delay=100ms,jitter=40ms", "60ms+-10ms", "0ms+-30ms"])
+def test_a_command_waits_until_all_are_as_old(spec):
+    driven, today = Told(spec), parse_spec(spec)
+    driven.drive(60)
+    late = driven.aware.ticks
+    assert late >= ticks_late(today, driven.env.control_period_s)
+    on_time = [np.isclose(done, n / 100) for n, done in enumerate(driven.carried[late:])]
+    assert np.mean(on_time) > 0.9  # Two deviations of the jitter are waited for.
+
+
+def test_it_sees_the_entries_of_any_environment():
+    aware = DelayAware(make_environment("parking-v0"), parse_spec("100ms"))
+    assert list(aware.space) == ["achieved_goal", "desired_goal", "observation", UNDER_WAY]
+    assert aware.layout.dtype.names == tuple(aware.space)
+    assert aware.space[UNDER_WAY].shape == aware.layout.dtype[UNDER_WAY].shape == (4,)

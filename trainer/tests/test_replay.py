@@ -132,6 +132,27 @@ def test_a_full_ring_keeps_the_newest_and_mixes_no_pictures(capacity, steps, lea
     assert drawn == set(list(source.stored)[-len(buffer) :])
 
 
+def test_what_is_foreseen_stands_beside_its_pair_and_is_restored():
+    buffer, copy = (ReplayBuffer(8, foresees=True) for _ in range(2))
+    buffer.start_episode(pair(0, 0))
+    for now in range(4):
+        ahead = [pair(max(now - 1, 0), now), pair(now, 100 + now), pair(100 + now, 200 + now)]
+        actions = np.array([[0.5 + now], [-0.5 - now]], np.float32)
+        human = now % 2 == 1
+        seen = ahead if human else []
+        buffer.add(actions[0], 1.0, pair(now, now + 1), False, human, actions[1], foreseen=seen)
+    copy.load_state_dict(buffer.state_dict())
+    for found in (sample(buffer).foreseen, sample(copy).foreseen):
+        assert found is not None
+        rows = zip(found.next_frames, found.actions, found.overruled, strict=True)
+        assert {(number(a), number(b), *map(float, (*x, *y))) for (a, b), x, y in rows} == {
+            (older, newer, 0.5 + now, -0.5 - now)
+            for now in (1, 3)
+            for older, newer in ((now, 100 + now), (100 + now, 200 + now))
+        }
+    assert buffer.human_count == 2
+
+
 def test_new_transitions_get_the_highest_priority():
     buffer, source = filled(3)
     buffer.update_priorities(np.arange(3), np.array([0.1, 7.0, 0.2]))
@@ -202,6 +223,15 @@ def test_separate_buffers_are_drawn_from_by_their_size_and_within_by_priority():
     # Each probability is the frequency with which it is drawn.
     _, where, counts = np.unique(batch.indices, return_index=True, return_counts=True)
     np.testing.assert_allclose(counts / 4000, batch.probabilities[where], atol=0.004)
+
+
+@pytest.mark.parametrize(("steps", "share"), [((30, -10), 0.5), ((40,), 0.0), ((-40,), 1.0)])
+def test_half_of_what_is_drawn_is_the_humans_where_there_are_both(steps, share):
+    buffer, _ = filled(*steps, alpha=0.0, human_share=0.5)
+    batch = sample(buffer, 4000)
+    assert batch.human.mean() == share
+    _, where, counts = np.unique(batch.indices, return_index=True, return_counts=True)
+    np.testing.assert_allclose(counts / 4000, batch.probabilities[where], atol=0.002)
 
 
 def test_a_slot_that_changes_hands_leaves_the_other_buffer():

@@ -19,10 +19,11 @@ from trainer.human.guide import Intervention
 from trainer.learner import equations
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import Losses
+from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.tests.test_commands import refusal
 from trainer.training.config import RunConfig
 from trainer.training.delayed import behind
-from trainer.training.run import WRONG_ACTIONS, TrainingRun
+from trainer.training.run import TrainingRun
 
 POLICY, HUMAN = 0.25, -0.5
 BATCH = 4
@@ -41,6 +42,8 @@ class ScriptedEnv:
     observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     brake_action = np.array([0.0], np.float32)
+    control_period_s = 0.1
+    biased_action = LeftTurnEnv.biased_action
 
     def __init__(self, length, outcome):
         self.length, self.outcome, self.steps = length, outcome, 0
@@ -140,6 +143,9 @@ def trained(directory, length=1, outcome="goal", human_steps=(), reason="collisi
         ("phil_td3", "stuck", False, 0.0),
         ("phil_td3", "stuck", True, -7.0),
         ("phil_without_shaping", "collision", True, 0.0),
+        ("rlif_td3", "collision", False, -7.0),
+        ("rlif_td3", "stuck", False, -7.0),
+        ("pvp_td3", "collision", True, 0.0),
     ],
 )
 @pytest.mark.parametrize("penalty_on", ["human", "overruled"])
@@ -152,12 +158,13 @@ def test_what_was_done_is_stored_and_only_taking_over_is_penalised(
     overruled = [(POLICY, step == 2 and penalty < 0.0) for step in range(1, 6)]
     assert run.guidance_stored == overruled
     penalty = penalty if penalty_on == "human" else 0.0
+    paid = 0.0 if algorithm in ("rlif_td3", "pvp_td3") else 1.0  # these have no reward
     assert run.stored == [
-        (POLICY, 1.0, False, False),
-        (HUMAN, 2.0 + penalty, False, True),
-        (HUMAN, 3.0, False, True),
-        (POLICY, 4.0, False, False),
-        (POLICY, 5.0, True, False),
+        (POLICY, 1.0 * paid, False, False),
+        (HUMAN, 2.0 * paid + penalty, False, True),
+        (HUMAN, 3.0 * paid, False, True),
+        (POLICY, 4.0 * paid, False, False),
+        (POLICY, 5.0 * paid, True, False),
     ]
     assert run.env.actions == [action for action, *_ in run.stored]
 
@@ -232,6 +239,13 @@ def test_the_human_leaves_after_so_many_steps(tmp_path):
     assert [human for *_, human in run.stored] == [False, True] * 2 + [False] * 4
 
 
+def test_the_human_gives_up_after_so_many_episodes_and_may_drive_in_another_way(tmp_path):
+    config = {"episodes": 4, "guided_until_episode": 2, "human_shift": -0.75}
+    run = trained(tmp_path, 2, human_steps=(2,), **config)
+    assert [human for *_, human in run.stored] == [False, True] * 2 + [False] * 4
+    assert [action for action, *_, human in run.stored if human] == [-1.0, -1.0]  # clipped
+
+
 def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
     run = trained(tmp_path, 2, episodes=100, steps=5)
     assert (run.episode, run.steps) == (3, 6)
@@ -260,7 +274,7 @@ def test_poor_guidance_replaces_its_share_of_the_demonstrations(tmp_path):
     assert np.abs(poor).max() <= 1.0
     assert np.std(poor) == pytest.approx(3**-0.5, abs=0.08)  # uniform over the whole range
     done = poorly_guided(tmp_path, poor_guidance_share=0.5, poor_guidance="biased")
-    assert set(done) == {HUMAN, WRONG_ACTIONS["left_turn"]}
+    assert set(done) == {HUMAN, LeftTurnEnv.biased_action}
     assert (done == HUMAN).sum() == pytest.approx(300, abs=60)
 
 

@@ -10,9 +10,10 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from bridge.environments import CONDITIONS as SERVED
-from edge_runtime.vehicles.mapping import CARS
-from trainer.drivers import ACTIONS, CONDITIONS, EXPERTS, make_environment
-from trainer.evaluate import drive_episodes
+from bridge.environments import describe
+from edge_runtime.vehicles.mapping import ScenarioCar
+from trainer.environments import CONDITIONS, make_environment
+from trainer.evaluation import drive_episodes
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.environment import EgoVehicle
@@ -30,7 +31,10 @@ def test_gymnasiums_and_stable_baselines3s_checkers_pass(scenario):
     check_env(gymnasium.make(SCENARIOS[scenario]).unwrapped, skip_render_check=True)
     check_for_sb3(gymnasium.make(SCENARIOS[scenario]).unwrapped, warn=False)
     # What the bridge compares when a policy comes to drive.
-    assert make_environment(scenario).action_names == (ACTIONS[scenario].name,)
+    task = describe(make_environment(scenario))
+    assert (task.task, task.control_period_s) == (scenario, 0.1)
+    assert [row.name for row in task.action] == [{"left_turn": "pedal"}.get(scenario, "steering")]
+    assert [row.stop for row in task.action] == [{"left_turn": -1.0}.get(scenario)]
 
 
 @every_scenario
@@ -97,7 +101,7 @@ def gaps_m(env, of_the_ego_lane=False):
 )
 def test_the_expert_arrives(scenario, condition, drives, arriving):
     env = make_environment(scenario, condition)
-    results = drive_episodes(env, EXPERTS[scenario](env), range(drives), condition)
+    results = drive_episodes(env, env.expert(), range(drives), condition)
     assert sum(result.outcome == "goal" for result in results) >= arriving
 
 
@@ -118,7 +122,7 @@ def test_more_vehicles_are_in_variant_and_dense_of_every_type_in_the_variant_alo
 @pytest.mark.parametrize("condition", NAMES)
 def test_cars_start_apart_and_never_touch_each_other(scenario, condition):
     env = make_environment(scenario, condition)
-    expert = EXPERTS[scenario](env)
+    expert = env.expert()
     fastest_mps = 6.01 if condition != "dense" else 7.01
     for seed in range(6):
         expert.reset()
@@ -158,7 +162,8 @@ def test_the_jam_is_closer_and_less_even():
 
 @every_scenario
 def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
-    car, config = CARS[scenario], make_environment(scenario).config
+    env = make_environment(scenario)
+    car, config = ScenarioCar(**env.car), env.config
     if scenario == "left_turn":
         wanted = config.throttle_mps2, config.max_speed_mps, EgoVehicle.MAX_STEERING_RAD
     else:  # its +1 turns right
@@ -175,7 +180,8 @@ def test_the_curvature_is_the_bicycles_own():
     way_m = math.hypot(*ego.position)
     assert way_m == pytest.approx(0.4)
     # Its y axis points down: positive turns right.
-    assert -ego.heading / way_m == pytest.approx(CARS["congestion"].curvature(0.5))
+    car = ScenarioCar(**make_environment("congestion").car)
+    assert -ego.heading / way_m == pytest.approx(car.curvature(0.5))
 
 
 @every_scenario

@@ -16,7 +16,7 @@ from trainer.tests.reference import ReferenceLearner
 SMALL = LearnerConfig(precision="float32", saturation_weight=0.0, tau=1e-3, picture_shift=0)
 
 
-def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
+def make_batch(seed: int = 0, humans: int = 4, size: int = 12, foreseen: bool = False) -> Batch:
     random = np.random.default_rng(seed)
     pictures = random.integers(0, 255, (size, 3, 45, 80)).astype(np.uint8)
     return Batch(
@@ -31,6 +31,7 @@ def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
         spans=random.integers(1, 9, size),
         overruled=random.uniform(-1, 1, (size, 1)).astype(np.float32),
         penalised=(np.arange(size) < humans) & (np.arange(size) % 2 == 0),
+        foreseen=None if foreseen else make_batch(seed + 100, size=5, foreseen=True),
     )
 
 

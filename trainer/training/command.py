@@ -5,15 +5,20 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import inspect
 import math
 import os
+import re
 import sys
 import textwrap
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import count
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +28,16 @@ from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.cli import INTERRUPTED, examples
-from edge_runtime.util import UserError, counted
+from edge_runtime.util import UserError, counted, read_toml
 from trainer import options
-from trainer.drivers import CHECKPOINT_FILE
-from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.drivers import CHECKPOINT_FILE, is_expert
+from trainer.environments import scenario_of
+from trainer.learner.config import ALGORITHMS, LearnerConfig, find_algorithm, starting_from
 from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.pictures import write_learning_curve
-from trainer.training.config import PRESETS, RunConfig
+from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
-from trainer.training.run import CONFIG_FILE, TrainingRun
+from trainer.training.run import TrainingRun
 from trainer.util import claimed, quit_on_signals
 
 EXAMPLE = examples(
@@ -45,6 +51,7 @@ EXAMPLE = examples(
 DEFAULTS = RunConfig()
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
+DEVICES = ("cpu", "cuda")
 EXTENT = ("episodes", "steps")
 """How long a run is: it may go on for longer."""
 LEARNERS = tuple(field.name for field in fields(LearnerConfig))
@@ -59,14 +66,14 @@ _ENDING = b"ending after this episode; a second time: at once, back to the last 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    parser.register("action", None, _Noted)
     what = parser.add_argument_group("what is trained")
     options.add_scenario(what)
     what.add_argument(
         "--algorithm",
-        choices=list(ALGORITHMS),
         default=DEFAULTS.algorithm,
         metavar="NAME",
-        help=f"the learner: {', '.join(ALGORITHMS)}",
+        help=f"the learner: {', '.join(ALGORITHMS)}, one of an installed package, or module:ROW",
     )
     options.add_seed(what, "everything that is drawn at random")
     options.add_fields(what, DEFAULTS, *EXTENT)
@@ -75,6 +82,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(PRESETS),
         default="ours",
         help="the settings to start from: this project's, or the paper's as they are printed",
+    )
+    what.add_argument(
+        "--config",
+        metavar="F.toml",
+        help="take options and settings from this file, as a run's own config.toml; what is given "
+        "here goes before",
     )
     what.add_argument(
         "--set",
@@ -90,7 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     guide.add_argument(
         "--human",
         default=DEFAULTS.human,
-        metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
+        metavar=f"expert|module:Class|HUMAN_DIR|{'|'.join(HUMANS)}",
         help="the scripted expert, a model trained by `trainer human`, or you",
     )
     add_person(parser)
@@ -98,9 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
     how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     options.add_time_limit(how, "stop after the episode that passes this time")
-    how.add_argument(
-        "--device", choices=["cpu", "cuda"], default="cpu", help="where the learner computes"
-    )
+    how.add_argument("--device", choices=DEVICES, default="cpu", help="where the learner computes")
     options.add_threads(how)
     how.add_argument(
         "--rerun",
@@ -111,40 +122,124 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train, showing progress; returns the exit status."""
-    if arguments.device == "cuda" and not torch.cuda.is_available():
+    settings = arguments.set
+    if arguments.config is not None:
+        settings = [*_take_config(arguments), *settings]
+    known = {**vars(arguments), "settings": settings}
+    done = train(**{name: known[name] for name in inspect.signature(train).parameters})
+    return INTERRUPTED if done.interrupted else 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training run as a path: what is in its directory is all that there is of it."""
+
+    directory: Path
+    interrupted: bool = False
+    """Whether it was asked to end before its time; ``resume`` goes on."""
+
+    def __fspath__(self) -> str:
+        return str(self.directory)
+
+    @property
+    def metrics(self) -> list[dict[str, str]]:
+        """A row for each training episode, as in ``metrics.csv``."""
+        return read_metrics(self.directory)
+
+
+def train(
+    scenario: str = DEFAULTS.scenario,
+    *,
+    out: str | PathLike[str] | None = None,
+    algorithm: str = DEFAULTS.algorithm,
+    human: str = DEFAULTS.human,
+    episodes: int = DEFAULTS.episodes,
+    steps: int = DEFAULTS.steps,
+    seed: int = DEFAULTS.seed,
+    preset: str = "ours",
+    settings: Mapping[str, Any] | Sequence[str] = (),
+    latency: str = DEFAULTS.latency,
+    device: str = DEFAULTS.device,
+    threads: int = DEFAULTS.threads,
+    max_minutes: float | None = None,
+    resume: bool = False,
+    rerun: str | None = None,
+    profile: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    speed: float = 1.0,
+) -> Run:
+    """Train a policy with human guidance, as ``python -m trainer train`` does.
+
+    The arguments are that command's options, ``out`` a new directory in ``runs`` by default, and
+    ``settings`` what ``--set`` changes, name to value. Gives the run, for ``evaluate`` and
+    ``export``.
+
+    Raises:
+        UserError: no such environment, algorithm, human or setting, or a directory that is taken.
+    """
+    if device not in DEVICES:
+        raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
+    if device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
-    options.set_threads(arguments.threads)
-    human = arguments.human
-    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
+    if not is_expert(human) and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
         raise UserError(f"--human {human} is none of {known}, nor a human model's directory")
-    given = {name: getattr(arguments, name) for name in (*OPTIONS, *EXTENT)}
-    given["human"] = PERSON if human in HUMANS else human
-    given["latency"] = str(parse_spec(arguments.latency))
-    config = replace(PRESETS[arguments.preset], **given)
-    for assignment in arguments.set:
+    if preset not in PRESETS:
+        raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
+    start = PRESETS[preset]
+    config = replace(
+        start,
+        scenario=scenario_of(scenario),
+        algorithm=algorithm,
+        human=PERSON if human in HUMANS else human,
+        episodes=episodes,
+        steps=steps,
+        seed=seed,
+        latency=str(parse_spec(latency)),
+        device=device,
+        threads=threads,
+        learner=starting_from(start.learner, find_algorithm(algorithm)),
+    )
+    options.set_threads(threads)
+    if isinstance(settings, Mapping):
+        settings = [f"{name}={value}" for name, value in settings.items()]
+    for assignment in settings:
         config = with_setting(config, assignment)
-    run_dir = Path(arguments.out)
+    run_dir = _new_directory(config) if out is None else Path(out)
+    person = argparse.Namespace(
+        human=human, scenario=config.scenario, resume=resume, profile=profile, host=host,
+        port=port, speed=speed,
+    )  # fmt: skip
     with claimed(run_dir):
-        check_directory(run_dir, config, arguments.resume)
-        return _train(arguments, config, run_dir)
+        check_directory(run_dir, config, resume)
+        end_s = math.inf if max_minutes is None else time.monotonic() + 60.0 * max_minutes
+        return _train(person, config, run_dir, rerun, end_s)
 
 
-def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
+def _new_directory(config: RunConfig) -> Path:
+    """The first of ``runs/SCENARIO-ALGORITHM-1`` and on that is not there."""
+    stem = re.sub(r"[^\w-]+", "_", f"{config.scenario}-{config.algorithm}")
+    paths = (Path("runs") / f"{stem}-{number}" for number in count(1))
+    return next(path for path in paths if not path.exists())
+
+
+def _train(
+    person: argparse.Namespace, config: RunConfig, run_dir: Path, rerun: str | None, end_s: float
+) -> Run:
     view: Any = None
-    if arguments.rerun is not None:
+    if rerun is not None:
         view = importlib.import_module("trainer.view")
-        sink = view.check_word(arguments.rerun)
+        sink = view.check_word(rerun)
     with ExitStack() as stack:
         training: TrainingRun
-        if arguments.human in HUMANS:
+        if person.human in HUMANS:
             from trainer.person.run import training_with_person
 
-            training = stack.enter_context(training_with_person(arguments, config, run_dir))
+            training = stack.enter_context(training_with_person(person, config, run_dir))
         else:
-            check_person_options(arguments)
-            training = TrainingRun(config, run_dir, arguments.resume)
-        end_s = options.deadline_s(arguments)
+            check_person_options(person)
+            training = TrainingRun(config, run_dir, person.resume)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -174,11 +269,11 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    print(f"{_summary(run_dir)}: {run_dir}")
-    if training.quitting and not training.over:
+    print(f"{_summary(run_dir, training.env.control_period_s)}: {run_dir}")
+    interrupted = training.quitting and not training.over
+    if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
-        return INTERRUPTED
-    return 0
+    return Run(run_dir, interrupted)
 
 
 def _quit(training: TrainingRun) -> bool:
@@ -191,14 +286,37 @@ def _quit(training: TrainingRun) -> bool:
     return heeded
 
 
-def _summary(run_dir: Path) -> str:
-    found = totals(read_metrics(run_dir))
+def _summary(run_dir: Path, period_s: float) -> str:
+    found = totals(read_metrics(run_dir), period_s)
     if not found:
         return "no episodes"
     amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
     steps = counted(found["human_steps"], "step")
-    human = f"{counted(found['takeovers'], 'take-over')} with {steps}"
+    human = f"{counted(found['takeovers'], 'take-over')} with {steps}, {found['human_s']:.0f} s"
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
+
+
+def _take_config(arguments: argparse.Namespace) -> list[str]:
+    """Take what ``--config`` says and no option does; the settings in it, as ``--set`` has them."""
+    path = Path(arguments.config)
+    values = _flat(read_toml(path, "config"))
+    assignments = []
+    for name, value in values.items():
+        if name not in (*OPTIONS, *EXTENT, "preset"):
+            assignments.append(f"{name}={value}")
+        elif type(value) is not type(getattr(DEFAULTS, name, "")):
+            raise UserError(f"config {path}: {name} cannot be {value!r}")
+        elif name not in getattr(arguments, "given", ()):
+            setattr(arguments, name, value)
+    return assignments
+
+
+class _Noted(argparse._StoreAction):
+    """Stores an option's value, and that it was given: such a value goes before ``--config``."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        super().__call__(parser, namespace, values, option)
+        namespace.given = {*getattr(namespace, "given", ()), self.dest}
 
 
 class _Set(argparse.Action):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -18,13 +19,21 @@ RANGES = {
     "steps": FROM_ZERO,
     "guided_share": SHARE,
     "guided_until_step": FROM_ZERO,
+    "guided_until_episode": FROM_ZERO,
     "poor_guidance_share": SHARE,
+    "late_from_s": FROM_ZERO,
+    "late_to_s": FROM_ZERO,
+    "missed_share": SHARE,
+    "human_shift": (-2.0, 2.0),
     "evaluate_every_steps": FROM_ZERO,
     "evaluation_runs": FROM_ONE,
     "checkpoint_every": FROM_ONE,
     "threads": (0, MOST_THREADS),
 }
 """What each number may be."""
+CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
+"""A run's settings in its directory; the first with the source's revision, the second for
+``--config``."""
 RANDOM, BIASED = GUIDANCE = ("random", "biased")
 """How a human of poor guidance is wrong: each time another way, or always the same."""
 
@@ -49,6 +58,17 @@ class RunConfig:
     turn.)"""
     guided_until_step: int = 0
     """Environment steps after which the human leaves for good; 0: never."""
+    guided_until_episode: int = 0
+    """Episodes after which the human gives up; 0: never."""
+    late_from_s: float = 0.0
+    """Least time by which the human takes over too late; each take-over's is drawn anew."""
+    late_to_s: float = 0.0
+    """Longest such time."""
+    missed_share: float = 0.0
+    """Share of the reasons to take over that the human overlooks, for 1.5 s each."""
+    human_shift: float = 0.0
+    """What is added to each of the human's actions: a human who drives in another way than the
+    reward asks for, slower or more to one side."""
     penalise_stuck: bool = False
     """Whether taking over from a car that only waits too long is penalised, too. A stuck car
     looks like one that rightly waits, so the penalty teaches to fear waiting."""
@@ -68,9 +88,14 @@ class RunConfig:
     """Episodes of such an evaluation."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
+    snapshots: bool = False
+    """Whether the actor of every validation is kept, 2 MB each: what ``bridge bisect`` tries."""
     latency: str = "none"
     """The network between policy and vehicle, in training and validation alike, in the words of
     ``bridge simulate --latency``."""
+    delay_known: bool = False
+    """Whether the policy sees the actions that are on their way behind that network, and each
+    command waits until it is as old as they all are."""
     device: str = "cpu"
     threads: int = 0
     """Processor threads of the learner, set by whoever starts the run; 0: as many as torch takes.
@@ -83,16 +108,32 @@ class RunConfig:
             raise UserError(
                 f"poor_guidance must be one of {', '.join(GUIDANCE)}: {self.poor_guidance}"
             )
+        if self.delay_known and self.latency == "none":
+            raise UserError("delay_known needs a network: --latency")
+        if self.late_to_s < self.late_from_s:
+            raise UserError(f"late_to_s {self.late_to_s} is below late_from_s {self.late_from_s}")
 
     def guided(self, episode: int, steps: int) -> bool:
         """Whether the human watches an episode that begins after so many environment steps."""
         if self.guided_until_step and steps >= self.guided_until_step:
+            return False
+        if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return asdict(self)
+
+    def as_toml(self) -> str:
+        """The same as a file for ``--config``."""
+        values = self.as_dict()
+        learner = values.pop("learner")
+        lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
+        lines += ["", "[learner]"]
+        return (
+            "\n".join(lines + [f"{name} = {json.dumps(v)}" for name, v in learner.items()]) + "\n"
+        )
 
     @property
     def kept_actor(self) -> str:
@@ -101,11 +142,13 @@ class RunConfig:
 
     def label(self, episode: int) -> dict[str, Any]:
         """What a file of the run says of whose it is, and of when."""
+        known = {"known_latency": self.latency} if self.delay_known else {}
         return {
             "scenario": self.scenario,
             "algorithm": self.algorithm,
             "seed": self.seed,
             "episode": episode,
+            **known,
         }
 
 

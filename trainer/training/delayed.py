@@ -9,24 +9,62 @@ action carried out is another than the policy's answer; for a learner off policy
 like any other, and so is the brake.
 
 What was carried out in the d ticks between is not in the picture: the delayed decision process is
-only partially observed, and the contract fixes the observation, so past commands are not added.
+only partially observed. `DelayAware` (``delay_known``) adds it to the observation, and makes the
+delay constant by waiting.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from gymnasium.spaces import Box, Dict
 
-from bridge.network import LatencySpec
-from bridge.virtual_link import COMMAND_WINDOW_S, ROUNDING_S, VirtualLink
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command
+from bridge.network import LatencySpec, Link
+from bridge.virtual_link import COMMAND_WINDOW, ROUNDING_S, VirtualLink
+from edge_runtime.wire import DRIVE, Command
+from trainer.environments import layout_of
 from trainer.human.guide import Action, Observation
+from trainer.learner.replay import Layout
 
 Policy = Callable[[Observation], Action]
+UNDER_WAY, PLAIN = "under_way", "observation"
+JITTER_WAITED_FOR = 2.0  # Standard deviations: of normal jitter one command in 44 comes later
+
+
+class DelayAware:
+    """The observation with the actions that are on their way: d of them, where a command takes d.
+
+    With a constant delay and these actions the decision process is Markov again (Katsikopoulos and
+    Engelbrecht, 2003; rtgym's action buffer). So a command that comes early waits (the conservative
+    agent). ``space`` and ``layout`` are of the larger observation.
+
+    Args:
+        env: the environment, whose actions are in [-1, 1].
+        spec: the network; it decides d.
+    """
+
+    def __init__(self, env: Any, spec: LatencySpec) -> None:
+        self.ticks = ticks_late(spec, env.control_period_s, JITTER_WAITED_FOR)
+        own, layout = env.observation_space, layout_of(env)
+        numbers = Box(-1.0, 1.0, (self.ticks * env.action_space.shape[0],), np.float32)
+        entries = own.spaces if isinstance(own, Dict) else {PLAIN: own}
+        self.space = Dict([*entries.items(), (UNDER_WAY, numbers)])
+        plain: list[Any] = [(PLAIN, layout.dtype, layout.shape)]
+        rows = [(name, layout.dtype[name]) for name in layout.dtype.names or ()] or plain
+        self.layout = Layout((), np.dtype([*rows, (UNDER_WAY, np.float32, numbers.shape)]))
+
+    def see(self, observation: Observation, under_way: Iterable[Action]) -> Observation:
+        """Both together; the action that acts first comes first."""
+        seen = np.zeros((), self.layout.dtype)
+        *names, _ = self.layout.dtype.names or ()
+        for name in names:
+            seen[name] = observation[name] if observation.dtype.names else observation
+        seen[UNDER_WAY] = np.concatenate(list(under_way))
+        return seen
 
 
 class VehicleEnd:
@@ -34,13 +72,27 @@ class VehicleEnd:
 
     Args:
         env: the scenario; its brake is pressed here when commands stop.
-        spec: the network.
+        spec: the network, or one episode's link.
         seed: of the network: the episode's, as in ``bridge simulate``.
+        observation: any one, for its size.
+        aware: where the policy sees what is on its way; then each command waits for its tick.
     """
 
-    def __init__(self, env: Any, spec: LatencySpec, seed: int) -> None:
-        self.env = env
-        self._link: VirtualLink[Observation] = VirtualLink(spec, seed)
+    def __init__(
+        self,
+        env: Any,
+        spec: LatencySpec | Link,
+        seed: int,
+        observation: Observation,
+        aware: DelayAware | None = None,
+    ) -> None:
+        self.env, self._aware = env, aware
+        self._rest: Action = np.zeros(env.action_space.shape, np.float32)  # Hands off
+        self._answers: dict[int, Action] = {}  # The policy's, by the step that they answer
+        self._received: dict[int, Action] = {}  # Those of them that have come to the vehicle
+        self._link: VirtualLink[Observation] = VirtualLink(
+            spec, seed, env.control_period_s, observation.nbytes, on_command=self._receive
+        )
         self._step = 0
         self.braking = False
         """The vehicle brakes: no command has come for 2 T, or the command is a safe stop."""
@@ -63,16 +115,33 @@ class VehicleEnd:
         self._step += 1
         while arrival := self._link.next_at_edge():
             if not arrival.overtaken:
-                self._link.answer(arrival, _command(arrival.step, policy(arrival.message)))
+                answer = policy(self._seen(arrival.step, arrival.message))
+                self._answers[arrival.step] = answer
+                self._link.answer(arrival, _command(arrival.step, answer))
         decision = self._link.decide()
         self.press_brake(bool(decision.brake_reason))
         if self.braking:
             action: Action = self.env.brake_action
-        elif decision.command is None:
-            action = np.zeros(self.env.action_space.shape, np.float32)
-        else:
-            action = np.array(decision.command.action, np.float32)
-        return action
+            return action
+        if self._aware is not None:
+            return self._newest(self._received, self._step - 1 - self._aware.ticks)
+        command = decision.command
+        return self._rest if command is None else np.array(command.action, np.float32)
+
+    def _receive(self, command: Command) -> None:
+        self._received[command.step] = np.array(command.action, np.float32)
+
+    def _seen(self, step: int, observation: Observation) -> Observation:
+        """What the policy sees of a step."""
+        if self._aware is None:
+            return observation
+        before = range(step - self._aware.ticks, step)
+        return self._aware.see(observation, [self._newest(self._answers, one) for one in before])
+
+    def _newest(self, actions: dict[int, Action], step: int) -> Action:
+        """The action that answers this step, or the newest one before; zeros before the first."""
+        known = [one for one in actions if one <= step]
+        return actions[max(known)] if known else self._rest
 
     def press_brake(self, pressed: bool) -> None:
         """Brake or not until the next tick: a scenario whose action only steers has a pedal."""
@@ -105,8 +174,12 @@ class Store(Protocol):
         human: bool,
         overruled: Action | None = None,
         penalised: bool = False,
+        foreseen: Sequence[Observation] = (),
     ) -> None:
-        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``."""
+        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``.
+
+        ``foreseen``: the observation before it, and what ``overruled`` would have led to.
+        """
 
 
 class DirectPolicy:
@@ -139,24 +212,30 @@ class DirectPolicy:
 class DelayedPolicy(DirectPolicy):
     """The policy behind a network, in virtual time."""
 
-    def __init__(self, store: Store, env: Any, spec: LatencySpec) -> None:
+    def __init__(
+        self, store: Store, env: Any, spec: LatencySpec, aware: DelayAware | None = None
+    ) -> None:
         super().__init__(store)
-        self._env, self._spec = env, spec
-        self._known: deque[Observation] = deque(maxlen=ticks_late(spec) + 1)
+        self._env, self._spec, self._aware = env, spec, aware
+        late = aware.ticks if aware else ticks_late(spec, env.control_period_s)
+        self._known: deque[Observation] = deque(maxlen=late + 1)
         """Observations of the ticks n - d to n."""
+        self._carried_out: deque[Action] = deque(maxlen=late)
+        """The actions of the ticks n - d to n - 1."""
         self._storing = False
 
     def start(self, observation: Observation, seed: int) -> None:
         """Begin an episode; the seed decides the network's luck."""
-        self._vehicle_end = VehicleEnd(self._env, self._spec, seed)
+        self._vehicle_end = VehicleEnd(self._env, self._spec, seed, observation, self._aware)
         self._known.clear()
+        self._carried_out.clear()
         self._storing = False
 
     def act(self, observation: Observation, policy: Policy) -> Action:
         """What the vehicle does: the newest command, or the brake."""
         self._known.append(observation)
         if not self._storing and len(self._known) == self._known.maxlen:
-            self._store.start_episode(self._known[0])
+            self._store.start_episode(self._seen(self._known[0], self._carried_out))
             self._storing = True
         return self._vehicle_end.tick(observation, policy)
 
@@ -168,17 +247,37 @@ class DelayedPolicy(DirectPolicy):
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
         """Keep the tick; the first d of an episode answer to nothing the policy could know."""
+        if ahead := guidance.get("foreseen"):
+            guidance["foreseen"] = self._foreseen(ahead, guidance["overruled"])
+        self._carried_out.append(action)
         if self._storing:
-            super().store(action, reward, [*self._known, observation][1], *rest, **guidance)
+            known = self._seen([*self._known, observation][1], self._carried_out)
+            super().store(action, reward, known, *rest, **guidance)
+
+    def _foreseen(self, ahead: Sequence[Observation], held: Action) -> list[Observation]:
+        """The same, each as late as all that the policy sees."""
+        late, known = len(self._carried_out), [*self._known, *ahead[1:]]
+        done = [*self._carried_out, *[held] * len(ahead)]
+        return [self._seen(known[i], done[i : i + late]) for i in range(len(ahead))]
+
+    def _seen(self, observation: Observation, done: Iterable[Action]) -> Observation:
+        """What the policy would have seen, had it planned what was carried out."""
+        return self._aware.see(observation, done) if self._aware else observation
 
 
-def ticks_late(spec: LatencySpec) -> int:
-    """How many ticks old the state is that a command answers when it is on time."""
-    round_trip_s = (spec.up.delay_ms + spec.down.delay_ms) * 1e-3
-    beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW_S - ROUNDING_S)
-    return math.ceil(beyond_window_s / CONTROL_PERIOD_S)
+def ticks_late(spec: LatencySpec, period_s: float, jitters: float = 0.0) -> int:
+    """How many ticks old the state is that a command answers when it is on time.
+
+    On time may be so many standard deviations of the jitter after the mean.
+    """
+    jitter_ms = math.hypot(spec.up.jitter_ms, spec.down.jitter_ms)
+    round_trip_s = (spec.up.delay_ms + spec.down.delay_ms + jitters * jitter_ms) * 1e-3
+    beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW * period_s - ROUNDING_S)
+    return math.ceil(beyond_window_s / period_s)
 
 
-def behind(spec: LatencySpec, store: Store, env: Any) -> DirectPolicy:
+def behind(
+    spec: LatencySpec, store: Store, env: Any, aware: DelayAware | None = None
+) -> DirectPolicy:
     """The policy behind a network; ``none`` is no network."""
-    return DirectPolicy(store) if spec == LatencySpec() else DelayedPolicy(store, env, spec)
+    return DirectPolicy(store) if spec == LatencySpec() else DelayedPolicy(store, env, spec, aware)

@@ -16,11 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
-from trainer.learner.replay import Batch, ReplayBuffer
+from trainer.learner.networks import PICTURES
+from trainer.learner.replay import PAPERS, Batch, Layout, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.util import Purpose, random_stream
 
@@ -55,6 +57,8 @@ class LearningThread:
         seed: of weights, noise and draws.
         action_size: length of an action.
         device: where the networks are; the replay buffer is in the processor's memory.
+        space: of the observations.
+        layout: how they lie in an array.
 
     Raises:
         UserError: there is no memory for the replay buffer.
@@ -67,9 +71,11 @@ class LearningThread:
         seed: int,
         action_size: int,
         device: str = "cpu",
+        space: Space[Any] = PICTURES,
+        layout: Layout = PAPERS,
     ) -> None:
         self.config = config
-        self.learner = TD3Learner(config, algorithm, seed, action_size, device)
+        self.learner = TD3Learner(config, algorithm, seed, action_size, device, space)
         try:
             self.replay = ReplayBuffer(
                 config.replay_capacity,
@@ -79,6 +85,9 @@ class LearningThread:
                 config.return_steps,
                 config.gamma,
                 config.intervention_penalty if charges_overruled(config, algorithm) else None,
+                layout,
+                algorithm.human_share,
+                bool(algorithm.foresight),
             )
         except MemoryError:
             raise UserError(
@@ -87,7 +96,8 @@ class LearningThread:
             ) from None
         self._random = random_stream(seed, Purpose.REPLAY)
         self._thread = ThreadPoolExecutor(1, "learner")
-        self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
+        self._updates = algorithm.updates_per_step
+        self._begun: tuple[list[Batch], Future[tuple[list[Losses], float]]] | None = None
         self._forget_episode()
 
     @property
@@ -109,6 +119,11 @@ class LearningThread:
         """The actor's action, float32 [action size]; not while updating."""
         return self.in_thread(self.learner.act, observation)
 
+    def doubt(self, observation: Observation, action: Action) -> float:
+        """How much the critics differ about an action; not while updating."""
+        found: float = self.in_thread(self.learner.doubt, observation, action)
+        return found
+
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
         return self.in_thread(self.learner.act_together, observations, averaged)
@@ -126,9 +141,10 @@ class LearningThread:
         self.replay.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
-        """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
-        batch = self.replay.sample(self.config.batch_size, self._random)
-        self._begun = batch, self._thread.submit(self._update, batch, beta)
+        """Start an update, or several, on what is stored; ``beta`` is eq. 15's exponent."""
+        size = self.config.batch_size
+        batches = [self.replay.sample(size, self._random) for _ in range(self._updates)]
+        self._begun = batches, self._thread.submit(self._update, batches, beta)
 
     def finish(self) -> float:
         """Wait until the update that was begun is done, if one was; the seconds waited.
@@ -138,15 +154,16 @@ class LearningThread:
         if self._begun is None:
             return 0.0
         began_s = time.perf_counter()
-        (batch, update), self._begun = self._begun, None
-        losses, learning_s = update.result()
-        if not np.isfinite(losses.priorities).all():
+        (batches, update), self._begun = self._begun, None
+        done, learning_s = update.result()
+        if not all(np.isfinite(losses.priorities).all() for losses in done):
             raise FloatingPointError("its losses are no longer finite")
         waited_s = time.perf_counter() - began_s
         self._waiting_s += waited_s
         self._learning_s += learning_s
-        self._losses.append(losses[:4])
-        self.replay.update_priorities(batch.indices, losses.priorities)
+        for batch, losses in zip(batches, done, strict=True):
+            self._losses.append(losses[:4])
+            self.replay.update_priorities(batch.indices, losses.priorities)
         return waited_s
 
     def end_episode(self, progress: float) -> EpisodeLearning:
@@ -182,9 +199,9 @@ class LearningThread:
         """Stop the thread."""
         self._thread.shutdown()
 
-    def _update(self, batch: Batch, beta: float) -> tuple[Losses, float]:
+    def _update(self, batches: list[Batch], beta: float) -> tuple[list[Losses], float]:
         began_s = time.perf_counter()
-        losses = self.learner.update(batch, beta)
+        losses = [self.learner.update(batch, beta) for batch in batches]
         return losses, time.perf_counter() - began_s
 
     def _forget_episode(self) -> None:

@@ -18,17 +18,24 @@ from typing import Any
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.network import LatencySpec
-from bridge.report import GOAL, EpisodeResult
-from edge_runtime.files import write_atomic
+from bridge.bisect import SNAPSHOTS
+from bridge.network import parse_spec
+from bridge.report import GOAL, EpisodeResult, failed
+from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.drivers import BEST_FILE, TogetherDriver, make_environment
-from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
-from trainer.training.config import RunConfig
+from trainer.drivers import BEST_FILE, TogetherDriver
+from trainer.environments import make_environment
+from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
+from trainer.learner.networks import Actor
+from trainer.scenarios import SCENARIOS
+from trainer.training.config import CONFIG_FILE, RunConfig
+from trainer.training.delayed import DelayAware
 from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
+MOST_ENVIRONMENTS = 8
+"""Driven at once in validation: another environment than our two may be large."""
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (
     "episode",
@@ -60,6 +67,9 @@ class EpisodeMetrics:
     outcome: str = ""
     interventions: int = 0
     human_steps: int = 0
+    total_human_s: float = 0.0  # Simulated seconds that the human drove since the run began
+    total_takeovers: int = 0
+    total_failures: int = 0  # Episodes that missed the goal since then, whoever drove
     exploration_std: float = 0.0
     critic_loss: float = NAN
     policy_loss: float = NAN
@@ -91,9 +101,12 @@ NAMES = [f.name for f in fields(EpisodeMetrics)]
 
 
 class MetricsWriter:
-    """Appends rows; a run that is resumed drops the rows after its checkpoint first."""
+    """Appends rows; a run that is resumed drops the rows after its checkpoint first.
 
-    def __init__(self, run_dir: Path, from_episode: int = 0) -> None:
+    A control period of the run takes ``period_s``.
+    """
+
+    def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
         self.path = run_dir / METRICS_FILE
         kept = [row for row in read_metrics(run_dir) if int(row["episode"]) < from_episode]
         text = io.StringIO()
@@ -101,12 +114,19 @@ class MetricsWriter:
         writer.writeheader()
         writer.writerows(kept)
         write_atomic(str(self.path), text.getvalue().encode())
+        self._period_s, self._spent = period_s, spent(kept, period_s)
+        self._failures = sum(self._spent["failures"].values())
         self._file = self.path.open("a", newline="")
         self._csv = csv.DictWriter(self._file, NAMES)
         self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=from_episode)
 
     def add(self, metrics: EpisodeMetrics) -> None:
-        """Write one episode's row; UserError where the disk is full."""
+        """Write one episode's row, with the totals so far; UserError where the disk is full."""
+        self._spent["human_s"] += metrics.human_steps * self._period_s
+        self._spent["takeovers"] += metrics.interventions
+        self._failures += failed(metrics.outcome)
+        metrics.total_human_s = round(self._spent["human_s"], 6)
+        metrics.total_takeovers, metrics.total_failures = self._spent["takeovers"], self._failures
         row = asdict(metrics)
         try:
             self._csv.writerow(row)
@@ -162,55 +182,90 @@ def _rows(text: str) -> list[dict[str, str]]:
     return rows
 
 
-def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
+LEARNED = (0.9, 0.98)
+"""Success of the policy alone, in validation, at which one asks what it has cost."""
+
+
+def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
+    """What these episodes have cost: steps, the human's effort, failures by their outcome."""
+    human_steps = sum(int(row["human_steps"]) for row in rows)
+    failures = Counter(row["outcome"] for row in rows if failed(row["outcome"]))
+    return {
+        "steps": int(rows[-1]["total_steps"]) if rows else 0,
+        "human_steps": human_steps,
+        "human_s": round(human_steps * period_s, 6),
+        "takeovers": sum(int(row["interventions"]) for row in rows),
+        "failures": dict(sorted(failures.items())),
+    }
+
+
+def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     """What a run cost and came to, from its rows; empty where there is none.
 
     ``failures`` are the training episodes, with the human's help, that missed the goal, by outcome;
     ``validation`` has the best and the last success rate, and after how many steps the best was
-    first reached, or nothing where none was measured.
+    first reached, or nothing where none was measured; ``until`` what was spent until the policy
+    alone first reached each of ``LEARNED``, or None.
     """
     if not rows:
         return {}
     measured = [
-        (float(row["validation_success"]), int(row["total_steps"]))
-        for row in rows
+        (float(row["validation_success"]), number)
+        for number, row in enumerate(rows)
         if row["validation_success"] not in ("", "nan")
     ]
     validation = {}
     if measured:
-        best, at_step = max(measured, key=lambda one: (one[0], -one[1]))
+        best, number = max(measured, key=lambda one: (one[0], -one[1]))
+        at_step = int(rows[number]["total_steps"])
         validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
-    failures = Counter(row["outcome"] for row in rows if row["outcome"] != GOAL)
+    until = {}
+    for level in LEARNED:
+        there = [number for success, number in measured if success >= level - 1e-9]
+        until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
-        "steps": int(rows[-1]["total_steps"]),
         "updates": int(rows[-1]["updates"]),
-        "human_steps": sum(int(row["human_steps"]) for row in rows),
-        "takeovers": sum(int(row["interventions"]) for row in rows),
-        "failures": dict(sorted(failures.items())),
+        **spent(rows, period_s),
         "validation": validation,
+        "until": until,
     }
 
 
-class Validation:
-    """Drives the policy as it stands, without help, and keeps the best actor so far.
+class Trials:
+    """The validation's episodes, which a policy drives without help, over the run's network."""
 
-    It drives over the same ``network`` as the training.
-    """
-
-    def __init__(
-        self, config: RunConfig, run_dir: Path, learning: LearningThread, network: LatencySpec
-    ) -> None:
-        self.config, self.run_dir = config, run_dir
-        self.learning, self.network = learning, network
+    def __init__(self, config: RunConfig) -> None:
+        self.config, self.network = config, parse_spec(config.latency)
         self._seeds = [
             episode_seed(config.seed, Purpose.VALIDATION, run)
             for run in range(config.evaluation_runs)
         ]
         self.envs = [
             make_environment(config.scenario, printed_reward=config.printed_reward)
-            for _ in self._seeds
+            for _ in self._seeds[: None if config.scenario in SCENARIOS else MOST_ENVIRONMENTS]
         ]
+
+    def drive(self, driver: TogetherDriver, more: Sequence[int] = ()) -> list[EpisodeResult]:
+        """Drive them, and then ``more`` seeds."""
+        seeds = [*self._seeds, *more]
+        if self.network == NO_NETWORK:
+            return drive_together(self.envs, driver.act_together, seeds)
+        return drive_episodes(self.envs[0], driver, seeds, latency=self.network)
+
+
+class Validation(Trials):
+    """Drives the policy as it stands, and keeps the best actor so far."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        run_dir: Path,
+        learning: LearningThread,
+        aware: DelayAware | None = None,
+    ) -> None:
+        super().__init__(config)
+        self.run_dir, self.learning, self.aware = run_dir, learning, aware
         self.best = (-1.0, -1.0)
         """Success and return of the best actor of those validated when it was due."""
         self._best_actor: dict[str, Any] | None = None
@@ -222,29 +277,36 @@ class Validation:
         One that was not ``due``, since the run stops early, may be kept as the best so far, but a
         resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
         """
-        results = self._drive()
+        driver = TogetherDriver(
+            lambda seen: self.learning.act_together(seen, self.config.averaged_actor), self.aware
+        )
+        actor = getattr(self.learning.learner, self.config.kept_actor)
+        self.take(self.drive(driver), actor, metrics, episode, due)
+
+    def take(
+        self,
+        results: Sequence[EpisodeResult],
+        actor: Actor,
+        metrics: EpisodeMetrics,
+        episode: int,
+        due: bool = True,
+    ) -> None:
+        """Do what ``judge`` does with what ``drive`` gave of an actor."""
         success = float(np.mean([result.outcome == GOAL for result in results]))
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
+        state = {**self.config.label(episode), "actor": actor.state_dict()}
+        if due and self.config.snapshots:
+            # A run of its own: every command takes its actor.
+            snapshot = self.run_dir / SNAPSHOTS / f"after_{episode:06d}"
+            make_directory(snapshot)
+            write_atomic(snapshot / CONFIG_FILE, read_bytes(self.run_dir / CONFIG_FILE, "config"))
+            save_torch(snapshot / BEST_FILE, state)
         if (success, reward) >= self.best:
-            state = self._keep(episode)
+            save_torch(self.run_dir / BEST_FILE, state)
             if due:
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
-
-    def _drive(self) -> list[EpisodeResult]:
-        driver = TogetherDriver(
-            lambda seen: self.learning.act_together(seen, self.config.averaged_actor)
-        )
-        if self.network == NO_NETWORK:
-            return drive_together(self.envs, driver.act_together, self._seeds)
-        return drive_episodes(self.envs[0], driver, self._seeds, latency=self.network)
-
-    def _keep(self, episode: int) -> dict[str, Any]:
-        actor = getattr(self.learning.learner, self.config.kept_actor)
-        state = {**self.config.label(episode), "actor": actor.state_dict()}
-        save_torch(self.run_dir / BEST_FILE, state)
-        return state
 
     def state_dict(self) -> dict[str, Any]:
         """Its part of a checkpoint."""

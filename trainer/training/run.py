@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.network import parse_spec
-from edge_runtime.files import write_json
+from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
-from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
-from trainer.human.guide import Guide, HumanGuide, Intervention
+from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
+from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
+from trainer.human.guide import STUCK, Asking, Guide, HumanGuide, Inattentive, Intervention, Trigger
 from trainer.learner import equations
-from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
+from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import TD3Learner
-from trainer.training.config import BIASED, RunConfig
-from trainer.training.delayed import behind
+from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
+from trainer.training.delayed import DelayAware, behind
 from trainer.training.learning import Action, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -79,8 +80,8 @@ def check_weights(learner: TD3Learner) -> None:
 class Seen:
     """One control period, once it is stored; nothing in it changes afterwards."""
 
-    observation: NDArray[np.uint8]
-    """s, [2, 45, 80]."""
+    observation: NDArray[Any]
+    """s."""
     policy_action: NDArray[np.float32]
     """With the exploration's noise, as the vehicle would have had it."""
     intervention: Intervention | None
@@ -91,9 +92,6 @@ class Seen:
 
 
 OnStep = Callable[[Seen], None]
-CONFIG_FILE = "config.json"
-WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}
-"""What a human of biased guidance does whenever wrong: full throttle; half of the full angle."""
 
 
 class TrainingRun:
@@ -101,18 +99,28 @@ class TrainingRun:
 
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
-        self.algorithm = ALGORITHMS[config.algorithm]
+        self.algorithm = find_algorithm(config.algorithm)
         self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
+        if self.algorithm.foresight:
+            check_foresight(self.env)
+        self._copied = self.env  # with nobody around it
         action_size = self.env.action_space.shape[0]
-        self.learning = self._around(
-            LearningThread(config.learner, self.algorithm, config.seed, action_size, config.device)
-        )
         self.network = parse_spec(config.latency)
-        self.validation = Validation(config, run_dir, self.learning, self.network)
-        self.policy = behind(self.network, self.learning, self.env)
-        self.guide = self._make_guide()
+        aware = DelayAware(self.env, self.network) if config.delay_known else None
+        seen = self.env.observation_space, layout_of(self.env)
+        if aware:
+            seen = aware.space, aware.layout
+        switches = config.learner, self.algorithm
+        self.learning = self._around(
+            LearningThread(*switches, config.seed, action_size, config.device, *seen)
+        )
+        self.validation = Validation(config, run_dir, self.learning, aware)
+        self.policy = behind(self.network, self.learning, self.env, aware)
         self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
         self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
+        self.gate: Asking | None = None
+        """Where the robot asks for help."""
+        self.guide = self._make_guide()
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, where the run is watched."""
@@ -133,7 +141,9 @@ class TrainingRun:
         """
         about = {**self.config.as_dict(), "source_revision": source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
-        metrics_writer = MetricsWriter(self.run_dir, self.episode)
+        write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
+        period_s = self.env.control_period_s
+        metrics_writer = MetricsWriter(self.run_dir, self.episode, period_s)
         try:
             while not self.over:
                 metrics = self.advance()
@@ -151,7 +161,7 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-        write_json(self.run_dir / REPORT_FILE, totals(read_metrics(self.run_dir)))
+        write_json(self.run_dir / REPORT_FILE, totals(read_metrics(self.run_dir), period_s))
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
@@ -190,6 +200,7 @@ class TrainingRun:
                 "kept_actor": self.config.kept_actor,
                 "exploration": self.exploration.bit_generator.state,
                 "guidance": self.guidance.bit_generator.state,
+                "doubts": list(self.gate.doubts) if self.gate else [],
                 **self.validation.state_dict(),
             },
         )
@@ -210,6 +221,8 @@ class TrainingRun:
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guidance.bit_generator.state = state["guidance"]
+        if self.gate:
+            self.gate.doubts.extend(state["doubts"])
         self.validation.load_state_dict(state)
 
     def _must_stop(self, deadline_s: float) -> bool:
@@ -223,9 +236,19 @@ class TrainingRun:
     def _make_guide(self) -> Guide | None:
         if not self.algorithm.guided:
             return None
-        expert = EXPERTS[self.config.scenario](self.env)
-        trigger = TRIGGERS[self.config.scenario](expert)
-        driver, _ = load_driver(self.config.human, self.env)
+        config, asks = self.config, self.algorithm.asks
+        driver, _ = load_driver(config.human, self.env)
+        trigger: Trigger = expert_of(
+            self.env, config.human if is_expert(config.human) else "expert"
+        )
+        if asks:
+            if config.delay_known:
+                raise UserError(f"{config.algorithm} asks about what is seen now: no delay_known")
+            trigger = self.gate = Asking(trigger, asks)
+        if config.late_to_s or config.missed_share:
+            period_s = self.env.control_period_s
+            late_steps = config.late_from_s / period_s, config.late_to_s / period_s
+            trigger = Inattentive(trigger, late_steps, config.missed_share, self.guidance)
         return HumanGuide(driver, trigger)
 
     def _episode(self) -> EpisodeMetrics:
@@ -252,11 +275,13 @@ class TrainingRun:
         )
 
     def _step(
-        self, observation: NDArray[np.uint8], guided: bool, metrics: EpisodeMetrics
-    ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
+        self, observation: NDArray[Any], guided: bool, metrics: EpisodeMetrics
+    ) -> tuple[NDArray[Any], bool, dict[str, Any]]:
         """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
         policy_action = self.policy.act(observation, self._explore)
+        if guided and self.gate is not None:
+            self.gate.doubts.append(self.learning.doubt(observation, policy_action))
         acted_s = time.perf_counter()
         if self.learning.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
@@ -268,6 +293,9 @@ class TrainingRun:
         if intervention is not None:
             self.policy.yield_to_human()
         action = equations.masked_action(policy_action, human_action)
+        foreseen = []
+        if intervention is not None and self.algorithm.foresight:
+            foreseen = foresee(self._copied, observation, policy_action, self.algorithm.foresight)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
@@ -279,6 +307,7 @@ class TrainingRun:
             intervention is not None,
             overruled=policy_action,
             penalised=self._penalises(intervention),
+            foreseen=foreseen,
         )
         stored_s = time.perf_counter()
         metrics.steps += 1
@@ -294,20 +323,23 @@ class TrainingRun:
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:
-        """Make a demonstration a wrong action as often as the poor guidance setting asks for."""
+        """Shift a demonstration, or make it a wrong action, as often as the settings ask for."""
         config = self.config
+        if intervention is not None and config.human_shift:
+            shifted = np.clip(intervention.action + np.float32(config.human_shift), -1.0, 1.0)
+            intervention = replace(intervention, action=shifted)
         share = config.poor_guidance_share
         if intervention is None or not share or self.guidance.random() >= share:
             return intervention
         shape = intervention.action.shape
         wrong = (
-            np.full(shape, WRONG_ACTIONS[config.scenario])
+            np.full(shape, self.env.biased_action)
             if config.poor_guidance == BIASED
             else self.guidance.uniform(-1.0, 1.0, shape)
         )
         return replace(intervention, action=wrong.astype(np.float32))
 
-    def _explore(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def _explore(self, observation: NDArray[Any]) -> NDArray[np.float32]:
         action = finite_action(self.learning.act(observation))
         c = self.config.learner
         self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
@@ -323,13 +355,16 @@ class TrainingRun:
 
     def _penalises(self, intervention: Intervention | None) -> bool:
         """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""
-        if intervention is None or not intervention.first or not self.algorithm.penalty:
+        row = self.algorithm
+        if intervention is None or not intervention.first or not row.penalty:
             return False
-        return intervention.reason != "stuck" or self.config.penalise_stuck
+        return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
 
     def _shape(self, reward: float, intervention: Intervention | None) -> float:
         """Eq. 17 as it is printed, unless the overruled action has the penalty."""
         c = self.config.learner
+        if not self.algorithm.rewarded:
+            reward = 0.0
         if c.penalty_on != HUMANS_ACTION or not self._penalises(intervention):
             return reward
         return equations.shaped_reward(reward, c.intervention_penalty, True, False)

@@ -21,20 +21,29 @@ import socket
 import struct
 import threading
 import time
-from typing import Any, ClassVar, Dict, NamedTuple, Optional
+from typing import Any, ClassVar, Dict, NamedTuple, Optional, Type
 
 from edge_runtime import log
+from edge_runtime.config import check_choice
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMAND_IDS, COMMANDS, Frame
-from edge_runtime.vehicles.mapping import Similarity
+from edge_runtime.vehicles.hunter.protocol import (
+    BITRATE,
+    COMMAND_IDS,
+    COMMANDS,
+    DEFAULT_PROFILE,
+    PROFILES,
+    Frame,
+)
+from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
 _LISTEN_S = 0.1
 _JOIN_S = 0.5
 
+DEFAULT_BUS = "socketcan:can0"
 _SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
 # Without a bit rate: the first has it from `ip link`, the others know none.
 _WITHOUT_BITRATE = ("socketcan", "virtual")
@@ -184,12 +193,22 @@ class Gate:
         self._bus.send(message, timeout=0.0)
 
 
+class HunterSettings(RobotSettings, frozen=True, kw_only=True):
+    """[vehicle.hunter]: its bus, and a row of protocol.PROFILES."""
+
+    bus: str = DEFAULT_BUS
+    profile: str = DEFAULT_PROFILE
+
+
 class HunterVehicle(StreamedVehicle):
     """Opens its bus when made (UserError where it cannot), and sends nothing before `enable`."""
 
     name: ClassVar[str] = "hunter"
+    settings_type: ClassVar[Type[RobotSettings]] = HunterSettings
 
-    def __init__(self, bus: BusName, similarity: Similarity, profile: str) -> None:
+    def __init__(self, settings: HunterSettings, similarity: Similarity) -> None:
+        bus, profile = parse_bus(settings.bus), settings.profile
+        check_choice("vehicle.hunter.profile", profile, tuple(PROFILES))
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
         # Our own frames come back there: a command need not be somebody else's.

@@ -23,10 +23,8 @@ from edge_runtime.vehicles.core import (
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, Similarity
-from edge_runtime.wire import CONTROL_PERIOD_S
 
-MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
-STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
+STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
 COUNTERS = 256  # byte 7 of 0x211 runs over
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
@@ -69,7 +67,7 @@ class Reports(Speeds):
 
     def is_known_to_stand(self, now_s: float) -> bool:
         """Whether it says now that it stands."""
-        return self.stands and now_s - self.motion_s <= MOTION_SILENCE_S
+        return self.stands and now_s - self.motion_s <= self.silence_s
 
     @property
     def needs_clearing(self) -> bool:
@@ -91,7 +89,7 @@ class Reports(Speeds):
 
     def silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         """SILENT where feedback is missing that was due since `since_s`."""
-        if now_s - max(self.motion_s, since_s) > MOTION_SILENCE_S:
+        if now_s - max(self.motion_s, since_s) > self.silence_s:
             return Finding(Event.SILENT, "the chassis sends no 0x221")
         if now_s - max(self.status_s, since_s) > STATUS_SILENCE_S:
             repeats = now_s - self._last_status_s <= STATUS_SILENCE_S

@@ -14,12 +14,12 @@ from __future__ import annotations
 import math
 import re
 import time
-from typing import TYPE_CHECKING, Callable, ClassVar, Dict, List, NamedTuple, Optional
+from typing import TYPE_CHECKING, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type
 
 import zenoh
 
 from edge_runtime import log
-from edge_runtime.config import Ros2Settings, check_choice
+from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import (
@@ -32,9 +32,8 @@ from edge_runtime.vehicles.core import (
     State,
     StreamedCore,
 )
-from edge_runtime.vehicles.mapping import SPECS, Similarity
+from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.stream import StreamedVehicle
-from edge_runtime.wire import CONTROL_PERIOD_S
 
 if TYPE_CHECKING:
     from edge_runtime.vehicles.ros2.node import Odometry
@@ -46,7 +45,6 @@ _ANGULAR = (YAW_RATE, STEERING)
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _MAX_CHARS = 200
 
-ODOMETRY_SILENCE_S = 2 * CONTROL_PERIOD_S
 # Below this the path's curvature, yaw rate over speed, is more noise than steering.
 STEERS_FROM_MPS = 0.2
 
@@ -114,11 +112,23 @@ def open_ros2_session(
         raise UserError(str(error).replace("--listen", option)) from None
 
 
+class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
+    """`config.example.toml` documents each key. A topic that is empty is not published."""
+
+    listen: Optional[str] = None
+    connect: Optional[str] = None
+    namespace: str = "/"
+    twist_topic: str = "cmd_vel"
+    twist_angular: str = YAW_RATE
+    ackermann_topic: str = ""
+    odometry_topic: str = "odom"
+    odometry_angular: str = YAW_RATE
+
+
 def check_settings(settings: Ros2Settings) -> None:
     """Raise UserError where the settings are not valid, or name nothing to be driven by."""
-    check_choice("ros2.model", settings.model, tuple(SPECS))
-    check_choice("ros2.twist_angular", settings.twist_angular, _ANGULAR)
-    check_choice("ros2.odometry_angular", settings.odometry_angular, _ANGULAR)
+    for name in ("twist_angular", "odometry_angular"):
+        check_choice(f"vehicle.ros2.{name}", getattr(settings, name), _ANGULAR)
     if settings.listen is not None and settings.connect is not None:
         raise UserError("ros2 has both listen and connect: give one of them")
     for endpoint in (settings.listen, settings.connect):
@@ -158,7 +168,7 @@ class Ros2Core(StreamedCore):
         """Drive again as soon as fresh odometry shows that the vehicle is there."""
         self._stamp_ns = 0  # whatever comes next counts: the sender's clock may have been set back
         self._angular = None
-        self._heard = Speeds()
+        self._heard.forget()
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
@@ -198,7 +208,7 @@ class Ros2Core(StreamedCore):
         return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"
 
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
-        if now_s - max(self._newest_s, since_s) <= ODOMETRY_SILENCE_S:
+        if now_s - max(self._newest_s, since_s) <= self._heard.silence_s:
             return None
         return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
 
@@ -221,6 +231,7 @@ class Ros2Vehicle(StreamedVehicle):
     """
 
     name: ClassVar[str] = "ros2"
+    settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings
 
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         from edge_runtime.vehicles.ros2 import node as ros
@@ -230,7 +241,9 @@ class Ros2Vehicle(StreamedVehicle):
         super().__init__(Ros2Core(settings, similarity))
         self._failing = False
         self._publish: List[Callable[[Motion], None]] = []
-        self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")
+        self._session = open_ros2_session(
+            settings.listen, settings.connect, "[vehicle.ros2] listen"
+        )
         try:
             self._node = node = ros.Ros2Node(self._session, settings.namespace)
             if settings.twist_topic:

@@ -27,7 +27,7 @@ try:
 
     # Private, but in the signature of `serialize`; the package is pinned, and a test would notice.
     from pycdr2._support import Buffer, Endianness
-    from pycdr2.types import array, float32, float64, int32, uint8, uint32
+    from pycdr2.types import array, float32, float64, int32, uint32
 except ImportError:
     raise UserError(
         "ROS 2 messages need the package pycdr2: pip install 'phil-edge-runtime[ros2]',"
@@ -43,7 +43,6 @@ TYPES: Dict[str, str] = {
     ),
     "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
     "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
-    "sensor_msgs/msg/Image": "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
 }
 """The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery."""
 
@@ -163,25 +162,12 @@ class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
     twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
 
 
-@dataclass
-class Image(IdlStruct, typename="sensor_msgs/msg/Image"):
-    """`height` rows of `step` bytes each."""
-
-    header: Header = field(default_factory=Header)
-    height: uint32 = 0
-    width: uint32 = 0
-    encoding: str = "mono8"
-    is_bigendian: uint8 = 0
-    step: uint32 = 0
-    data: bytes = b""  # On the wire a sequence of uint8; pycdr2 copies bytes in one piece.
-
-
 def stamp_of(time_ns: int) -> Time:
     """The wall clock's nanoseconds as a ROS time."""
     return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
 
 
-_M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
+_M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry)
 
 
 def encode(message: IdlStruct) -> bytes:

@@ -1,18 +1,15 @@
 // The cockpit: joins the hands, the link to the trainer, and what is drawn.
 
+import { showCoach } from "./coach.js";
 import { Gamepads } from "./gamepad.js";
-import { Keyboard, Pad } from "./hands.js";
+import { Keyboard, list, Pad, ways } from "./hands.js";
 import { Link } from "./link.js";
-import { drawFrames, drawScene, History } from "./scene.js";
+import { drawFrames, drawPicture, drawScene, History } from "./scene.js";
 
 const byId = (id) => document.getElementById(id);
 const STEP_MS = 1000 / 60;
 const SURE_MS = 3000; // within which Quit is pressed again
 const STALE_MS = 1000; // without a new view the trainer is busy, and says so
-const WORDS = {
-  left_turn: { title: "left turn", meaning: "pedal", plus: "throttle", minus: "brake" },
-  congestion: { title: "congestion", meaning: "steering", plus: "right", minus: "left" },
-};
 const WHO = {
   waiting: ["Nobody drives yet", "the trainer is starting"],
   lost: ["Connection lost", "you have let go; looking for the trainer"],
@@ -57,36 +54,42 @@ function step() {
 }
 
 function see(next) {
-  if (next.scenario !== view?.scenario) enter(next.scenario);
+  if (next.scenario !== view?.scenario) enter(next);
   view = next;
   viewMs = performance.now();
   history.add(view);
   requestAnimationFrame(draw);
 }
 
-function enter(scenario) {
-  keyboard.scenario = touch.scenario = gamepads.scenario = scenario;
-  const words = WORDS[scenario];
-  byId("scenario").textContent = words.title;
-  byId("meaning").textContent = `${words.meaning}: ${words.minus} ◂ ▸ ${words.plus}`;
-  for (const side of ["plus", "minus"]) {
-    for (const word of document.querySelectorAll(`.${side}-word`)) word.textContent = words[side];
+function enter({ scenario, controls }) {
+  keyboard.controls = touch.controls = gamepads.controls = controls;
+  gamepads.scenario = scenario;
+  const { aside, along } = ways(controls);
+  byId("scenario").textContent = scenario.replace("_", " ");
+  byId("meaning").textContent = `${controls.names.join(", ")}: - ◂ ▸ +`;
+  for (const [side, text] of [["plus", aside ? "right" : "up"], ["minus", aside ? "left" : "down"]]) {
+    for (const word of document.querySelectorAll(`.${side}-word`)) word.textContent = text;
   }
-  byId("pad").className = scenario === "left_turn" ? "upright" : "level";
+  byId("pad").className = aside ? "level" : "upright";
+  byId("pad").hidden = !aside && !along;
   changed(); // a key may be down already
 }
 
 function draw() {
   if (document.body.dataset.link !== "live") return;
   document.body.dataset.control = view.control;
-  drawScene(byId("scene"), view);
-  drawFrames(frames, view.frames);
+  if (view.scene) drawScene(byId("scene"), view);
+  else if (view.picture) drawPicture(byId("scene"), view.picture);
+  byId("frames").parentElement.hidden = !view.frames;
+  if (view.frames) drawFrames(frames, view.frames);
   history.draw();
+  showCoach(view.coach);
   bar("policy", view.policy_action);
   bar("applied", view.applied_action);
   byId("place").textContent = `episode ${view.episode}, ${view.time_s.toFixed(1)} s`;
-  byId("speed-value").textContent = view.speed_mps.toFixed(1);
-  byId("distance").textContent = `${view.distance_m.toFixed(1)} of ${view.goal_m.toFixed(0)} m`;
+  byId("speed-value").textContent = view.speed_mps?.toFixed(1) ?? "–";
+  const way = view.goal_m === null ? "" : `${view.distance_m.toFixed(1)} of ${view.goal_m.toFixed(0)} m`;
+  byId("distance").textContent = way;
   byId("late").textContent = view.late_ticks ? `${view.late_ticks} late` : "";
   byId("progress").textContent = view.progress;
   byId("message").textContent = view.paused ? view.message || "paused" : view.message;
@@ -113,11 +116,17 @@ function showWho() {
 function bar(name, action) {
   const element = document.querySelector(`.bar.${name}`);
   const known = action !== null && action !== undefined;
-  const value = known ? action : 0;
-  const fill = element.querySelector("u");
-  fill.style.left = `${50 + Math.min(value, 0) * 50}%`;
-  fill.style.width = `${Math.abs(value) * 50}%`;
-  element.querySelector("output").textContent = known ? value.toFixed(2) : "–";
+  const values = list(action);
+  const track = element.querySelector("i");
+  while (track.children.length < values.length) track.append(document.createElement("u"));
+  [...track.children].forEach((fill, i) => {
+    const value = values[i] ?? 0;
+    fill.style.left = `${50 + Math.min(value, 0) * 50}%`;
+    fill.style.width = `${Math.abs(value) * 50}%`;
+    fill.style.top = `${(100 * i) / values.length}%`;
+    fill.style.height = `${100 / values.length}%`;
+  });
+  element.querySelector("output").textContent = known ? values.map((v) => v.toFixed(2)).join(" ") : "–";
 }
 
 function hearEcho(echo) {
@@ -158,6 +167,10 @@ function wish(word) {
 for (const button of document.querySelectorAll("[data-wish]")) {
   button.addEventListener("click", () => wish(button.dataset.wish));
 }
+
+byId("full-screen").hidden = !document.fullscreenEnabled; // as on iPhones
+byId("full-screen").addEventListener("click", () => document.fullscreenElement
+  ? document.exitFullscreen() : document.documentElement.requestFullscreen());
 
 function item(text) {
   const element = document.createElement("li");

@@ -3,6 +3,8 @@
 // The action is what pushes to the plus less what pushes to the minus; a stick or a wheel is both
 // in one axis, a pair of pedals is two.
 
+import { list, mix, shares, ways } from "./hands.js";
+
 const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
 const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
 
@@ -14,15 +16,15 @@ const SOURCES = {
   button: (pad, index) => pad.buttons[index]?.value ?? 0,
 };
 
-export function preset(pad, scenario) {
+export function preset(pad, upright) {
   const common = { dead: 0.05, full: 1, invert: false, hold: "button 5" };
   if (pad.mapping === "standard") {
-    return scenario === "left_turn"
+    return upright
       ? { ...common, plus: "button 7", minus: "button 6" }
       : { ...common, plus: "axis 0", minus: "", dead: 0.15 };
   }
   // A wheel: axis 0 turns, the next ones are pedals (a G29's throttle and brake).
-  return scenario === "left_turn"
+  return upright
     ? { ...common, plus: "pedal 2", minus: "pedal 3", hold: MOVING }
     : { ...common, plus: "axis 0", minus: "", dead: 0.02, full: 0.25, hold: MOVING };
 }
@@ -46,7 +48,7 @@ export class Gamepads {
   constructor(form, changed) {
     this.form = form;
     this.changed = changed;
-    this.scenario = null;
+    this.scenario = this.controls = null;
     this.pad = null;
     this.said = { action: 0, engaged: false, by_moving: false };
     for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
@@ -64,13 +66,25 @@ export class Gamepads {
     const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
     if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
     this.pad = pad;
-    const said = pad ? read(pad, this.choice) : { action: 0, engaged: false, by_moving: false };
+    const said = pad ? this.said_by(pad) : { action: 0, engaged: false, by_moving: false };
     const before = this.said;
     this.said = said;
-    const moved = Math.abs(said.action - before.action) > 0.002;
+    const was = list(before.action);
+    const moved = list(said.action).some((value, i) => Math.abs(value - (was[i] ?? 0)) > 0.002);
     if (moved || said.engaged !== before.engaged || said.by_moving !== before.by_moving) {
       this.changed();
     }
+  }
+
+  // What is chosen presses left and right, or up and down where there is no aside. Of a device
+  // that does both, the pedals are those of its preset.
+  said_by(pad) {
+    const said = read(pad, this.choice);
+    const { aside, along } = ways(this.controls);
+    const several = aside && along && list(this.controls.rest).length > 1;
+    const pedals = several ? read(pad, { ...preset(pad, true), hold: this.choice.hold }).action : 0;
+    const place = aside ? { aside: said.action, along: pedals } : { along: said.action };
+    return { ...said, action: mix(this.controls, shares(place)) };
   }
 
   now() {
@@ -82,7 +96,7 @@ export class Gamepads {
     this.form.name.textContent = pad ? pad.id : "none: press one of its buttons";
     if (!pad) return;
     this.key = `${pad.id} ${this.scenario}`;
-    this.choice = { ...preset(pad, this.scenario), ...kept()[this.key] };
+    this.choice = { ...preset(pad, !ways(this.controls).aside), ...kept()[this.key] };
     const numbered = (kind, count) => [...Array(count).keys()].map((index) => `${kind} ${index}`);
     const axes = numbered("axis", pad.axes.length);
     const pedals = numbered("pedal", pad.axes.length);

@@ -1,75 +1,95 @@
 // Keyboard and sliding pad. A held key or finger takes over; letting go hands control back.
 
-// A pedal is down in 0.2 s; a wheel is turned by a tap, not thrown. As in trainer/person/devices.py.
-const KEYS = {
-  left_turn: { plus: ["ArrowUp", "KeyW"], minus: ["ArrowDown", "KeyS"], perSecond: 5.0 },
-  congestion: { plus: ["ArrowRight", "KeyD"], minus: ["ArrowLeft", "KeyA"], perSecond: 2.5 },
-};
+// Which keys there are, and what each adds to hands off, comes with a view: ``controls``, as in
+// trainer/person/controls.py. An action is one number, or a list of several.
 const FIRST_S = 0.1; // what a press is worth at once
-const HOLD = "Space";
-const DRIVING = new Set([HOLD, ...Object.values(KEYS).flatMap((keys) => [...keys.plus, ...keys.minus])]);
+const HOLD = "space";
 const WISHES = { KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit" };
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
+const keyOf = (code) => code.replace(/^(Arrow|Key|Digit)/, "").toLowerCase();
+export const list = (action) => [].concat(action ?? 0);
+const plain = (values) => (values.length === 1 ? values[0] : values);
+
+// The action while keys are pressed so far, each from 0 to 1.
+export function mix(controls, shares) {
+  const added = list(controls.rest).map((rest, i) =>
+    Object.entries(shares).reduce(
+      (sum, [key, share]) => sum + share * (list(controls.keys[key])[i] ?? 0), rest));
+  return plain(added.map(clip));
+}
+
+// Whether an environment is driven aside, and whether up and down.
+export const ways = (controls) => ({ aside: "left" in controls.keys, along: "up" in controls.keys });
 
 export class Keyboard {
   constructor(changed, wish) {
-    this.scenario = null; // until the first view: nothing is driven
+    this.controls = null; // until the first view: nothing is driven
     this.down = new Set();
-    this.action = 0;
+    this.pressed = []; // what the keys add to hands off
     this.changed = changed;
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
       if (event.code in WISHES && !event.repeat) return wish(WISHES[event.code]);
-      if (!DRIVING.has(event.code)) return;
+      const key = keyOf(event.code);
+      if (!this.drives(key)) return;
       event.preventDefault(); // neither scroll, nor press the button that was clicked last
       if (event.repeat) return;
-      this.down.add(event.code);
-      const first = this.way() * this.perSecond() * FIRST_S;
-      // The other direction begins at once, from rest.
-      if (this.action * first < 0 || Math.abs(this.action) < Math.abs(first)) this.action = first;
+      this.down.add(key);
+      this.pressed = this.way().map((way, i) => {
+        const first = way * this.perSecond() * FIRST_S;
+        const now = this.pressed[i] ?? 0;
+        // The other direction begins at once, from rest.
+        return now * first < 0 || Math.abs(now) < Math.abs(first) ? first : now;
+      });
       changed();
     });
     addEventListener("keyup", (event) => {
-      if (DRIVING.has(event.code) && !typing(event.target)) event.preventDefault();
-      if (this.down.delete(event.code)) this.settle();
+      const key = keyOf(event.code);
+      if (this.drives(key) && !typing(event.target)) event.preventDefault();
+      if (this.down.delete(key)) this.settle();
     });
     // A page without the focus hears no key come up.
     for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
     addEventListener("visibilitychange", () => document.hidden && this.release());
   }
 
-  isDown(codes) {
-    return codes.some((code) => this.down.has(code));
+  drives(key) {
+    if (!this.controls) return key === HOLD || /^(up|down|left|right|[wasd])$/.test(key);
+    return key === HOLD || key in this.controls.keys;
   }
 
+  // How far the keys that are held want to go from hands off.
   way() {
-    const keys = KEYS[this.scenario];
-    return keys ? this.isDown(keys.plus) - this.isDown(keys.minus) : 0;
+    if (!this.controls) return [];
+    const held = Object.fromEntries([...this.down].map((key) => [key, 1]));
+    const rest = list(this.controls.rest);
+    return list(mix(this.controls, held)).map((wanted, i) => wanted - rest[i]);
   }
 
   perSecond() {
-    return KEYS[this.scenario]?.perSecond ?? 0;
+    return this.controls?.rate_per_s ?? 0;
   }
 
   engaged() {
-    const keys = KEYS[this.scenario];
-    return Boolean(keys) && this.isDown([HOLD, ...keys.plus, ...keys.minus]);
+    return this.controls !== null && [...this.down].some((key) => this.drives(key));
   }
 
   // Grow towards what is held, fall back to nothing without.
   step(seconds) {
     const by = this.perSecond() * seconds;
-    const target = this.engaged() ? this.way() : 0;
-    const next = clip(this.action + Math.min(Math.max(target - this.action, -by), by));
-    if (next !== this.action) {
-      this.action = next;
+    const next = this.way().map((way, i) => {
+      const now = this.pressed[i] ?? 0;
+      return now + Math.min(Math.max((this.engaged() ? way : 0) - now, -by), by);
+    });
+    if (next.some((value, i) => value !== (this.pressed[i] ?? 0))) {
+      this.pressed = next;
       this.changed();
     }
   }
 
   settle() {
-    if (!this.engaged()) this.action = 0;
+    if (!this.engaged()) this.pressed = [];
     this.changed();
   }
 
@@ -79,17 +99,19 @@ export class Keyboard {
   }
 
   now() {
-    return { action: this.action, engaged: this.engaged(), by_moving: false };
+    const rest = list(this.controls?.rest);
+    const action = plain(rest.map((value, i) => clip(value + (this.pressed[i] ?? 0))));
+    return { action, engaged: this.engaged(), by_moving: false };
   }
 }
 
 export class Pad {
   constructor(element, knob, changed) {
-    this.scenario = null;
+    this.controls = null;
     this.element = element;
     this.knob = knob;
     this.finger = null;
-    this.action = 0;
+    this.at = { aside: 0, along: 0 }; // the finger, right and up to 1
     this.changed = changed;
     element.addEventListener("pointerdown", (event) => {
       if (this.finger !== null) return;
@@ -108,33 +130,38 @@ export class Pad {
   move(event) {
     if (event.pointerId !== this.finger) return;
     const box = this.element.getBoundingClientRect();
-    const upright = this.scenario === "left_turn";
-    const share = upright
-      ? 1 - (2 * (event.clientY - box.top)) / box.height
-      : (2 * (event.clientX - box.left)) / box.width - 1;
+    const along = 1 - (2 * (event.clientY - box.top)) / box.height;
+    const aside = (2 * (event.clientX - box.left)) / box.width - 1;
     // The outer tenth is full action: a thumb need not find the edge.
-    this.action = clip(share / 0.9);
+    this.at = { aside: clip(aside / 0.9), along: clip(along / 0.9) };
     this.changed();
   }
 
   release() {
     if (this.finger === null) return;
     this.finger = null;
-    this.action = 0;
+    this.at = { aside: 0, along: 0 };
     this.changed();
   }
 
   draw() {
-    const upright = this.scenario === "left_turn";
-    this.knob.style.left = `${upright ? 50 : 50 + 40 * this.action}%`;
-    this.knob.style.top = `${upright ? 50 - 40 * this.action : 50}%`;
+    const can = this.controls ? ways(this.controls) : {};
+    this.knob.style.left = `${50 + 40 * (can.aside ? this.at.aside : 0)}%`;
+    this.knob.style.top = `${50 - 40 * (can.along ? this.at.along : 0)}%`;
     this.element.classList.toggle("held", this.finger !== null);
   }
 
   now() {
-    const engaged = this.finger !== null && this.scenario !== null;
-    return { action: this.action, engaged, by_moving: false };
+    if (!this.controls) return { action: 0, engaged: false, by_moving: false };
+    const action = mix(this.controls, shares(this.at));
+    return { action, engaged: this.finger !== null, by_moving: false };
   }
+}
+
+// A place of a stick, a wheel or a finger as keys that are pressed so far.
+export function shares({ aside = 0, along = 0 }) {
+  const part = (value) => Math.max(value, 0);
+  return { left: part(-aside), right: part(aside), up: part(along), down: part(-along) };
 }
 
 const typing = (target) => ["INPUT", "SELECT", "TEXTAREA"].includes(target?.tagName);

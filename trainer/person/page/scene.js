@@ -11,12 +11,12 @@ const COLOURS = {
   glass: "rgba(10, 12, 15, 0.75)",
 };
 // The colours of what decides are the same in every view: colours.css has them.
-const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
+export const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;
 
 // A canvas as sharp as the screen; returns its pen with the scale in its units.
-function sharp(canvas, width, height) {
+export function sharp(canvas, width, height) {
   const ratio = devicePixelRatio || 1;
   const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
@@ -46,7 +46,18 @@ export function drawScene(canvas, view) {
   for (const car of scene.vehicles) drawCar(pen, car, view.control);
 }
 
-function line(pen, points, colour, width) {
+// What an environment draws that has no scene: a JPEG in base64.
+export function drawPicture(canvas, base64) {
+  const image = new Image();
+  image.onload = () => {
+    const width = canvas.clientWidth;
+    const height = (width * image.height) / image.width;
+    sharp(canvas, width, height).drawImage(image, 0, 0, width, height);
+  };
+  image.src = `data:image/jpeg;base64,${base64}`;
+}
+
+export function line(pen, points, colour, width) {
   pen.beginPath();
   for (const [x, y] of points) pen.lineTo(x, y);
   pen.strokeStyle = colour;
@@ -126,7 +137,8 @@ export class History {
     });
     line(pen, [[0, height / 2], [width, height / 2]], "#3a424d", 1);
     const trace = (index, colour, wide) => {
-      const known = this.steps.map((step, i) => [left + (i + 0.5) * dx, step[index]]);
+      const first = (action) => (Array.isArray(action) ? action[0] : action);
+      const known = this.steps.map((step, i) => [left + (i + 0.5) * dx, first(step[index])]);
       const points = known.filter(([, action]) => action !== null);
       line(pen, points.map(([x, action]) => [x, y(action)]), colour, wide);
     };

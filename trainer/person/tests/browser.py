@@ -4,6 +4,7 @@
 """
 
 import asyncio
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -14,9 +15,8 @@ from functools import cache
 
 import aiohttp
 
-from trainer.drivers import make_environment
+from trainer.environments import make_environment
 from trainer.person.interface import View
-from trainer.util import find_chromium
 
 WAIT_S, PATIENCE_S = 5.0, 20.0
 DESKTOP = {"width": 1280, "height": 740}
@@ -29,6 +29,12 @@ POLICY_DRIVES = (
     " && !document.getElementById('message').textContent"
 )
 WHY = "document.getElementById('why').textContent"
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+def find_chromium() -> str | None:
+    """The path of the browser, or None where there is none."""
+    return next((path for name in CHROMIUM if (path := shutil.which(name))), None)
 
 
 @cache
@@ -155,6 +161,7 @@ async def open_browser(scripts=(), **options):
 async def quit_sitting(page):
     await page.keyboard.press("KeyQ")
     await page.keyboard.press("KeyQ")
+    await until(page, OVER)  # A page that closes sooner may take the word with it.
 
 
 def address(process):

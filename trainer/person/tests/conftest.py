@@ -6,10 +6,9 @@ from contextlib import closing
 
 import pytest
 
-from trainer.person.tests.browser import READY, first_view, open_browser, until
+from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
 from trainer.tests.conftest import one_thread
-from trainer.util import find_chromium
 
 __all__ = ["browser", "cockpit", "one_thread", "opened", "runner"]
 

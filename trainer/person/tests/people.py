@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from trainer.drivers import make_environment
+from trainer.environments import make_environment
 from trainer.person.interface import LET_GO, Moving, Reading, View, Wish
 from trainer.person.recording import Recorder, Step
 from trainer.person.session import Sitting

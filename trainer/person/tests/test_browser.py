@@ -2,10 +2,12 @@
 
 import asyncio
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from bridge.rerun import BY_NAME
+from trainer.person.coach import Coaching, Episode, advise
 from trainer.person.interface import LET_GO
 from trainer.person.tests.browser import (
     LIVE,
@@ -113,6 +115,7 @@ async def test_a_finger_on_the_pad_drives(browser, cockpit):
 
 TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 768), (768, 1024)]
 """Phones and tablets, either way up."""
+LONG_ADVICE = advise([Episode(0, "collision", 0.0, 0)] * 10, None, {})
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
@@ -122,8 +125,9 @@ async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, size, scen
     viewport = {"width": width, "height": height}
     async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
         await page.goto(cockpit.url)
-        cockpit.show(first_view(scenario))
-        await until(page, READY)
+        said = Coaching(LONG_ADVICE, "", "", [], [], 0.0, [])
+        cockpit.show(replace(first_view(scenario), coach=said))
+        await until(page, f"{READY} && document.getElementById('advice').textContent")
         boxes = await page.evaluate(
             "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
             "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
@@ -193,7 +197,7 @@ async def test_buttons_and_keys_wish_once_and_quitting_asks_again(browser, cockp
 
 
 async def test_what_is_shown_is_drawn(browser, cockpit):
-    view = replace(first_view(), control="human", speed_mps=4.25, message="saving", episode=7)
+    view: Any = replace(first_view(), control="human", speed_mps=4.25, message="saving", episode=7)
     cockpit.show(view)
     await until(browser, "document.body.dataset.control === 'human'")
     assert await browser.text_content("#who") == "You drive"
@@ -213,6 +217,36 @@ async def test_what_is_shown_is_drawn(browser, cockpit):
         ".getImageData(0, 0, scene.width, scene.height).data.buffer)).size"
     )
     assert await browser.evaluate(colours) > 10
+
+
+async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpit):
+    coach = Coaching(
+        advice="Watch only.", said="42 s at the wheel", alone="94%", human_s=42.0,
+        curve=[(5.0, 0.2), (30.0, 0.94)], typical=[(10.0, 0.5), (28.0, 0.9)],
+        episodes=[Episode(6, "collision", 0.0, 0), Episode(7, "goal", 2.25, 1, 1.5)],
+    )  # fmt: skip
+    cockpit.show(replace(first_view(), coach=coach))
+    await until(browser, "document.getElementById('advice').textContent === 'Watch only.'")
+    assert await browser.text_content("#alone") == "94%"
+    newest, older = (await browser.inner_text("#episodes")).splitlines()[1:]
+    assert newest.split() == ["7", "goal", "2.3", "1"]
+    assert older.split() == ["6", "collision", "0.0", "0"]
+    colours = (
+        "new Set(new Uint32Array(curve.getContext('2d')"
+        ".getImageData(0, 0, curve.width, curve.height).data.buffer)).size"
+    )
+    assert await browser.evaluate(colours) > 5
+    cockpit.show(first_view())
+    await until(browser, "document.getElementById('coach').hidden")
+    assert await browser.is_hidden("#advice")
+    assert await browser.is_hidden("#listed")
+
+
+async def test_the_screen_is_filled_and_left(browser):
+    await browser.click("#full-screen")
+    await until(browser, "document.fullscreenElement")
+    await browser.click("#full-screen")
+    await until(browser, "!document.fullscreenElement")
 
 
 async def test_a_second_page_is_told_that_it_watches(browser, cockpit):

@@ -8,14 +8,24 @@ import numpy as np
 import pytest
 
 from bridge import rerun
-from trainer.drivers import EXPERTS, make_environment
-from trainer.person.devices import SIZE, JoystickHands, KeyboardHands, Window, pygame
+from trainer.environments import make_environment
+from trainer.person.coach import Coaching, Episode
+from trainer.person.devices import (
+    COACH_LEFT,
+    COACH_WIDTH,
+    SIZE,
+    JoystickHands,
+    KeyboardHands,
+    Window,
+    pygame,
+)
 from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.browser import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
 from trainer.tests.humans import drive
 
+FAILED = Episode(3, "collision", 0.0, 0)
 G29 = read_profile(SHIPPED / "g29.toml")
 
 
@@ -79,7 +89,7 @@ def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | No
 def test_keys_are_enough_to_drive(scenario, keys):
     """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
     env = make_environment(scenario)
-    expert, periods = EXPERTS[scenario](env), count()
+    expert, periods = env.expert(), count()
     for seed in range(6):
         expert.reset()
         hands, down, wanted, action = KeyboardHands(scenario), None, [0.0, 0.0], 0.0
@@ -184,11 +194,20 @@ def test_all_of_it_is_seen_on_any_screen(opened, screen):
     assert bar.bottom / height == pytest.approx((400 + 16 + 24 + 2 * 42 + 18) / SIZE[1], abs=0.01)
 
 
+def test_the_learning_curve_runs_through_the_right_column(opened):
+    curve = [(1.0, 0.2), (29.0, 0.9)]
+    coach = Coaching("Watch only.", "29 s at the wheel", "90%", curve, [], 29.0, [FAILED])
+    opened(1920, 1080).show(replace(first_view(), control="human", policy_action=0, coach=coach))
+    line = found(rerun.POLICY)
+    assert line.left >= COACH_LEFT
+    assert line.width == pytest.approx(28 / 30 * COACH_WIDTH, abs=6)
+
+
 def test_a_window_that_is_resized_shows_all_of_it_in_its_shape(opened):
     window = opened(1920, 1080)
     pygame.display.set_mode((520, 680), pygame.RESIZABLE)
     window.show(replace(first_view(), human_action=1.0, control="policy"))
-    assert found(rerun.HUMAN).width == pytest.approx(200 / 2, abs=3)
+    assert found(rerun.HUMAN).width == pytest.approx(200 * 520 / SIZE[0], abs=3)
     assert found(rerun.HUMAN).top > 170, "in the middle"
 
 

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from trainer.person import profile as module
 from trainer.person.profile import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 
 PLACE = st.floats(-1.0, 1.0)
@@ -91,71 +90,3 @@ def test_a_wrong_profile_is_one_line(tmp_path, found, wrong, complaint):
     path.write_text(GOOD.replace(found, wrong))
     with pytest.raises(UserError, match=f"^.*{path}.*{re.escape(complaint)}.*$"):
         read_profile(path)
-
-
-class Trembling:
-    """A wheel with two pedals whose axes tremble before they are held still; a look is a moment."""
-
-    def __init__(self, answers):
-        self._answers = answers
-        self._pressed: set[int] = set()
-        self._let_go()
-        self.get_name = lambda: 'A "quoted" wheel'
-        self.get_numaxes, self.get_numbuttons = lambda: 3, lambda: 12
-        self.get_axis = lambda axis: self._coming[axis][0]
-        self.get_button = self._pressed.__contains__
-
-    def _let_go(self):
-        self._coming = {0: [0.0], 1: [-1.0], 2: [-1.0]}
-
-    def look(self):
-        for places in self._coming.values():
-            if len(places) > 1:
-                places.pop(0)
-
-    def answer(self, line):
-        for word, (axis, place) in self._answers.items():
-            if word in line:
-                self._coming[axis] = [0.5, 0.7, 0.4, 0.6] * 5 + [place]
-        if "let go" in line:
-            self._let_go()
-        if "button" in line:
-            self._pressed.add(7)
-
-
-ANSWERS = {"LEFT": (0, 0.5), "RIGHT": (0, -0.4), "THROTTLE": (2, 0.9), "BRAKE": (1, 1.0)}
-
-
-@pytest.fixture
-def ask(monkeypatch):
-    for name, value in {"STEADY_S": 0.05, "FIRST_S": 0.0, "LOOK_S": 0.001}.items():
-        monkeypatch.setattr(module, name, value)
-
-    def ask(answers):
-        wheel = Trembling(answers)
-        return module.ask(wheel, wheel.look, wheel.answer)
-
-    return ask
-
-
-def test_the_answers_become_a_profile(ask, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(ask(ANSWERS))
-    profile = read_profile(path)
-    assert (profile.name, profile.match) == ('A "quoted" wheel',) * 2
-    assert profile.buttons == {"hold": (7,)}
-    for scenario, places, action in (
-        ("congestion", {0: 0.5, 1: -1.0, 2: 0.9}, -1.0),
-        ("congestion", {0: -0.4}, 1.0),
-        ("left_turn", {0: 0.5, 1: -1.0, 2: 0.9}, 1.0),
-        ("left_turn", {2: -1.0, 1: 1.0}, -1.0),
-    ):
-        assert profile.action(scenario, places) == pytest.approx(action, abs=0.01)
-
-
-def test_left_and_right_on_different_axes_is_refused_and_no_answer_ends_it(ask, monkeypatch):
-    with pytest.raises(UserError, match="left was axis 0, right axis 2"):
-        ask({**ANSWERS, "RIGHT": (2, 0.5)})
-    monkeypatch.setattr(module, "PATIENCE_S", 0.3)
-    with pytest.raises(UserError, match="no profile was written"):
-        ask({})

@@ -9,6 +9,8 @@ import pytest
 
 from edge_runtime.tests.harness import wait_until
 from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.learner.networks import Actor
+from trainer.person.alone import BehindTheScenes, Check
 from trainer.person.run import KeptBack, PersonRun, UnhurriedLearning
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
@@ -112,6 +114,16 @@ def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
     np.testing.assert_array_equal(other.act(frames(7)), action)
     assert unhurried.act_together(frames(7)[None], averaged=True).shape == (1, 1)
     other.close()
+
+
+def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either():
+    behind = BehindTheScenes(RunConfig())
+    for _ in range(2):
+        behind.begin(Check(Actor(), 1, 0.0, {}))
+        behind.kill()
+        wait_until(lambda: not behind.busy, "the answer's absence")
+        assert behind.take() is None
+    behind.close()
 
 
 @pytest.mark.parametrize(

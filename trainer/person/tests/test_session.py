@@ -16,7 +16,7 @@ def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=No
     """Drive as the readings say, then quit: outcomes, recorded steps, views, and the sitting."""
     person = person or Puppet(readings, QUIT, presence)
     sitting = make_sitting(directory, person, alone=policy is None)
-    outcomes = drive(sitting, None if policy is None else constant_driver(policy), 0, None)
+    outcomes = drive(sitting, None if policy is None else constant_driver(policy), abs, None)
     sitting.close()
     path = sitting.recorder.path
     return outcomes, list(read_steps(path)) if path.exists() else [], person.views, sitting
@@ -36,6 +36,8 @@ def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_pat
     np.testing.assert_array_equal(driven[0].frames, steps[0].observation)
     for step, view in zip(steps, driven[1:], strict=False):
         assert (view.applied_action, view.control) == (step.action, step.control)
+    given = 0.1 * sum(step.human for step in steps)
+    assert views[-1].cost == {"human_s": pytest.approx(given), "takeovers": 1, "failures": 0}
 
 
 def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):

@@ -2,6 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trainer.person.controls import distance
 from trainer.person.interface import LET_GO, WISHES, Moving, Reading
 from trainer.person.takeover import MAX_SLEW, NEXT, SILENCE_S, Input, Intent, Seat, TakeOver
 
@@ -18,12 +19,13 @@ def test_a_hand_over_never_jumps_and_all_but_the_policys_own_action_is_the_perso
         applied = take_over.step(policy, human, holds)
         followed = before == take_over.state in ("policy", "human")
         if last is not None and not followed:
-            assert abs(applied.action - last) <= MAX_SLEW + EPSILON
+            assert distance(applied.action, last) <= MAX_SLEW + EPSILON
         # An intervention has one first step, which already moves towards the person.
         assert applied.first == (applied.human and before == "policy")
         if applied.first:
             start = policy if last is None else last
-            assert abs(human - applied.action) <= max(abs(human - start) - MAX_SLEW, 0.0) + EPSILON
+            left = max(distance(human, start) - MAX_SLEW, 0.0)
+            assert distance(human, applied.action) <= left + EPSILON
         assert applied.human or (applied.action == policy and not holds)
         last, before = applied.action, take_over.state
 

@@ -7,10 +7,13 @@ import socket
 import struct
 import time
 from contextlib import ExitStack, closing, suppress
+from unittest.mock import Mock
+from urllib.parse import urlsplit
 
 import aiohttp
 import numpy as np
 import pytest
+import segno
 
 from edge_runtime.util import UserError
 from trainer.person import web
@@ -76,7 +79,7 @@ async def test_a_view_arrives_whole_and_a_page_that_comes_later_sees_the_newest(
         cockpit.show(expected)
         view = await hear(link, "view")
     frames = np.frombuffer(base64.b64decode(view["frames"]), np.uint8)
-    assert np.array_equal(frames.reshape(2, 45, 80), expected.frames)
+    assert frames.tobytes() == np.array(expected.frames).tobytes()
     assert view["scene"] == json.loads(json.dumps(expected.scene))
     seen = view["policy_action"], view["ground"]["left_m"], view["number"]
     assert seen == (0.25, -30.0, 1)
@@ -154,7 +157,15 @@ async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
     assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
     assert headers["Referrer-Policy"] == "no-referrer"
     assert "default-src 'self'" in headers["Content-Security-Policy"]
-    served = ("cockpit.js", "hands.js", "link.js", "gamepad.js", "scene.js", "cockpit.css")
+    served = (
+        "cockpit.js",
+        "coach.js",
+        "hands.js",
+        "link.js",
+        "gamepad.js",
+        "scene.js",
+        "cockpit.css",
+    )
     for name in (*served, "server.py", "..%2fserver.py"):
         assert (await status_of(cockpit.url + name))[0] == (200 if name in served else 404), name
     assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
@@ -237,11 +248,29 @@ def test_an_address_that_cannot_be_listened_on_is_a_plain_error(cockpit):
 
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
-    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        open_web(host=host).close()
+    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True), ("127.0.0.2", True)):
+        cockpit = open_web(host=host)
+        cockpit.close()
         out, err = capsys.readouterr()
         assert out.startswith("cockpit: open http://")
         assert ("warning: --host" in err) == warned
+        assert (f"phone in this network: {cockpit.phone_url}\n" in out) == warned
+    assert cockpit.phone_url == cockpit.url
+
+
+async def test_a_phone_gets_in_by_the_address_in_the_code_and_loopback_shows_none(
+    cockpit, monkeypatch
+):
+    make = Mock(wraps=segno.make)
+    monkeypatch.setattr(segno, "make", make)
+    with closing(Cockpit("0.0.0.0")) as open_to_all:
+        make.assert_called_once_with(open_to_all.phone_url)
+        status, text, _ = await status_of(open_to_all.phone_url)
+    assert status == 200
+    assert 'src="data:image/svg' in text
+    assert str(open_to_all.phone_url) in text
+    assert urlsplit(open_to_all.phone_url).hostname not in ("0.0.0.0", *web.LOOPBACK)
+    assert "data:image" not in (await status_of(cockpit.url))[1]
 
 
 CROWD = 375

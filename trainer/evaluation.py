@@ -6,20 +6,24 @@ import argparse
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from os import PathLike, fspath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from bridge.network import LatencySpec, parse_spec
+from bridge.network import LatencySpec, Link, parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import counted
-from trainer.drivers import CONDITIONS, ActTogether, load_driver, make_environment
+from trainer.drivers import ActTogether, load_driver
+from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
-from trainer.options import add_latency, add_scenario, add_seed, set_threads
+from trainer.options import add_latency, add_scenario, add_seed, read_json, set_threads
 from trainer.training.delayed import VehicleEnd
 
 EXAMPLE = examples(
@@ -40,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "action from -1 to 1 throughout",
     )
     add_public_key(parser)
-    add_scenario(parser)
+    add_scenario(parser, None)
     parser.add_argument(
         "--condition",
         choices=CONDITIONS,
@@ -65,33 +69,91 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; returns the exit status."""
     if arguments.out:
         check_writable(arguments.out)
-    latency = parse_spec(arguments.latency)
-    env = make_environment(arguments.scenario, arguments.condition)
-    driver, policy_id = load_driver(arguments.policy, env, arguments.public_key)
-    seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    found = evaluate(
+        arguments.policy,
+        arguments.scenario,
+        runs=arguments.runs,
+        seed=arguments.seed,
+        condition=arguments.condition,
+        latency=arguments.latency,
+        public_key=arguments.public_key,
+    )
+    if not arguments.out:
+        print(json.dumps(found.report, indent=2))
+        return 0
+    detail = [asdict(result) for result in found.episodes]
+    write_json_out(arguments.out, {**found.report, "per_episode": detail})
+    distance_m, reward = found.report["surviving_distance_m"], found.report["episode_reward"]
+    success = "" if found.success_rate is None else f"success {found.success_rate:.0%}, "
+    print(
+        f"{counted(arguments.runs, 'episode')}: {success}return {reward['mean']:.2f}, "
+        f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
+    )
+    return 0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a policy drove."""
+
+    report: dict[str, Any]  # As ``trainer evaluate`` prints it
+    episodes: list[EpisodeResult]
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of episodes that reached the goal; None where the environment knows of none."""
+        rate: float | None = self.report["success_rate"]
+        return rate
+
+    @property
+    def mean_return(self) -> float:
+        """Mean of the episodes' sums of rewards."""
+        return float(self.report["episode_reward"]["mean"])
+
+
+def evaluate(
+    policy: str | PathLike[str],
+    scenario: str | None = None,
+    *,
+    runs: int = 50,
+    seed: int = 0,
+    condition: str = "nominal",
+    latency: str = "none",
+    public_key: str | None = None,
+) -> Evaluation:
+    """Drive test episodes with a policy alone, as ``python -m trainer evaluate`` does.
+
+    ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
+    else the left turn. Episode i is reset with ``seed + i``.
+
+    Raises UserError: nothing there that drives, or in another environment.
+    """
+    policy, spec = fspath(policy), parse_spec(latency)
+    scenario = scenario_of(scenario or _trained_in(policy))
+    env = make_environment(scenario, condition)
+    driver, policy_id = load_driver(policy, env, public_key)
+    threads, goals = torch.get_num_threads(), 0
     set_threads(1)  # The last bits must not depend on the machine's cores.
-    goals = 0
-    with ProgressBar("evaluating", arguments.runs) as bar:
+    with ProgressBar("evaluating", runs) as bar:
 
         def on_episode(result: EpisodeResult) -> None:
             nonlocal goals
             goals += result.outcome == GOAL
             bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
-        results = drive_episodes(env, driver, seeds, arguments.condition, on_episode, latency)
-    report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
-    report["latency_spec"] = str(latency)
-    if not arguments.out:
-        print(json.dumps(report, indent=2))
-        return 0
-    detail = [asdict(result) for result in results]
-    write_json_out(arguments.out, {**report, "per_episode": detail})
-    distance_m = report["surviving_distance_m"]
-    print(
-        f"{counted(arguments.runs, 'episode')}: success {report['success_rate']:.0%}, "
-        f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
-    )
-    return 0
+        seeds = range(seed, seed + runs)
+        results = drive_episodes(env, driver, seeds, condition, on_episode, spec)
+    set_threads(threads)
+    report = summarise(results, scenario, condition, policy_id, seed)
+    return Evaluation({**report, "latency_spec": str(spec)}, results)
+
+
+def _trained_in(policy: str) -> str:
+    """The scenario of a run or a human model; of anything else the left turn."""
+    for name in ("config.json", "human.json"):
+        if (Path(policy) / name).is_file():
+            return str(read_json(Path(policy) / name, "config").get("scenario"))
+    return "left_turn"
 
 
 class Drive:
@@ -129,7 +191,7 @@ class Drive:
             outcome=self._info["outcome"],
             distance_m=float(self._info["distance_m"]),
             reward=float(sum(self._rewards)),
-            time_s=len(self._actions) * self.env.config.control_period_s,
+            time_s=len(self._actions) * self.env.control_period_s,
             lateral_acceleration_mps2=float(np.mean(self._lateral)),
             longitudinal_acceleration_mps2=float(np.mean(self._longitudinal)),
             steps=len(self._actions),
@@ -146,7 +208,7 @@ def drive_together(
 
     Args:
         envs: of one scenario and condition.
-        act: actions [n, action size] for observations [n, 2, 45, 80], of a driver without memory.
+        act: actions [n, action size] for observations [n, ...], of a driver without memory.
         seeds: of the episodes.
         condition: one of ``CONDITIONS``.
     """
@@ -173,18 +235,22 @@ def drive_episodes(
     seeds: Iterable[int],
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
-    latency: LatencySpec = NO_NETWORK,
+    latency: LatencySpec | Link = NO_NETWORK,
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
     Its noise is added here; its scene is the environment's own (``drivers.make_environment``).
-    ``latency`` is the network between driver and vehicle, in virtual time.
+    ``latency`` is the network between driver and vehicle, in virtual time; a link serves one
+    episode.
     """
     results = []
     for seed in seeds:
         drive = Drive(env, seed, CONDITIONS[condition].noise_std)
         driver.reset()
-        network = None if latency == NO_NETWORK else VehicleEnd(env, latency, seed)
+        network = None
+        aware = getattr(driver, "aware", None)  # Its commands wait, behind whatever network.
+        if latency != NO_NETWORK or aware:
+            network = VehicleEnd(env, latency, seed, drive.observation, aware)
         while not drive.over:
             seen = drive.observation
             drive.step(network.tick(seen, driver.act) if network else driver.act(seen))

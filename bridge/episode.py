@@ -1,0 +1,289 @@
+"""Driving one episode of an environment over the wire.
+
+An episode is: state out, decision back, one step of the environment, again. What the environment is
+stepped with is the policy's command, or what a vehicle made of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bridge.clocks import Clock
+from bridge.environments import Environment, entry_name
+from bridge.inbound import VehicleDecision
+from bridge.messages import Origin, Stamps
+from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
+from bridge.virtual_link import Decision
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.safety import Event
+from edge_runtime.util import UserError
+from edge_runtime.wire import State
+
+
+class Actuators:
+    """Applies actions to an environment; ``stops`` are those of the policy's safe stop.
+
+    An environment's own ``brake_action`` and ``press_brake`` come before them.
+    """
+
+    def __init__(self, environment: Environment, stops: Sequence[float | None]) -> None:
+        self._own = environment.unwrapped
+        space: Any = environment.action_space
+        self._space, self._stops = space, stops
+        self._shape = space.shape
+        self.hands_off: np.ndarray = np.clip(0.0, space.low, space.high).astype(space.dtype)
+        """Zero, or the nearest in range: what is done before the first command."""
+        self.last = self.hands_off
+
+    def brake(self, pressed: bool) -> None:
+        """Press or release the brake of an environment that has one: its action only steers."""
+        press = getattr(self._own, "press_brake", None)
+        if callable(press):
+            press(pressed)
+
+    def stop(self) -> np.ndarray:
+        """The action of a safe stop, in the environment's shape."""
+        own = getattr(self._own, "brake_action", None)
+        if own is not None:
+            return self.within(own)
+        pairs = zip(self._stops, self.last.ravel().tolist(), strict=True)
+        return self.within([last if stop is None else stop for stop, last in pairs])
+
+    def within(self, action: Any) -> np.ndarray:
+        """The numbers as an action of the environment, within its range."""
+        values = np.asarray(action, self._space.dtype).reshape(self._shape)
+        self.last = np.clip(values, self._space.low, self._space.high)
+        return self.last
+
+
+Apply = Callable[[Actuators, Decision], np.ndarray]
+"""Returns the action of one tick, and presses or releases the brake."""
+PEDAL = "pedal"
+
+
+def policy_action(actuators: Actuators, decision: Decision) -> np.ndarray:
+    """The command's action, the safe stop's, or (before the first command) hands off."""
+    actuators.brake(bool(decision.brake_reason))
+    if decision.brake_reason:
+        return actuators.stop()
+    if decision.command is None:
+        return actuators.hands_off
+    return actuators.within(decision.command.action)
+
+
+def vehicle_action(
+    action_names: Sequence[str], pedal_for_speed: Callable[[float], float] | None = None
+) -> Apply:
+    """Return what applies what the vehicle's actuators have reached.
+
+    Where the vehicle tells the speed of the scenario's car and the environment knows which pedal
+    leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
+    for what the last step missed, while errors of pedals would add up. Without feedback the car
+    brakes fully; an environment that is only steered does so whenever the vehicle brakes.
+    ``action_names`` are those of the policy's actions, in order.
+    """
+    place = list(action_names).index(PEDAL) if PEDAL in action_names else None
+
+    def apply(actuators: Actuators, decision: Decision) -> np.ndarray:
+        assert isinstance(decision, VehicleDecision)
+        actuators.brake(bool(decision.brake_reason))
+        if decision.feedback is None:
+            return actuators.stop()
+        action = list(decision.feedback.action)
+        speed_mps = decision.feedback.scenario_speed_mps
+        if speed_mps is not None and pedal_for_speed is not None and place is not None:
+            action[place] = float(pedal_for_speed(speed_mps))
+        return actuators.within(action)
+
+    return apply
+
+
+PublishScene = Callable[[Any, Stamps], None]
+"""Called with the environment and what is to stand beside its scene."""
+OnTick = Callable[[int, int, Decision], None]
+"""Called with episode, step, decision after every tick."""
+
+
+@dataclass
+class EpisodeRunner:
+    """Drives one environment through a clock and keeps what the report needs."""
+
+    environment: Environment
+    clock: Clock
+    session: str
+    publish_scene: PublishScene
+    on_tick: OnTick
+    task: Task
+    apply: Apply = policy_action
+    standing: bool = False
+    rejected: Callable[[], Mapping[str, int]] = dict
+    origin: Origin | None = None
+    """Of the drive, to be told with every scene; each episode has a seed of its own."""
+
+    def __post_init__(self) -> None:
+        self._layout, self._period_s = Layout(self.task), self.task.control_period_s
+        self.safe_stops = SafeStopLog(self._period_s)
+        self._actuators = Actuators(self.environment, [row.stop for row in self.task.action])
+        self.deadline_misses = 0
+        self.command_ages_ms: list[float] = []
+        """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
+        self.ridden_steps = 0
+        """Ticks in which an action of an earlier command's plan was done."""
+        self._ridden = 0  # In the tick before: of the plan
+        self._under_way: State | None = None
+        self._applied: tuple[list[float] | None, bool] = (None, False)
+        self._options = {"standing": True} if self.standing else None
+
+    def show_task(self, seed: int) -> None:
+        """Send one state, the final one already, so that the edge runtime compares it as well.
+
+        It shows nothing: what another policy observes may be of another size.
+        """
+        self.clock.begin(0, seed)
+        self.clock.finish(self._state(0, 0, None, {}, final=True))
+
+    def run(self, episode: int, seed: int) -> EpisodeResult:
+        """Drive one episode to its end; the seed decides the environment and the link.
+
+        Where it is cut short (^C, a fault of the environment) a final state goes out as well, so
+        that the edge runtime stands by instead of stopping for a link that seems to be lost.
+        """
+        self._under_way = None
+        try:
+            return self._drive(episode, seed)
+        except BaseException:
+            if (cut := self._under_way) is not None:
+                self.clock.finish(msgspec.structs.replace(cut, step=cut.step + 1, final=True))
+            raise
+
+    def _drive(self, episode: int, seed: int) -> EpisodeResult:
+        observation, info = self.environment.reset(seed=seed, options=self._options)
+        self.clock.begin(episode, seed)
+        self._ridden = 0
+        if self.origin is not None:
+            self.origin = msgspec.structs.replace(self.origin, seed=seed)
+        self._applied = (None, False)
+        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        lateral_mps2: list[float] = []
+        longitudinal_mps2: list[float] = []
+        ended = False
+        while not ended:
+            state = self._state(episode, result.steps, observation, info)
+            self._show(state)
+            self._under_way = state
+            decision = self.clock.exchange(state)
+            if decision.brake_reason == Event.OTHER_TASK.value:
+                raise UserError(
+                    "the edge runtime's policy is for another task than this environment"
+                    f" ({self.task.text}); start it with a policy of this one"
+                )
+            action = self.apply(self._actuators, decision)
+            observation, reward, terminated, truncated, info = self.environment.step(action)
+            result.steps += 1
+            applied = [float(value) for value in action.ravel()]
+            result.actions.append(applied)
+            self._applied = (applied, bool(decision.brake_reason))
+            result.reward += _finite("reward", reward)
+            # An environment need not report accelerations; then they count as zero.
+            lateral_mps2.append(abs(_number(info, "lateral_acceleration_mps2")))
+            longitudinal_mps2.append(abs(_number(info, "longitudinal_acceleration_mps2")))
+            self._note(state, decision, _speed_mps(info) or 0.0)
+            ended = bool(terminated or truncated)
+        final = self._state(episode, result.steps, observation, info, final=True)
+        self._show(final)
+        self.clock.finish(final)
+        self._under_way = None
+        result.outcome = outcome_of(info)
+        result.distance_m = _number(info, "distance_m")
+        result.time_s = round(result.steps * self._period_s, 6)
+        result.lateral_acceleration_mps2 = float(np.mean(lateral_mps2))
+        result.longitudinal_acceleration_mps2 = float(np.mean(longitudinal_mps2))
+        return result
+
+    def _state(
+        self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
+    ) -> State:
+        return State(
+            session=self.session,
+            episode=episode,
+            step=step,
+            sim_time_s=round(step * self._period_s, 6),
+            sent_ns=0,  # The clock stamps it when it sends it.
+            observation=self._pack(observation),
+            speed_mps=_speed_mps(info),
+            final=final,
+            task=self.task.text,
+        )
+
+    def _pack(self, observation: Any) -> dict[str, bytes]:
+        if observation is None:
+            return {}
+        return pack(self._layout, self.environment, observation)
+
+    def _show(self, state: State) -> None:
+        step, round_trip_ms = self.clock.newest_answer() or (None, None)
+        stamps = Stamps(
+            state.episode,
+            state.step,
+            state.sim_time_s,
+            round_trip_ms,
+            step,
+            self.rejected(),
+            self.task,
+            b"",
+            self.origin,
+            *self._applied,
+            ridden=self._ridden,
+        )
+        self.publish_scene(self.environment, stamps)
+
+    def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
+        self.deadline_misses += not decision.fresh
+        self._ridden = decision.ridden
+        self.ridden_steps += decision.ridden > 0
+        if decision.command_age_s is not None:
+            self.command_ages_ms.append(decision.command_age_s * 1e3)
+        self.safe_stops.observe(state.episode, state.step, decision, speed_mps)
+        self.on_tick(state.episode, state.step, decision)
+
+
+def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str, bytes]:
+    """An environment's observation as a state carries it. Raises UserError for another shape."""
+    if not isinstance(observation, Mapping):
+        observation = {entry_name(environment.unwrapped): observation}
+    packed = {}
+    for name, dtype, shape, _ in layout.parts:
+        array = np.asarray(observation[name], dtype)
+        if array.shape != shape:
+            raise UserError(f"the observation {name} is {array.shape}, not {shape}")
+        packed[name] = array.tobytes()
+    return packed
+
+
+def outcome_of(info: Mapping[str, Any]) -> str:
+    """How an episode has ended; UNKNOWN where the environment's last ``info`` does not say."""
+    if info.get("outcome"):
+        return str(info["outcome"])
+    return UNKNOWN if "is_success" not in info else GOAL if info["is_success"] else FAILED
+
+
+def _speed_mps(info: dict[str, Any]) -> float | None:
+    return _number(info, "speed_mps") if "speed_mps" in info else None
+
+
+def _number(info: dict[str, Any], name: str) -> float:
+    return _finite(name, info.get(name, 0.0))
+
+
+def _finite(name: str, value: Any) -> float:
+    """Return the number; the wire and the report can carry no other than finite ones."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise UserError(f"the environment's {name} is {number}, not a finite number")
+    return number

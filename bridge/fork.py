@@ -1,0 +1,469 @@
+"""``python -m bridge fork``: a recorded drive again, and on in another way.
+
+The scene is rebuilt from its seed and from what the vehicle did in every step, the simulator's own
+brakes among it; each step is compared with the recorded one, to the bit. From the fork on the loop
+is closed again, in virtual time: a policy inside the edge runtime's decision logic, behind a
+network that has carried the recorded commands until then. So the same policy behind the same
+network repeats a drive of lock-step.
+
+A person forks a drive in the trainer: the bridge imports nothing of it, and runs its command.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import tempfile
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+
+from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, InProcessClock
+from bridge.environments import Environment, describe, make_environment, scene_of
+from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
+from bridge.messages import DECODERS, Heard, Origin, Scene, Stamps, encode_scene
+from bridge.network import LatencySpec, parse_spec
+from bridge.ports import add_options, scene_payload
+from bridge.record import RecordingWriter, new_recording
+from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.report import EpisodeResult
+from bridge.virtual_link import Arrival, Decision
+from edge_runtime import cli
+from edge_runtime.controller import Controller, Received, shared_limits
+from edge_runtime.files import write_atomic, write_json_out
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.policy import Policy, infer, load_policy
+from edge_runtime.util import UserError, counted, printable
+from edge_runtime.wire import DRIVE, Command, State, encode
+
+NOWHERE = Stamps(0, 0, 0.0)
+
+
+def _told(payload: bytes) -> bytes:
+    """What the environment itself tells in a scene, encoded."""
+    fields = msgspec.msgpack.decode(payload)
+    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in NOWHERE._fields})
+
+
+@dataclass
+class RecordedEpisode:
+    """One episode of a recording, by step; ``number`` is its place among them, from 0."""
+
+    path: Path
+    vehicle_id: str
+    number: int
+    origin: Origin
+    episode: int
+    task: Task
+    began_ns: int
+    scenes: dict[int, bytes] = field(default_factory=dict)  # What `_told` makes of them
+    states: dict[int, list[State]] = field(default_factory=dict)  # A network loses and repeats
+    commands: dict[int, Command] = field(default_factory=dict)  # The first answer to each state
+    applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
+    """What was done in a step: the action, and whether the brake was pressed."""
+
+    def take(self, heard: Heard, message: Any) -> None:
+        """Keep a message that is of this episode."""
+        origin = message.origin if isinstance(message, Scene) else message
+        key = getattr(origin, "session", None), getattr(message, "episode", None)
+        if key != (self.origin.session, self.episode):
+            return
+        if isinstance(message, State):
+            self.states.setdefault(message.step, []).append(message)
+        elif isinstance(message, Command):
+            self.commands.setdefault(message.step, message)
+        else:
+            self.scenes[message.step], action = _told(heard.payload), message.applied or []
+            if len(action) == len(self.task.action) and np.isfinite(action).all():
+                self.applied[message.step - 1] = action, message.braked
+
+    @property
+    def steps(self) -> int:
+        """How many steps from the first on say what was done in them."""
+        return next(n for n in range(len(self.applied) + 1) if n not in self.applied)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is recorded to its end."""
+        return any(state.final for state in self.states.get(self.steps, ()))
+
+    @property
+    def has_wall_time(self) -> bool:
+        """Whether wall time had a part in it: another clock, or a machine that stood still."""
+        virtual = (self.origin.clock, self.origin.loop) == (LOCKSTEP, "policy")
+        return not virtual or any(c.reason in WALL_CLOCK_REASONS for c in self.commands.values())
+
+    def step_at(self, at_s: float) -> int:
+        """The first step from that time on; UserError where that is not recorded."""
+        period_s = self.task.control_period_s
+        step = math.ceil(at_s / period_s - 1e-6)
+        if step >= self.steps:
+            end = "lasts" if self.ended else "is recorded without a gap for"
+            raise UserError(
+                f"{self.path}: the drive {end} {self.steps * period_s:g} s; fork before"
+            )
+        return step
+
+    def environment(self, named: str | None = None) -> Environment:
+        """The environment anew. UserError where there is none, or it has become another.
+
+        A module is imported where a person has ``named`` it, not because a file says so.
+        """
+        name = named or self.origin.environment
+        if ":" in name and named is None:
+            raise UserError(f"{self.path} was driven in {name}, a module's: name it yourself")
+        made = make_environment(name, self.origin.condition)
+        if (now := describe(made, self.task.control_period_s).text) != self.task.text:
+            raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
+        return made
+
+    def differs(self, step: int, observation: dict[str, bytes], environment: Any) -> str:
+        """What of a rebuilt step is not as it was recorded; empty where nothing is."""
+        for state in self.states.get(step, ()):
+            for name, data in observation.items():
+                if state.observation.get(name) != data:
+                    return f"the observation {name!r}"
+        known, scene = self.scenes.get(step), scene_of(environment)
+        if known is None or scene is None or _told(encode_scene(scene, NOWHERE)) == known:
+            return ""
+        return "the scene"
+
+    def check(self, step: int, observation: dict[str, bytes], environment: Any) -> None:
+        """Raise UserError where a rebuilt step is not as it was recorded."""
+        if found := self.differs(step, observation, environment):
+            where = f"at step {step} ({step * self.task.control_period_s:g} s)"
+            why = f"{where} {found} is another than recorded"
+            raise UserError(f"{self.path}: the drive cannot be rebuilt: {why}")
+
+    def redo(self, step: int, actuators: Actuators) -> np.ndarray:
+        """The recorded action of a step, with the brake as it was."""
+        action, braked = self.applied[step]
+        actuators.brake(braked)
+        return actuators.within(action)
+
+
+def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
+    """Read an episode; ``number`` None: the only one.
+
+    UserError for a damaged recording, and one that does not say how its episodes were begun.
+    """
+    recording = Recording(path)
+    vehicle_id = choose_vehicle(recording, vehicle_id)
+    if recording.is_damaged:
+        mend = f"python -m bridge repair {path} --out G.mcap saves what is whole"
+        raise UserError(f"{path} {recording.trouble()}; {mend}")
+    begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
+    for heard, message in _messages(recording, vehicle_id):
+        if isinstance(message, Scene) and message.origin is not None and message.task is not None:
+            about = message.origin, message.episode, message.task, heard.arrived_ns
+            begun.setdefault((message.origin.session, message.episode), about)
+    if not begun:
+        why = "it was recorded by an earlier version, or without its scenes"
+        raise UserError(f"{path} does not say how its drives were begun: {why}")
+    if number is None and len(begun) == 1:
+        number = 0
+    if number is None or number >= len(begun):
+        which = f"--episode says which, 0 to {len(begun) - 1}"
+        raise UserError(f"{path} holds {counted(len(begun), 'drive')}; {which}")
+    drive = RecordedEpisode(path, vehicle_id, number, *list(begun.values())[number])
+    for heard, message in _messages(recording, vehicle_id):
+        drive.take(heard, message)
+    return drive
+
+
+def _messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
+    for heard in heard_of(recording, vehicle_id):
+        if heard.topic in ("scene", "state", "command"):
+            yield heard, DECODERS[heard.topic](heard.payload)
+
+
+class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose every episode begins where a recorded drive is forked."""
+
+    def __init__(self, environment: Any, drive: RecordedEpisode, step: int) -> None:
+        super().__init__(environment)
+        self._drive, self._fork = drive, step
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Rebuild the drive until the fork; its seed goes before. UserError: it is another."""
+        drive, layout = self._drive, Layout(self._drive.task)
+        actuators = Actuators(self.env, [row.stop for row in drive.task.action])
+        options = {"standing": True} if drive.origin.standing else None
+        seen, info = self.env.reset(seed=drive.origin.seed, options=options)
+        for step in range(self._fork):
+            drive.check(step, pack(layout, self.env, seen), self.env)
+            seen, *_, info = self.env.step(drive.redo(step, actuators))
+        drive.check(self._fork, pack(layout, self.env, seen), self.env)
+        actuators.brake(False)
+        return seen, info
+
+
+class PolicyAnswers:
+    """A policy inside the edge runtime's decision logic, to which no state comes late."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy, self._now_s = policy, 0.0
+        self._period_s = policy.manifest.control_period_s
+        limits, text = shared_limits(policy.manifest.action, {}), policy.layout.task_text
+        self._controller = Controller(limits, self._period_s, needs_rearm=False, task=text)
+
+    def answer(self, state: State, known: Command | None = None) -> Command | None:
+        """The command for a state.
+
+        ``known`` is what was answered before the fork: limits and stops go on from there.
+        """
+        self._now_s += self._period_s
+        self._controller.begin(Received(state, self._now_s, state.sent_ns), self._now_s)
+        if known is not None and known.mode == DRIVE:
+            output: np.ndarray | None = np.array(known.action, np.float32)
+        else:
+            output, _ = infer(self._policy, self._policy.layout.arrays(state.observation))
+        order = self._controller.finish(output, 0, self._now_s)
+        return order and Command(
+            session=state.session, episode=state.episode, step=state.step, mode=order.mode,
+            action=order.action, policy_id=self._policy.policy_id, received_ns=state.sent_ns,
+            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason,
+        )  # fmt: skip
+
+
+class ForkedDrive(InProcessClock):
+    """A recorded drive once more: as it was until step ``fork``, and then on.
+
+    Args:
+        drive: what is recorded.
+        environment: as ``drive.environment`` makes it.
+        fork: the first step that is not given.
+        policy: who answers from there on; None: what is recorded, while all is as recorded.
+        network: from there on; None: the recorded one.
+        out: where it is recorded.
+    """
+
+    def __init__(
+        self,
+        drive: RecordedEpisode,
+        environment: Environment,
+        fork: int,
+        policy: Policy | None = None,
+        network: LatencySpec | None = None,
+        out: RecordingWriter | None = None,
+    ) -> None:
+        self._drive, self._environment, self._fork, self._out = drive, environment, fork, out
+        self._recorded, self._task, self._step = parse_spec(drive.origin.latency), drive.task, 0
+        self.network, self._answers = network or self._recorded, None
+        self.first_difference: int | None = None
+        """The first step in which anything was, or was done, otherwise than recorded."""
+        if policy is not None:
+            if policy.manifest.text != drive.task.text:
+                theirs, ours = policy.manifest.text, drive.task.text
+                raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {ours!r}")
+            self._task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
+            self._answers = PolicyAnswers(policy)
+        super().__init__(self._command, self._recorded, self._task)
+
+    def run(self) -> EpisodeResult:
+        """Drive it to its end. UserError where it cannot be rebuilt until the fork."""
+        origin = msgspec.structs.replace(
+            self._drive.origin, session="fork", latency=str(self.network)
+        )
+        runner = EpisodeRunner(
+            self._environment, self, origin.session, self._show, lambda *_: None, self._task,
+            self._apply, origin.standing, origin=origin,
+        )  # fmt: skip
+        return runner.run(0, origin.seed)
+
+    def exchange(self, state: State) -> Decision:
+        """Compare the state with the recorded one, and then as any clock."""
+        self._step = state.step
+        if state.step <= self._fork:
+            self._drive.check(state.step, state.observation, self._environment)
+        if state.step == self._fork and self.network != self._recorded:
+            self._link.change(self.network, self._drive.origin.seed)
+        self._compare(state)
+        return super().exchange(state)
+
+    def finish(self, state: State) -> None:
+        """Compare the final state, too."""
+        self._compare(state)
+        self._write("state", state, state.sim_time_s)
+
+    def _compare(self, state: State) -> None:
+        drive, step = self._drive, state.step
+        finals = {known.final for known in drive.states.get(step, ())}
+        same = step in drive.scenes and finals <= {state.final}
+        self._note(same and not drive.differs(step, state.observation, self._environment))
+
+    def _note(self, same: bool) -> None:
+        if self.first_difference is None and not same:
+            self.first_difference = self._step
+
+    def _apply(self, actuators: Actuators, decision: Decision) -> np.ndarray:
+        if self._step < self._fork:
+            return self._drive.redo(self._step, actuators)
+        action = policy_action(actuators, decision)
+        done = [float(value) for value in action.ravel()], bool(decision.brake_reason)
+        self._note(self._drive.applied.get(self._step) == done)
+        return action
+
+    def _command(self, arrival: Arrival[State]) -> Command | None:
+        """What the edge runtime says: before the fork what it said, then what the policy says."""
+        sent_ns = self._at_ns(arrival.arrived_s)
+        state = msgspec.structs.replace(arrival.message, sent_ns=sent_ns)
+        command, given = self._drive.commands.get(arrival.step), self._step < self._fork
+        if self._answers is not None:
+            answer = self._answers.answer(state, command if given else None)
+            command = command if given else answer
+        elif not given and self.first_difference is not None:
+            step = f"from step {self.first_difference} on it is another drive"
+            raise UserError(f"{step}, in which only a policy can say what to do: --policy")
+        self._write("state", state, arrival.arrived_s)
+        if command is not None:
+            stamps = dict.fromkeys(("received_ns", "sent_ns"), sent_ns) | {"inference_ns": 0}
+            place = {"session": state.session, "episode": state.episode}
+            told = msgspec.structs.replace(command, **place, **stamps)
+            self._write("command", told, arrival.arrived_s)
+        return command
+
+    def _show(self, environment: Environment, stamps: Stamps) -> None:
+        if self._out is not None:
+            self._write("scene", scene_payload(environment, stamps), stamps.sim_time_s)
+
+    def _write(self, topic: str, message: State | Command | bytes, at_s: float) -> None:
+        if self._out is not None:
+            payload = message if isinstance(message, bytes) else encode(message)
+            key = f"phil/{self._drive.vehicle_id}/{topic}"
+            self._out.write(Heard(key, topic, payload, self._at_ns(at_s), len(payload)))
+
+    def _at_ns(self, at_s: float) -> int:
+        return self._drive.began_ns + round(at_s * 1e9)
+
+
+def _time(text: str) -> float:
+    return cli.seconds(text.removesuffix("s"))
+
+
+def add_place(parser: Any) -> None:
+    """Declare the options that say where a recording is forked."""
+    at, which = "where it is forked, in seconds of the drive, as 12.3s", "which drive, from 0"
+    parser.add_argument("--at", metavar="T", type=_time, default=0.0, help=at)
+    parser.add_argument("--episode", metavar="K", type=cli.not_negative, help=which)
+    several = "which vehicle, where the recording holds several"
+    add_options(parser, "--vehicle-id", default=None, help=several)
+
+
+def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
+    """The drive that the options name, and the step of its fork."""
+    drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
+    return drive, drive.step_at(asked.at)
+
+
+def add_common(parser: Any) -> None:
+    """Declare what `fork` and `bisect` have in common."""
+    parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
+    add_place(parser)
+    module = "the environment, where it is of a module: no file decides what is imported"
+    parser.add_argument("--env", metavar="ENV", help=module)
+    add_options(parser, "--out")
+
+
+def _add_fork_arguments(parser: Any) -> None:
+    add_common(parser)
+    policy = "who drives on (default: the recorded commands, while all is as recorded)"
+    unsigned = "also take a policy whose origin cannot be verified"
+    human = "you drive on: `python -m trainer drive --from`, which has more options"
+    record = "record the fork, as `bridge record` does; of a person's, the directory"
+    parser.add_argument("--policy", metavar="POLICY.onnx", help=policy)
+    cli.add_public_key(parser)
+    parser.add_argument("--allow-unsigned", action="store_true", help=unsigned)
+    add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
+    parser.add_argument("--human", metavar="keyboard|gamepad|wheel|web", help=human)
+    parser.add_argument("--record", metavar="G.mcap", help=record)
+
+
+def _run_fork(asked: Namespace) -> int:
+    """Fork the drive, and say what came of it."""
+    if asked.human is not None:
+        return _hand_over(asked)
+    record = asked.record and new_recording(asked.record)
+    drive, fork = find_fork(asked.recording, asked)
+    trust = asked.public_key, asked.allow_unsigned
+    policy = None if asked.policy is None else load_policy(asked.policy, *trust)
+    with ExitStack() as stack:
+        environment = stack.enter_context(closing(drive.environment(asked.env)))
+        recorded = ForkedDrive(drive, environment, drive.steps).run() if drive.ended else None
+        out, made = None, Path(stack.enter_context(tempfile.TemporaryDirectory()), "fork.mcap")
+        if record:
+            out = stack.enter_context(closing(RecordingWriter(made)))
+        forked = ForkedDrive(drive, environment, fork, policy, asked.latency, out)
+        found = forked.run()
+        if out:
+            out.finish(dropped=0)
+            write_atomic(record, made.read_bytes())
+    first, period_s = forked.first_difference, drive.task.control_period_s
+    policy_ids = {command.policy_id for command in drive.commands.values()}
+    report = {
+        "recording": asked.recording,
+        "episode": drive.number,
+        "origin": msgspec.structs.asdict(drive.origin),
+        "at_s": round(fork * period_s, 6),
+        "latency_spec": str(forked.network),
+        "policy_id": "" if policy is None else policy.policy_id,
+        "recorded_policy_ids": sorted(policy_ids),
+        "recorded_states": sum(map(len, drive.states.values())),
+        "recorded": None if recorded is None else asdict(recorded),
+        "fork": asdict(found),
+        "differs_from_s": None if first is None else round(first * period_s, 6),
+    }
+    write_json_out(asked.out, report)
+    how = "the same to the bit" if first is None else f"another from {first * period_s:g} s on"
+    if drive.has_wall_time:
+        how += "; wall time was in the recorded drive, so it need not be the same"
+    at = f"forked at {fork * period_s:g} s: {_ended(found)}; {how}"
+    print(printable(f"recorded: {_ended(recorded)}; {at}"))
+    return 0
+
+
+def _ended(result: EpisodeResult | None) -> str:
+    if result is None:
+        return "not to its end"
+    return f"{result.outcome} after {result.time_s:g} s, {result.distance_m:.2f} m"
+
+
+def _hand_over(asked: Namespace) -> int:
+    """Let the trainer's command take this process's place: it has the screen and the signals."""
+    if asked.latency is not None or asked.out is not None:
+        raise UserError("--human takes no --latency and no --out: it drives without a network")
+    given = {"--at": asked.at, "--human": asked.human, "--episode": asked.episode}
+    given |= {"--vehicle-id": asked.vehicle_id, "--scenario": asked.env, "--out": asked.record}
+    given |= {"--policy": asked.policy, "--public-key": asked.public_key}
+    words = [str(w) for pair in given.items() if pair[1] is not None for w in pair]
+    os.execv(sys.executable, trainer_command("drive", "--from", asked.recording, *words))
+
+
+def trainer_command(*words: str) -> list[str]:
+    """A command of the trainer, of which nothing is imported here. UserError: not installed."""
+    if find_spec("trainer") is None:
+        raise UserError("this needs the trainer, which is not installed here")
+    return [sys.executable, "-m", "trainer", *words]
+
+
+FORK = cli.Command(
+    cli.examples(
+        "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json",
+        "python -m bridge fork drive.mcap --episode 2 --at 3s --policy my.onnx --latency 80ms",
+        "python -m bridge fork drive.mcap --at 12.3s --human web --record runs/forked",
+    ),
+    _add_fork_arguments,
+    _run_fork,
+)

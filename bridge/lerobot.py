@@ -1,0 +1,250 @@
+"""``python -m bridge export``: a recording as a LeRobotDataset v3.0, in Parquet and MP4.
+
+A frame is a state that was answered, with the first new answer to it, whether to drive or to stop.
+The format knows no gaps: where nobody answered a state, only the feature ``step`` jumps. The file
+is read once for each array of the observation, so that its pictures need no memory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.messages import images_of
+from bridge.ports import add_options
+from bridge.replay import Answer, RecordedDrive, key_of, without_repetitions
+from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
+from edge_runtime.config import NONE
+from edge_runtime.files import check_writable, write_json
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.util import UserError, counted
+from edge_runtime.wire import State, is_foreign
+
+try:
+    import av
+    import pyarrow as pa
+    from pyarrow.parquet import write_table
+except ImportError:
+    raise UserError("export needs av and pyarrow: pip install 'phil-hil[lerobot]'") from None
+
+EXAMPLE = examples("python -m bridge export drive.mcap --format lerobot --out datasets/drive")
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+FIRST = FILE.format(chunk_index=0, file_index=0)
+SAMPLED_PIXELS = 256  # Of each picture, for the statistics
+ENCODER = {"crf": "10", "g": "2", "bf": "0"}
+"""Hardly any loss; every second picture stands alone: a training jumps about in the video."""
+Columns = dict[str, np.ndarray]  # Feature to [frames, ...]; of a video, a sample of its pixels
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
+    form = "what to make: a LeRobotDataset v3.0"
+    parser.add_argument("--format", choices=["lerobot"], required=True, help=form)
+    out = "the directory of the data set; it must not exist yet"
+    parser.add_argument("--out", metavar="DIR", required=True, help=out)
+    several = "which vehicle, where the recording holds several"
+    add_options(parser, "--vehicle-id", default=None, help=several)
+
+
+def run(arguments: Any) -> int:
+    """Run the command; the directory gets its name when it is whole, and else nothing is left."""
+    out = Path(arguments.out)
+    if os.path.lexists(out):
+        raise UserError(f"{out} exists; choose another name: no data set is lost")
+    check_writable(out)
+    drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    with sigterm_as_interrupt():
+        try:
+            frames = _export(drive, part)
+            os.rename(part, out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    left_out = sum(not state.final for state in drive.states()) - frames
+    if trouble := drive.recording.trouble():
+        print(f"the recording {trouble}; what is whole of it was exported", file=sys.stderr)
+    missing = f"; left out: {counted(left_out, 'state')} without an answer" if left_out else ""
+    print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
+    return 0
+
+
+def _export(drive: RecordedDrive, folder: Path) -> int:
+    """Write the data set; how many frames it has.
+
+    UserError where the states cannot be read, or none was answered.
+    """
+    task = drive.task
+    if task is None:
+        raise UserError(f"{drive.recording.path} holds no scene that says how to read the states")
+    for name in task.observation:
+        if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
+            raise UserError(f"the observation {name!r} cannot be the name of a feature")
+    rate = Fraction(1 / task.control_period_s).limit_denominator(1000)
+    columns, bounds = _numbers(drive, task, rate)
+    features = {key: _feature(values) for key, values in columns.items()}
+    features["action"]["names"] = [row.name for row in task.action]
+    zeros = {name: np.zeros(row.shape, row.dtype) for name, row in task.observation.items()}
+    plain = [name for name, array in zeros.items() if images_of(array) is None]
+    layout = Layout(task)
+    for name in task.observation:
+        arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
+        if name in plain:
+            key = "observation.state" if len(plain) == 1 else f"observation.{name}"
+            columns[key] = np.array([array.ravel() for array in arrays])
+            features[key] = _feature(columns[key])
+        else:
+            key = f"observation.images.{name}"
+            path = folder / f"videos/{key}/{FIRST}.mp4"
+            columns[key], features[key] = _encode(path, rate, arrays)
+    robot = None if drive.vehicle == NONE else drive.vehicle
+    info = {"robot_type": robot, "total_frames": bounds[-1], "features": features}
+    _write(folder, task.task, rate, columns, info, bounds)
+    return bounds[-1]
+
+
+def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
+    """The states that can be read, each with the first answer that does not repeat a stop."""
+    layout = Layout(task)
+    answers = without_repetitions(exchange.answers for exchange in drive.exchanges.values())
+    first = {key: each[0] for key, each in zip(drive.exchanges, answers, strict=True)}
+    for state in drive.states():
+        answer = None if state.final else first.get(key_of(state))
+        readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
+        if readable and answer is not None and len(answer.action) == len(task.action):
+            yield state, answer
+
+
+def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:
+    """The features that every data set has, and where its episodes begin and the last one ends."""
+    kept = [(key_of(state), answer) for state, answer in _kept(drive, task)]
+    if not kept:
+        raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
+    ended = {key_of(state)[:2] for state in drive.states() if state.final}
+    episodes = [key[:2] for key, _ in kept]
+    bounds = [at for at, name in enumerate(episodes) if not at or name != episodes[at - 1]]
+    bounds.append(len(kept))
+    index, lengths = np.arange(len(kept)), np.diff(bounds)
+    number = index - np.repeat(bounds[:-1], lengths)
+    columns = {
+        "action": np.array([answer.action for _, answer in kept], np.float32),
+        "mode": np.array([answer.mode for _, answer in kept]),
+        "step": np.array([key[2] for key, _ in kept], np.uint64).astype(np.int64),
+        "next.done": np.isin(index + 1, bounds) & [name in ended for name in episodes],
+        "timestamp": (number / float(rate)).astype(np.float32),
+        "frame_index": number,
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "index": index,
+        "task_index": np.zeros_like(index),
+    }
+    return columns, bounds
+
+
+def _feature(values: np.ndarray) -> dict[str, Any]:
+    """As info.json has it."""
+    dtype = "string" if values.dtype.kind == "U" else values.dtype.name
+    return {"dtype": dtype, "shape": [values.size // len(values)], "names": None}
+
+
+def _encode(
+    path: Path, rate: Fraction, arrays: Iterable[np.ndarray]
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Write the newest picture of each array; a sample of their pixels, and the feature."""
+    path.parent.mkdir(parents=True)
+    sampled = []
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate, options=ENCODER)
+        for number, array in enumerate(arrays):
+            images: Any = images_of(array)
+            height, width = images.shape[1:3]
+            picture = np.ascontiguousarray(np.broadcast_to(images[-1], (height, width, 3)))
+            if not number:
+                stream.height, stream.width = height, width
+                # Colours of half the size, as players like them, need even sizes.
+                stream.pix_fmt = "yuv444p" if height % 2 or width % 2 else "yuv420p"
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = number, 1 / rate
+            container.mux(stream.encode(frame))
+            sampled.append(picture.reshape(-1, 3)[:: height * width // SAMPLED_PIXELS + 1])
+        container.mux(stream.encode(None))
+        info = {
+            "video.height": height, "video.width": width, "video.codec": "h264",
+            "video.pix_fmt": stream.pix_fmt, "video.fps": int(rate), "video.channels": 3,
+            "has_audio": False, "is_depth_map": False,
+        }  # fmt: skip
+    feature = {"dtype": "video", "shape": [height, width, 3], "info": info}
+    return np.array(sampled), feature | {"names": ["height", "width", "channels"]}
+
+
+def _write(
+    folder: Path, task: str, rate: Fraction, columns: Columns, info: dict[str, Any], bounds: Any
+) -> None:
+    """All but the videos."""
+    features = info["features"]
+    videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
+    rows = []
+    for number, (start, end) in enumerate(pairwise(bounds)):
+        row = {"episode_index": number, "tasks": [task], "length": end - start}
+        row |= {"dataset_from_index": start, "dataset_to_index": end}
+        for place in ("data", "meta/episodes", *videos):
+            row |= {f"{place}/chunk_index": 0, f"{place}/file_index": 0}
+        for place in videos:
+            row[f"{place}/from_timestamp"] = float(start / rate)
+            row[f"{place}/to_timestamp"] = float(end / rate)
+        for key, stats in _stats(columns, features, slice(start, end)).items():
+            row |= {f"stats/{key}/{name}": value for name, value in stats.items()}
+        rows.append(row)
+    # pandas, which reads it, is told that the text is the index.
+    index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
+    told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
+    tasks = pa.table({"task_index": [0], "task": [task]})
+    numbers = {key: _column(array) for key, array in columns.items() if array.ndim < 3}
+    for name, table in {
+        f"data/{FIRST}": pa.table(numbers),
+        f"meta/episodes/{FIRST}": pa.Table.from_pylist(rows),
+        "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
+    }.items():
+        path = folder / f"{name}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_table(table, path)
+    write_json(folder / "meta/stats.json", _stats(columns, features, slice(None)))
+    info |= {
+        "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
+        "total_episodes": len(rows), "total_tasks": 1, "splits": {"train": f"0:{len(rows)}"},
+        "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
+        "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
+    }  # fmt: skip
+    write_json(folder / "meta/info.json", info)
+
+
+def _column(values: np.ndarray) -> Any:
+    """Plain numbers or texts, or lists of a fixed length."""
+    column, size = pa.array(values.ravel()), values.size // len(values)
+    return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
+
+
+def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[str, Any]:
+    """Of each feature but texts, as LeRobot has them: of a video each colour, from 0 to 1."""
+    found = {}
+    for key, feature in features.items():
+        if feature["dtype"] == "string":
+            continue
+        most, shape = (255, [3, 1, 1]) if feature["dtype"] == "video" else (1, feature["shape"])
+        values = columns[key][frames].reshape(-1, shape[0]) / most
+        stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+        stats |= {"std": values.std(0)}
+        for part in (1, 10, 50, 90, 99):
+            stats[f"q{part:02d}"] = np.quantile(values, part / 100, axis=0)
+        found[key] = {name: value.reshape(shape).tolist() for name, value in stats.items()}
+        found[key]["count"] = [len(columns[key][frames])]
+    return found

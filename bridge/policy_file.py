@@ -1,0 +1,224 @@
+"""Writing a policy file; and ``python -m deploy policy``, which makes one of any ONNX model.
+
+What a model is for is read from its environment: the names, shapes and ranges of what goes in and
+out, and the control period. The model is then driven in the environment for a while, by what the
+board itself would load.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import onnx
+
+from bridge.environments import Environment, changed, describe, known_stops, make_environment
+from bridge.episode import Actuators, pack
+from edge_runtime.cli import Command, examples, positive_number
+from edge_runtime.envelope import read_envelope
+from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
+from edge_runtime.policy import (
+    OUTPUT,
+    SIGNATURE_SUFFIX,
+    UNSIGNED,
+    Policy,
+    check_answer,
+    check_graph,
+    open_policy,
+    policy_id_of,
+)
+from edge_runtime.tls import read_signing_key
+from edge_runtime.util import UserError, read_bytes, read_json
+
+REAL_OBSERVATIONS = 200
+FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    env = "the environment that the model drives: scenario, gymnasium id or module:id"
+    change = "what the environment does not say: action.N.stop (a number, or null to hold the last"
+    change += " action), slew_per_s, unit, meaning; may be repeated"
+    add("model", metavar="MODEL.onnx", help="the model, in one file")
+    add("--env", metavar="ENV", required=True, help=env)
+    add("--out", metavar="POLICY.onnx", required=True, help="the policy file")
+    add("--key", metavar="KEY", help="the private key (PEM) to sign it with (deploy keys)")
+    add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
+    period = "seconds of a step, for an environment that does not say"
+    add("--period", metavar="SECONDS", type=positive_number, help=period)
+    algorithm = "what trained it, for the manifest"
+    add_envelope(parser)
+    add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Make, check and sign the policy file."""
+    out, key = Path(arguments.out), arguments.key
+    if out.suffix != ".onnx":
+        raise UserError(f"--out {out}: a policy file's name ends in .onnx")
+    check_writable(out)
+    if key:
+        read_signing_key(key)
+    envelope = arguments.envelope and read_json(arguments.envelope, "envelope")
+    environment = make_environment(arguments.env)
+    try:
+        task = changed(describe(environment, arguments.period), arguments.changes)
+        _ask_for_stops(environment, task, arguments.changes)
+        model = read_bytes(arguments.model, "model")
+        training = {"source": Path(arguments.model).name, "environment": arguments.env}
+        try:
+            data = make_policy(model, task, arguments.algorithm, training, envelope)
+            policy = open_policy(data, UNSIGNED)
+            low, high = drive(policy, environment, REAL_OBSERVATIONS)
+        except UserError as error:
+            raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
+    finally:
+        environment.close()
+    write_policy(data, out, key)
+    signed = "signed" if key else "not signed"
+    print(f"{out}: {len(data) / 1e6:.1f} MB, {signed}, policy_id {policy.policy_id}")
+    print(f"it drives {task.text}")
+    for row, least, most in zip(task.action, low, high, strict=True):
+        stop = "holds the last value" if row.stop is None else f"is {row.stop:g}"
+        said = f"{least:.3g} to {most:.3g} in {REAL_OBSERVATIONS} steps"
+        print(f"{row.name}: {row.low:g} to {row.high:g}, {said}; its safe stop {stop}")
+    return 0
+
+
+def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> None:
+    """Raise UserError where nobody has said what a safe stop of each action is."""
+    if known_stops(environment) is not None:
+        return
+    for number, row in enumerate(task.action):
+        place = f"action.{number}.stop="
+        if not any(change.startswith(place) for change in changes):
+            ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
+            raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
+
+
+def add_envelope(parser: argparse.ArgumentParser) -> None:
+    """Declare the option of the networks that the policy bears."""
+    text = "the networks in which it may drive (hil_tests envelope), for the manifest"
+    parser.add_argument("--envelope", metavar="F.json", help=text)
+
+
+def network_of(model: onnx.ModelProto) -> str:
+    """SHA-256 of the graph with its weights, in hex: the same whatever manifest is beside it."""
+    return hashlib.sha256(model.graph.SerializeToString(deterministic=True)).hexdigest()
+
+
+def network_of_file(path: str) -> str:
+    """The same of a file."""
+    return network_of(onnx.load(path))
+
+
+def make_policy(
+    model: bytes,
+    task: Task,
+    algorithm: str,
+    training: dict[str, Any],
+    envelope: Any = None,
+) -> bytes:
+    """The policy file's bytes: the model with its manifest in it.
+
+    A single input and a single output may have any name: they get the manifest's. Raises UserError
+    for what is no ONNX model that the board can run. ``envelope`` is the JSON value of one that was
+    measured with this file (its ``policy_id``) or this graph (its ``network``); UserError else.
+    """
+    check_graph(model)
+    graph = onnx.load_from_string(model)
+    names = [each.name for each in graph.graph.input]
+    known = {each.name for each in graph.graph.initializer}  # of a model of IR version 3
+    inputs = [name for name in names if name not in known]
+    if len(inputs) == len(task.observation) == 1:
+        _rename(graph.graph, inputs[0], next(iter(task.observation)))
+    if len(graph.graph.output) == 1:
+        _rename(graph.graph, graph.graph.output[0].name, OUTPUT)
+    manifest = Manifest(
+        **msgspec.structs.asdict(task),
+        algorithm=algorithm,
+        training=training,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        envelope=envelope,
+    )
+    if envelope is not None:
+        measured = read_envelope(envelope, task)
+        if measured.policy_id != policy_id_of(model) and measured.network != network_of(graph):
+            raise UserError("the envelope was measured with another network")
+    del graph.metadata_props[:]
+    told = msgspec.json.encode(manifest).decode()
+    graph.metadata_props.add(key=MANIFEST_KEY, value=told)
+    return graph.SerializeToString()
+
+
+def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
+    """Rename a value wherever it stands; another of the new name makes room."""
+    swap = {old: new, new: f"{new}_of_the_model"} if old != new else {}
+    for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        value.name = swap.get(value.name, value.name)
+    for node in graph.node:
+        for names in (node.input, node.output):
+            names[:] = [swap.get(name, name) for name in names]
+
+
+def drive(
+    policy: Policy, environment: Environment, steps: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The least and largest actions, float [n], in that many steps of the environment.
+
+    Every other episode is driven by random actions: a policy that stands sees little.
+    Raises UserError for an action that the environment cannot take.
+    """
+    actions: list[np.ndarray] = []
+    space: Any = environment.action_space
+    space.seed(seed)
+    actuators = Actuators(environment, [row.stop for row in policy.manifest.action])
+    episode, over = 0, True
+    seen: Any = None
+    while len(actions) < steps:
+        if over:
+            seen, _ = environment.reset(seed=seed + episode)
+            episode += 1
+        packed = pack(policy.layout, environment, seen)
+        try:
+            action = policy.act(policy.layout.arrays(packed))
+        except UserError:
+            raise
+        except Exception as error:  # onnxruntime's exceptions share no narrower base
+            raise UserError(f"onnxruntime does not run it: {error}") from None
+        check_answer(action, policy.manifest, "a real observation")
+        actions.append(action)
+        wanted = space.sample() if episode % 2 == 0 else action
+        seen, _, terminated, truncated, _ = environment.step(actuators.within(wanted))
+        over = terminated or truncated
+    return np.min(actions, axis=0), np.max(actions, axis=0)
+
+
+def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
+    """Write the policy file and, given a private key (PEM), its signature.
+
+    The key is read first: a wrong one leaves no unsigned file behind.
+    """
+    key = read_signing_key(key_file) if key_file else None
+    signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
+    check_writable(signature_path)
+    if key is None:
+        # A signature of an older file beside it would only mislead.
+        signature_path.unlink(missing_ok=True)
+    write_atomic(path, data)
+    if key is not None:
+        write_atomic(signature_path, key.sign(data))
+
+
+EXAMPLE = examples(
+    "python -m deploy policy td3.onnx --env Pendulum-v1 --set action.0.stop=0 \\\n"
+    "    --out pendulum.onnx --key keys/policy.key",
+    "python -m deploy policy mine.onnx --env my_package:MyRobot-v0 --out robot.onnx",
+)
+POLICY = Command(EXAMPLE, _add_arguments, _run)

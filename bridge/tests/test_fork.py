@@ -1,0 +1,303 @@
+"""``python -m bridge fork`` and ``bisect``: recordings of the real wire, driven again.
+
+Of the kept recording the second drive (episode 1) is forked: its car slows down for a gap, and
+arrives after 6.1 s.
+"""
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import onnx
+import pytest
+
+from bridge.environments import describe, make_environment
+from bridge.fork import ForkedDrive, RecordedEpisode
+from bridge.messages import Origin
+from bridge.policy_file import make_policy as make_any_policy
+from bridge.record import RecordingWriter
+from bridge.recording import Recording, read_heard
+from bridge.tests.harness import (
+    LEFT_TURN,
+    TOY,
+    BridgeProcess,
+    bridge_status,
+    flip_chunk,
+    make_policy,
+    read,
+    start_edge,
+    start_simulate,
+)
+from edge_runtime.policy import load_policy
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import wait_until
+
+SHIPPED = Path(__file__).parents[2] / "results" / "policies"
+OURS = SHIPPED / "left_turn.onnx"
+TWO = ("--episodes", "2")
+NETWORK = "60ms+-40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
+PARKING = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation)
+=> (float[b, 2] action) {
+    apart = Sub(desired_goal, achieved_goal) wide = MatMul(apart, turn) action = Tanh(wide)
+}"""
+
+
+def parking_policy(folder: Path) -> Path:
+    """Drives towards its place, more or less."""
+    graph = onnx.parser.parse_graph(PARKING)
+    turn = np.random.default_rng(1).normal(0.0, 3.0, (6, 2)).astype(np.float32)
+    graph.initializer.append(onnx.numpy_helper.from_array(turn, "turn"))
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    task = describe(make_environment("parking-v0"))
+    path = folder / "parking.onnx"
+    path.write_bytes(make_any_policy(model.SerializeToString(), task, "test", {}))
+    return path
+
+
+def record(folder: Path, env: str, policy: Path, *options: str) -> Path:
+    """A drive of the three processes, as a person would record it."""
+    endpoint, path = free_endpoint(), folder / "drive.mcap"
+    with start_simulate(
+        endpoint, folder / "report.json", env, "--wait-edge-s", "100", *options
+    ) as simulator:
+        to = ("--connect", endpoint, "--wait-s", "100", "--linger-s", "0.5")
+        with BridgeProcess("record", "--out", str(path), *to) as recorder:
+            wait_until(
+                lambda: path.exists() and path.stat().st_size > 0, "the recording to begin", 100.0
+            )
+            with start_edge(endpoint, policy):
+                assert simulator.wait(200.0) == 0, simulator.errors
+            assert recorder.wait() == 0, recorder.errors
+    return path
+
+
+def fork_of(path: Path, *options) -> dict:
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "fork.json"
+        words = ["fork", path, "--out", out, "--allow-unsigned", *options]
+        assert bridge_status([str(word) for word in words]) == 0
+        return read(out)
+
+
+def is_recorded_to_the_bit(path: Path, number: int, policy: Path, time_s: float) -> dict:
+    """Fork it in the middle, and the fork's own recording once more; what was found first."""
+    again = path.with_name(f"again{number}.mcap")
+    words = ("--episode", number, "--at", f"{time_s / 2}s", "--policy", policy, "--record", again)
+    found = fork_of(path, *words)
+    assert found["differs_from_s"] is None
+    assert found["fork"] == found["recorded"]
+    once_more = fork_of(again, "--at", time_s / 4, "--policy", policy)
+    assert (once_more["differs_from_s"], once_more["fork"]) == (None, found["fork"])
+    return found
+
+
+@pytest.mark.parametrize(("env", "latency"), [("left_turn", "none"), ("congestion", NETWORK)])
+def test_without_a_change_the_fork_is_the_recorded_drive_to_the_bit(tmp_path, env, latency):
+    policy = SHIPPED / f"{env}.onnx"
+    for attempt in range(4):  # Where the machine stood still, the edge runtime has stopped.
+        (folder := tmp_path / str(attempt)).mkdir()
+        path = record(folder, env, policy, *TWO, "--seed", "3", "--latency", latency)
+        driven = read(folder / "report.json")
+        if not driven["wall_clock_stalls"]:
+            break
+    for number, row in enumerate(driven["per_episode"]):
+        found = is_recorded_to_the_bit(path, number, policy, row["time_s"])
+        assert found["fork"] == row, "rewards and all, as the simulator itself has reported them"
+        assert (found["latency_spec"], found["origin"]["seed"]) == (
+            driven["latency_spec"],
+            row["seed"],
+        )
+
+
+def test_an_environment_of_others_is_rebuilt_whatever_stood_still(tmp_path):
+    """Its steps take so long that on a busy machine the edge runtime stops now and then."""
+    path = record(tmp_path, "parking-v0", parking_policy(tmp_path), "--latency", "50ms+-30ms")
+    (row,) = read(tmp_path / "report.json")["per_episode"]
+    assert fork_of(path, "--at", row["time_s"] / 2)["recorded"] == row
+
+
+def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
+    policy, path = parking_policy(tmp_path), tmp_path / "drive.mcap"
+    environment = make_environment("parking-v0")
+    origin = Origin(
+        session="s", environment="parking-v0", condition="nominal", seed=4, standing=False,
+        clock="lockstep", loop="policy", latency="50ms+-30ms,loss=5%",
+    )  # fmt: skip
+    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
+    with contextlib.closing(RecordingWriter(path)) as out:
+        loaded = load_policy(policy, None, allow_unsigned=True)
+        row = ForkedDrive(nothing, environment, 0, loaded, out=out).run()
+        out.finish(dropped=0)
+    assert is_recorded_to_the_bit(path, 0, policy, row.time_s)["fork"] == asdict(row)
+
+
+def test_another_policy_or_network_drives_on_in_another_way(tmp_path):
+    place = ("--episode", 1, "--at", "2.95s")
+    braking = fork_of(LEFT_TURN, *place, "--policy", make_policy(tmp_path, "constant", -1.0))
+    assert braking["differs_from_s"] == braking["at_s"] == 3.0
+    assert (braking["recorded"]["outcome"], braking["fork"]["outcome"]) == ("goal", "timeout")
+    before, after = braking["recorded"]["actions"], braking["fork"]["actions"]
+    assert before[:30] == after[:30]
+    assert set(map(tuple, after[30:])) == {(-1.0,)}
+    late = fork_of(LEFT_TURN, *place, "--policy", OURS, "--latency", "300ms")
+    assert 3.0 <= late["differs_from_s"] < 3.4
+    # What was answered before arrives; for 600 ms nothing newer does, and the car brakes.
+    assert late["fork"]["actions"][32] == [-1.0]
+    assert late["fork"]["actions"][:30] == before[:30]
+    # Without a policy the recorded commands are given, as long as they fit.
+    assert fork_of(LEFT_TURN, *place)["differs_from_s"] is None
+
+
+def test_a_fork_that_nobody_can_drive_says_so(refusal):
+    said = refusal("fork", LEFT_TURN, "--episode", 1, "--at", "3", "--latency", "300ms")
+    assert "from step 30 on it is another drive" in said
+    assert "--policy" in said
+
+
+def rewritten(path: Path, out: Path, change) -> Path:
+    """The recording with ``change(topic, message)`` in the place of each message, None: without."""
+    with contextlib.closing(RecordingWriter(out)) as writer:
+        for heard in read_heard(Recording(path), None):
+            message = msgspec.msgpack.decode(heard.payload)
+            if (message := change(heard.topic, message)) is not None:
+                payload = msgspec.msgpack.encode(message)
+                writer.write(heard._replace(payload=payload, size=len(payload)))
+        writer.finish(dropped=0)
+    return out
+
+
+def a_pixel(topic, message):
+    if topic == "state" and (message["episode"], message["step"]) == (1, 12):
+        pixels = bytearray(message["observation"]["frames"])
+        pixels[4000] ^= 1
+        message["observation"]["frames"] = bytes(pixels)
+    return message
+
+
+def a_car(topic, message):
+    if topic == "scene" and (message["episode"], message["step"]) == (1, 31):
+        message["vehicles"][1]["x"] = np.nextafter(message["vehicles"][1]["x"], 1e9).item()
+    return message
+
+
+def an_action(topic, message):
+    if topic == "scene" and (message["episode"], message["step"]) == (1, 6):
+        message["applied"][0] *= 0.5
+    return message
+
+
+def without_a_scene(topic, message):
+    return None if topic == "scene" and message["step"] == 9 else message
+
+
+def without_origins(topic, message):
+    message.pop("origin", None)
+    return message
+
+
+def of_a_module(topic, message):
+    if topic == "scene":
+        message["origin"]["environment"] = TOY
+    return message
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (a_pixel, "at step 12 (1.2 s) the observation 'frames' is another than recorded"),
+        (a_car, "at step 31 (3.1 s) the scene is another than recorded"),
+        (an_action, "at step 6 (0.6 s) the "),
+        (without_a_scene, "is recorded without a gap for 0.8 s"),
+        (without_origins, "does not say how its drives were begun"),
+        (of_a_module, f"was driven in {TOY}, a module's"),
+    ],
+)
+def test_a_recording_that_cannot_be_rebuilt_gets_one_line(tmp_path, refusal, change, said):
+    path, out = rewritten(LEFT_TURN, tmp_path / "changed.mcap", change), tmp_path / "again.mcap"
+    words = ("--episode", 1, "--at", "3.5", "--policy", OURS, "--allow-unsigned", "--record", out)
+    assert said in refusal("fork", path, *words)
+    assert not out.exists()
+
+
+def test_a_change_behind_the_fork_is_found_as_well(tmp_path, refusal):
+    """What the recorded drive came to is found by driving it to its end."""
+    path = rewritten(LEFT_TURN, tmp_path / "changed.mcap", a_car)
+    said = refusal("fork", path, "--episode", 1, "--at", "3")
+    assert "at step 31" in said
+
+
+def test_other_places_and_damage(tmp_path, refusal):
+    assert "--episode says which, 0 to 4" in refusal("fork", LEFT_TURN)
+    assert "holds 5 drives" in refusal("fork", LEFT_TURN, "--episode", 5)
+    assert "fork before" in refusal("fork", LEFT_TURN, "--episode", 1, "--at", "999s")
+    other = refusal("fork", LEFT_TURN, "--episode", 1, "--env", "congestion")
+    assert "was driven in 'left_turn:" in other
+    words = ("--policy", SHIPPED / "congestion.onnx", "--allow-unsigned")
+    assert "the policy is for 'congestion:" in refusal("fork", LEFT_TURN, "--episode", 1, *words)
+    assert "--human takes no" in refusal("fork", LEFT_TURN, "--human", "web", "--latency", "9ms")
+    damaged = Path(shutil.copy(LEFT_TURN, tmp_path))
+    flip_chunk(damaged, 0)
+    assert "bridge repair" in refusal("fork", damaged)
+    named = fork_of(LEFT_TURN, "--episode", 1, "--env", "trainer.scenarios:phil/LeftTurn-v0")
+    assert named["differs_from_s"] is None
+
+
+def test_a_person_is_handed_to_the_trainer_with_all_that_was_said(monkeypatch):
+    ran = []
+    monkeypatch.setattr(os, "execv", lambda program, words: ran.append(words))
+    words = ["--at", "3s", "--episode", "1", "--human", "web", "--record", "rec"]
+    with contextlib.suppress(TypeError):  # It does not come back.
+        bridge_status(["fork", str(LEFT_TURN), *words])
+    (command,) = ran
+    where = ["--at", "3.0", "--human", "web", "--episode", "1", "--out", "rec"]
+    assert command[1:] == ["-m", "trainer", "drive", "--from", str(LEFT_TURN), *where]
+
+
+def policies(folder: Path, values: Sequence[float]) -> Path:
+    folder.mkdir()
+    for number, value in enumerate(values):
+        make_policy(folder, "constant", value).rename(folder / f"after_{number:03d}.onnx")
+    return folder
+
+
+def bisected(path: Path, runs: Path) -> dict:
+    words = ["bisect", path, "--episode", 1, "--at", "2", "--runs", runs, "--out", "bisect.json"]
+    assert bridge_status([str(word) for word in words]) == 0
+    return read(Path("bisect.json"))
+
+
+STOPS, GOES = -1.0, 0.1
+
+
+@pytest.mark.parametrize("planted", [1, 5, 12, 19])
+def test_bisection_finds_the_policy_that_was_planted(tmp_path, monkeypatch, planted):
+    monkeypatch.chdir(tmp_path)
+    runs = policies(tmp_path / "run", [STOPS] * planted + [GOES] * (20 - planted))
+    found = bisected(LEFT_TURN, runs)
+    names = [f"after_{number:03d}.onnx" for number in (planted - 1, planted)]
+    assert [found["before"], found["changes_at"]] == names
+    assert found["one_change"]
+    assert len(found["tried"]) <= 9
+    assert found["tried"][names[1]] == "goal"
+
+
+def test_bisection_says_where_there_is_no_change_or_more_than_one(
+    tmp_path, monkeypatch, capsys, refusal
+):
+    monkeypatch.chdir(tmp_path)
+    same = bisected(LEFT_TURN, policies(tmp_path / "same", [STOPS] * 5))
+    assert (same["changes_at"], len(same["tried"])) == (None, 2)
+    assert "no change between the first and the last" in capsys.readouterr().out
+    there_and_back = [STOPS, GOES, STOPS, GOES, GOES, GOES]
+    found = bisected(LEFT_TURN, policies(tmp_path / "several", there_and_back))
+    assert (found["changes_at"], found["one_change"]) == ("after_003.onnx", False)
+    assert "more than one change" in capsys.readouterr().out
+    said = refusal("bisect", LEFT_TURN, "--episode", 1, "--runs", tmp_path)
+    assert "--set snapshots=true" in said

@@ -1,0 +1,136 @@
+"""A recording as LeRobot's data set, read back with other libraries; live in Foxglove."""
+
+import asyncio
+import contextlib
+import json
+
+import aiohttp
+import av
+import msgspec
+import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
+import pytest
+from pyarrow import parquet
+
+from bridge.messages import Stamps, encode_scene
+from bridge.record import RawImage, describe
+from bridge.rerun import free_port
+from bridge.tests import harness
+from bridge.tests.test_recording import heard, writing
+from edge_runtime.manifest import Action, Entry, Task
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.policies import TASK
+from edge_runtime.wire import encode
+
+SEEN = {
+    "a": Entry(dtype="uint8", shape=[6, 8, 3]),
+    "b": Entry(dtype="float32", shape=[2]),
+    "c": Entry(dtype="uint8", shape=[2, 5, 7]),  # A grey pair, of odd size
+}
+ACTIONS = [Action(name=name, low=-1, high=1) for name in ("left", "right")]
+ROVER = Task(task="rover", observation=SEEN, action=ACTIONS, control_period_s=0.05)
+ODD = msgspec.structs.replace(ROVER, observation={"a/../b": SEEN["b"]})
+STEPS = {(0, 0): "drive", (0, 1): "safe_stop", (0, 2): "drive", (0, 3): "final", (1, 0): "drive",
+         (1, 1): "no answer", (1, 2): "drive"}  # fmt: skip
+FILE = "chunk-000/file-000"
+
+
+def recorded(path, task):
+    with writing(path) as writer:
+        writer.write(heard("scene", encode_scene({}, Stamps(0, 0, 0.0, task=task))))
+        for (episode, step), mode in STEPS.items():
+            place = {"session": "here", "episode": episode}
+            seen = {"a": bytes([20 * step, 90, 10 * episode] * 48)}
+            seen["b"] = np.array([episode, step], np.float32).tobytes()
+            seen["c"] = bytes(35) + bytes([50 + 20 * step] * 35)
+            state = make_state(step, **place, observation=seen, final=mode == "final")
+            writer.write(heard("state", encode(state)))
+            if mode in ("drive", "safe_stop"):
+                done = harness.make_command(step, **place, mode=mode, action=[step / 4, -0.5])
+                writer.write(heard("command", encode(done)))
+    return path
+
+
+def export(path, out):
+    return ["export", str(path), "--format", "lerobot", "--out", str(out)]
+
+
+def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
+    out = tmp_path / "sets" / "a"
+    assert harness.bridge_status(export(recorded(tmp_path / "a.mcap", ROVER), out)) == 0
+    assert capsys.readouterr().out.endswith("5 frames; left out: 1 state without an answer\n")
+    rows = parquet.read_table(out / f"data/{FILE}.parquet").to_pylist()
+    episodes = parquet.read_table(out / f"meta/episodes/{FILE}.parquet").to_pylist()
+    kept = [place for place, mode in STEPS.items() if mode in ("drive", "safe_stop")]
+    for index, (row, (episode, step)) in enumerate(zip(rows, kept, strict=True)):
+        number = index - 3 * episode
+        assert row == {
+            "action": [step / 4, -0.5], "mode": STEPS[episode, step], "step": step, "index": index,
+            "next.done": index == 2, "timestamp": pytest.approx(number / 20), "task_index": 0,
+            "frame_index": number, "episode_index": episode, "observation.state": [episode, step],
+        }  # fmt: skip
+    for key in ("observation.images.a", "observation.images.c"):
+        starts_s = [one[f"videos/{key}/from_timestamp"] for one in episodes]
+        with av.open(str(out / f"videos/{key}/{FILE}.mp4")) as video:
+            for row, frame, (episode, step) in zip(rows, video.decode(), kept, strict=True):
+                wanted_s = starts_s[episode] + row["timestamp"]  # as LeRobot looks it up
+                assert frame.time == pytest.approx(wanted_s, abs=1e-4)
+                colour = [20 * step, 90, 10 * episode] if key[-1] == "a" else 50 + 20 * step
+                assert np.abs(frame.to_ndarray(format="rgb24").astype(int) - colour).max() <= 4
+    assert episodes[1]["stats/observation.images.a/max"] == [[[40 / 255]], [[90 / 255]], [[2 / 51]]]
+    assert episodes[1]["stats/action/mean"] == [0.25, -0.5]
+    info = json.loads((out / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 20, 5)
+    assert info["features"]["action"]["names"] == ["left", "right"]
+    assert pd.read_parquet(out / "meta/tasks.parquet").loc["rover"].task_index == 0
+
+
+@pytest.mark.parametrize(
+    ("task", "says"),
+    [(None, "no scene that says"), (ODD, "cannot be the name"), (TASK, "no answered state")],
+)
+def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(task, says, tmp_path, refusal):
+    path = recorded(tmp_path / "a.mcap", task)
+    assert says in refusal(*export(path, tmp_path / "a"))
+    assert "exists; choose another name" in refusal(*export(path, tmp_path))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+async def first_message(port, topic, start_drive):
+    """What a client that is there before the drive begins gets first."""
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"ws://127.0.0.1:{port}", protocols=["foxglove.sdk.v1"]) as server,
+    ):
+        start_drive()
+        while (message := await server.receive(timeout=40)).type == aiohttp.WSMsgType.TEXT:
+            for channel in json.loads(message.data).get("channels", ()):
+                if channel["topic"] == topic:
+                    both = {"id": 1, "channelId": channel["id"]}
+                    await server.send_json({"op": "subscribe", "subscriptions": [both]})
+        assert message.type == aiohttp.WSMsgType.BINARY, message
+        return message.data[13:]  # Behind the kind, the subscription and the time
+
+
+def test_a_drive_is_served_to_foxglove(tmp_path, refusal):
+    endpoint, port = free_endpoint(), free_port()
+    policy = harness.make_policy(tmp_path, "constant")
+    with (
+        harness.BridgeProcess("view", "--foxglove", str(port), "--connect", endpoint) as view,
+        # So many drives that none is the last, however late a busy machine lets the client ask.
+        harness.start_simulate(
+            endpoint, tmp_path / "r.json", harness.SLOW_TOY, "--episodes", "1000"
+        ) as run,
+        contextlib.ExitStack() as edge,
+    ):
+        assert view.process.stdout.readline() == f"open ws://127.0.0.1:{port} in Foxglove\n"
+
+        def start_drive():
+            edge.enter_context(harness.start_edge(endpoint, policy))
+
+        data = asyncio.run(first_message(port, "view/hunter01/frames", start_drive))
+        run.process.kill()
+        assert view.wait(30) == 0, view.errors  # with the simulator
+    assert describe(RawImage).make.FromString(data).height == 90
+    assert "by itself" in refusal("view", "a.mcap", "--foxglove")

@@ -1,0 +1,141 @@
+"""``python -m deploy policy``: any ONNX model becomes a policy file, or says why it cannot."""
+
+import hashlib
+import json
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.parser
+import pytest
+from onnx import helper, numpy_helper
+
+from deploy.__main__ import main
+from deploy.certs import write_key_pair
+from edge_runtime.link_quality import ACCURACY, LinkQuality
+from edge_runtime.policy import VERIFIED, load_policy
+from edge_runtime.tests.harness import exit_status
+
+PENDULUM = "(float[b, 3] obs) => (float[b, 1] out)"
+TORQUE = "cos = Slice(obs, zero, one, one) out = Mul(cos, two)"
+BODY = "(bool go) => (bool on) { on = Identity(go) }"
+PARKING = "float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation"
+STOP = ("--set", "action.0.stop=0")
+
+
+def write_model(path, graph, opset=17, ir_version=8):
+    made = onnx.parser.parse_graph(f"g {graph}")
+    for name, number in (("zero", [0]), ("one", [1]), ("two", np.float32(2)), ("ends", [2])):
+        made.initializer.append(numpy_helper.from_array(np.asarray(number), name))
+    opsets = [helper.make_opsetid("", opset)]
+    onnx.save(helper.make_model(made, opset_imports=opsets, ir_version=ir_version), str(path))
+
+
+def policy(tmp_path, *options, env="Pendulum-v1"):
+    out = tmp_path / "out.onnx"
+    words = ["policy", str(tmp_path / "model.onnx"), "--env", env, "--out", str(out), *options]
+    return exit_status(main, words), out
+
+
+@pytest.mark.parametrize(("opset", "ir_version"), [(13, 7), (21, 10)])
+def test_a_model_with_names_of_its_own_becomes_a_signed_policy(tmp_path, capsys, opset, ir_version):
+    write_model(tmp_path / "model.onnx", f"{PENDULUM} {{ {TORQUE} }}", opset, ir_version)
+    key, public = write_key_pair(tmp_path / "keys")
+    more = ("--set", "action.0.slew_per_s=50", "--set", "action.0.unit=N m", "--algorithm", "hand")
+    status, out = policy(tmp_path, *STOP, *more, "--key", str(key))
+    assert status == 0
+    made = load_policy(out, public)
+    manifest = made.manifest
+    assert (made.trust, manifest.task, manifest.algorithm) == (VERIFIED, "Pendulum-v1", "hand")
+    assert manifest.control_period_s == pytest.approx(1 / 30)
+    (row,) = manifest.action
+    assert (row.low, row.high, row.stop, row.slew_per_s, row.unit) == (-2.0, 2.0, 0.0, 50.0, "N m")
+    seen = {"observation": np.array([0.25, 0.0, 0.0], np.float32)}
+    assert made.act(seen) == pytest.approx([0.5])
+    assert "it drives Pendulum-v1: observation float32 3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("graph", "options", "match"),
+    [
+        ("(float[b, 4] obs) => (float[b, 1] out) { " + TORQUE + " }", STOP, "must be observation"),
+        ("(int32[b, 3] obs) => (float[b, 1] out) { x = Cast<to = 1>(obs) "
+         + TORQUE.replace("obs", "x") + " }", STOP, "must be observation"),
+        ("(float[b, 3] obs) => (double[b, 1] out) { cos = Slice(obs, zero, one, one)"
+         " out = Cast<to = 11>(cos) }", STOP, r"output must be action tensor\(float\)"),
+        ("(float[b, 3] obs) => (float[b, 1] out) { x = Slice(obs, zero, one, one)"
+         " y = Mul(x, two) out = Mul(y, two) }", STOP, "outside its manifest's -2.0 to 2.0"),
+        (f"{PENDULUM} {{ s = Sqrt(obs) out = Slice(s, zero, one, one) }}", STOP, "not finite"),
+        (f"{PENDULUM} {{ go = Greater(two, two) o = If(go)<then_branch = t () => (float[b, 1] x) "
+         f"{{ x = Identity(two) }}, else_branch = e () => (float[b, 1] y) {{ y = Identity(two) }}> "
+         f"{TORQUE} }}", STOP, "control flow"),
+        (f"{PENDULUM} {{ {TORQUE} }}", (), "does not say how action_0 stops safely; give --set"),
+        (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.0.stop=9"), "outside its range"),
+        (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.1.stop=0"), "with N from 0 to 0"),
+        (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.0.low=0"), "expected action.N.stop"),
+    ],
+)  # fmt: skip
+def test_what_cannot_drive_is_one_line_and_leaves_no_file(tmp_path, capsys, graph, options, match):
+    write_model(tmp_path / "model.onnx", graph)
+    status, out = policy(tmp_path, *options)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert match.replace("\\", "") in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("env", "match"),
+    [
+        ("CartPole-v1", "acts in Discrete(2)"),
+        ("parking-v0", "its input must be achieved_goal"),  # one is missing
+        ("nobodys:Env-v0", "no environment 'nobodys:Env-v0'"),
+    ],
+)
+def test_an_environment_that_does_not_fit_is_one_line(tmp_path, capsys, env, match):
+    inputs = PARKING.replace("achieved_goal", "goal")
+    body = "{ x = Slice(observation, zero, ends, one) out = Clip(x) }"
+    write_model(tmp_path / "model.onnx", f"({inputs}) => (float[b, 2] out) {body}")
+    status, _ = policy(tmp_path, *STOP, "--set", "action.1.stop=0", env=env)
+    assert status == 2
+    assert match in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_envelope_goes_into_the_policy_that_it_was_measured_with(tmp_path, capsys):
+    """The file that was measured, or another with the same graph: no other one."""
+    write_model(tmp_path / "model.onnx", f"{PENDULUM} {{ {TORQUE} }}")
+    _, out = policy(tmp_path, *STOP)
+    measured, file = load_policy(out, allow_unsigned=True), tmp_path / "envelope.json"
+    graph = onnx.load(str(out)).graph.SerializeToString(deterministic=True)
+    limits = dict.fromkeys(ACCURACY, 7.0)
+    known = {
+        "policy_id": measured.policy_id, "env": "Pendulum-v1", "condition": "nominal",
+        "promised_success": 0.95, "confidence": 0.95, "limits": limits, "joint": 1.0, "tried": [],
+        "control_period_s": measured.manifest.control_period_s,
+    }  # fmt: skip
+    write_key_pair(tmp_path / "keys")
+    named = {**known, "policy_id": "another", "network": hashlib.sha256(graph).hexdigest()}
+    key = ("--key", str(tmp_path / "keys" / "policy.key"))
+    for content, model in ((named, "model.onnx"), (known, "measured.onnx")):
+        out.rename(tmp_path / "measured.onnx")
+        (tmp_path / "model.onnx").write_bytes((tmp_path / model).read_bytes())
+        file.write_text(json.dumps(content))
+        assert policy(tmp_path, *STOP, *key, "--envelope", str(file))[0] == 0
+        made = load_policy(out, tmp_path / "keys" / "policy.pub")
+        assert LinkQuality(made.manifest).limits == limits
+        assert (made.trust, made.policy_id != measured.policy_id) == (VERIFIED, True)
+        if model == "model.onnx":
+            (tmp_path / "measured.onnx").replace(out)
+    wrong: Any = (
+        ({**named, "network": "0"}, "the envelope was measured with another network"),
+        ({**named, "joint": None}, "the envelope is not valid: Expected `float`"),
+        ([], "the envelope is not valid: Expected `object`, got `array`"),
+        ("", "is not JSON"),
+    )
+    out.unlink()
+    capsys.readouterr()
+    for content, words in wrong:
+        file.write_text(json.dumps(content) if content != "" else "")
+        status, _ = policy(tmp_path, *STOP, "--envelope", str(file))
+        (line,) = capsys.readouterr().err.splitlines()
+        assert (status, words in line, out.exists()) == (2, True, False), line

@@ -1,0 +1,203 @@
+"""The manifest of a policy file: what the policy is for, sees and does. Contract, section 4.
+
+A Task is what an environment asks of a policy; a Manifest is a Task and where the policy comes
+from. Everything else follows it: the control period T, the size of a state, the safe stop.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
+
+import msgspec
+import numpy as np
+
+from edge_runtime.util import UserError
+from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Envelope, Reason, Rejection
+
+MANIFEST_KEY = "phil.manifest"
+MANIFEST_SCHEMA = 2
+MIN_PERIOD_S, MAX_PERIOD_S = 0.01, 1.0
+DTYPES = ("uint8", "int32", "int64", "float32", "bool")
+OVERHEAD_BYTES = 4096  # What a state holds besides its observation, at most
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """One array of the observation: one input of the network, behind a batch dimension."""
+
+    dtype: str
+    shape: List[int]
+    meaning: str = ""
+
+
+class Action(msgspec.Struct, frozen=True, kw_only=True):
+    """One number of the network's output, its physical meaning, unit and range.
+
+    `stop` is its value in a safe stop, None to hold the last one; `slew_per_s` the fastest change
+    that is sent, None for any.
+    """
+
+    name: str
+    meaning: str = ""
+    unit: str = ""
+    low: float
+    high: float
+    stop: Optional[float] = None
+    slew_per_s: Optional[float] = None
+
+
+class Car(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The car that a driving policy was trained on, for a robot that takes its place.
+
+    `full_steering_rad` is the front-wheel angle at action +1, positive to the left.
+    `wheelbase_m` is the length that its bicycle model turns by.
+    """
+
+    throttle_mps2: float
+    brake_mps2: float
+    max_speed_mps: float
+    full_steering_rad: float
+    wheelbase_m: float
+
+
+class Task(msgspec.Struct, frozen=True, kw_only=True):
+    """What is asked of a policy. `car` is left out where the policy drives no car."""
+
+    task: str
+    observation: Dict[str, Entry]
+    action: List[Action]
+    control_period_s: float
+    car: Optional[Car] = None
+
+    @property
+    def text(self) -> str:
+        """All that both sides must agree on, as in `rover: camera uint8 48x64x3, left 0 to 1, ...`.
+
+        A text that is too long for the wire ends with a checksum of the whole.
+        """
+        seen = (
+            f"{name} {entry.dtype} {'x'.join(map(str, entry.shape)) or 'number'}"
+            for name, entry in sorted(self.observation.items())
+        )
+        done = (f"{row.name} {row.low:g} to {row.high:g}" for row in self.action)
+        text = f"{self.task}: {', '.join((*seen, *done))}, every {self.control_period_s:g} s"
+        if len(text) > MAX_TEXT_CHARS:
+            end = f"... {zlib.crc32(text.encode()):08x}"
+            text = text[: MAX_TEXT_CHARS - len(end)] + end
+        return text
+
+
+class Manifest(Task, frozen=True, kw_only=True):
+    """All of it. `training` holds what is known of it: seed, episodes, config, source revision.
+
+    `created` is ISO 8601 in UTC, `envelope` as in envelope.py. Other fields are not looked at.
+    """
+
+    algorithm: str
+    training: Dict[str, Any]
+    created: str
+    envelope: Optional[Dict[str, Any]] = None
+    schema: int = MANIFEST_SCHEMA
+
+
+def decode_manifest(text: str) -> Manifest:
+    """The manifest of a policy file. Raises UserError where it is none, or none we can drive."""
+    try:
+        # The schema first: another schema's fields need not fit.
+        schema = msgspec.json.decode(text.encode(), type=Envelope).schema
+        if schema != MANIFEST_SCHEMA:
+            found = f"the manifest has schema {schema}, this runtime reads {MANIFEST_SCHEMA}"
+            raise UserError(f"{found}; export the policy again")
+        manifest = msgspec.json.decode(text.encode(), type=Manifest)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise UserError(f"the manifest in the policy file is not valid: {error}") from None
+    check_task(manifest)
+    if manifest.envelope is not None:
+        from edge_runtime.envelope import read_envelope  # Here: most have none.
+
+        read_envelope(manifest.envelope, manifest)
+    return manifest
+
+
+def check_task(task: Task) -> None:
+    """Raise UserError, with the first reason, where no policy could drive it here."""
+    if not MIN_PERIOD_S <= task.control_period_s <= MAX_PERIOD_S:  # nor is NaN
+        within = f"it must lie in {MIN_PERIOD_S} to {MAX_PERIOD_S} s"
+        raise UserError(f"the control period is {task.control_period_s} s; {within}")
+    if not task.observation:
+        raise UserError("the manifest names no observation")
+    for name, entry in task.observation.items():
+        if entry.dtype not in DTYPES:
+            known = ", ".join(DTYPES)
+            raise UserError(f"the observation {name!r} is {entry.dtype}; the wire carries {known}")
+        if len(entry.shape) > 32 or any(length < 1 for length in entry.shape):  # numpy's most
+            raise UserError(f"the observation {name!r} has the shape {entry.shape}")
+    Layout(task)
+    names = [row.name for row in task.action]
+    if not names or len(set(names)) != len(names):
+        found = f"an action twice: {', '.join(names)}" if names else "no action"
+        raise UserError(f"the manifest names {found}")
+    for row in task.action:
+        if not (row.low < row.high and math.isfinite(row.low) and math.isfinite(row.high)):
+            found = f"the range of {row.name} is {row.low} to {row.high}"
+            raise UserError(f"{found}; it must be finite, and not empty")
+        if row.stop is not None and not row.low <= row.stop <= row.high:
+            found = f"the safe stop of {row.name} is {row.stop}"
+            raise UserError(f"{found}, outside its range of {row.low} to {row.high}")
+        if row.slew_per_s is not None and not 0.0 < row.slew_per_s < math.inf:
+            raise UserError(f"the slew_per_s of {row.name} is {row.slew_per_s}; it must be above 0")
+
+
+class _Part(NamedTuple):
+    """One array of the observation as it lies in a state."""
+
+    name: str
+    dtype: np.dtype
+    shape: Tuple[int, ...]
+    size: int  # bytes
+
+
+class Layout:
+    """How a state carries a task's observation. Raises UserError for one that no state can."""
+
+    def __init__(self, task: Task) -> None:
+        self.task_text = task.text
+        self.parts = [
+            _Part(
+                name,
+                np.dtype(entry.dtype),
+                tuple(entry.shape),
+                math.prod(entry.shape) * np.dtype(entry.dtype).itemsize,
+            )
+            for name, entry in task.observation.items()
+        ]
+        self.size = sum(part.size for part in self.parts)
+        self.max_payload_bytes = self.size + OVERHEAD_BYTES
+        if self.max_payload_bytes > MAX_STATE_BYTES:
+            found = f"the observation holds {self.size} bytes"
+            raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
+
+    def refusal(self, observation: Mapping[str, bytes]) -> Optional[Rejection]:
+        """Why a state's observation is none of this task's, None where it is one."""
+        if len(observation) != len(self.parts):
+            names = ", ".join(part.name for part in self.parts)
+            found = f"{len(observation)} arrays, not {names}"
+            return Rejection(Reason.OBSERVATION, f"the observation holds {found}")
+        for name, dtype, _, size in self.parts:
+            data = observation.get(name)
+            if data is None or len(data) != size:
+                found = "is missing" if data is None else f"holds {len(data)} bytes, not {size}"
+                return Rejection(Reason.OBSERVATION, f"{name} {found}")
+            if dtype.kind == "f" and not np.isfinite(np.frombuffer(data, dtype)).all():
+                return Rejection(Reason.NOT_FINITE, f"{name} holds a number that is not finite")
+            if dtype.kind == "b" and max(data) > 1:
+                return Rejection(Reason.OBSERVATION, f"{name} holds bytes that are no bool")
+        return None
+
+    def arrays(self, observation: Mapping[str, bytes]) -> Dict[str, np.ndarray]:
+        """The read-only arrays of an observation that `refusal` has nothing against; no copies."""
+        return {
+            name: np.frombuffer(observation[name], dtype).reshape(shape)
+            for name, dtype, shape, _ in self.parts
+        }

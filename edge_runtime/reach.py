@@ -1,0 +1,139 @@
+"""Why there is no link, and whether a port can be had: with Python's own socket and ssl.
+
+Zenoh says "Unable to connect" whether nobody is there, the other end refuses us, or we refuse it,
+and of a busy port neither its number nor the cause.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import ssl
+from typing import TYPE_CHECKING, Any, Optional, Tuple
+
+from edge_runtime.util import UserError
+
+if TYPE_CHECKING:
+    from edge_runtime.tls import TlsFiles
+
+_LOOK_S = 1.0
+# A server that refuses a client's certificate says so after the handshake (TLS 1.3).
+_ALERT_S = 0.3
+
+
+def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
+    """Whether anybody answers at `endpoint`, and why there is no link; "" if nothing forbids one.
+
+    An endpoint of udp or quic is only resolved: there is nothing to connect to, and Python has no
+    QUIC. Takes up to 1.3 s for each address of the host, and as long as the name server does.
+    """
+    protocol, host, port = _parts(endpoint)
+    try:
+        _address(endpoint)
+    except OSError as error:
+        return False, f"host {host!r} cannot be resolved ({error.strerror})"
+    if _kind(protocol) != socket.SOCK_STREAM:
+        return False, ""
+    try:
+        plain = socket.create_connection((host, port), timeout=_LOOK_S)
+    except ConnectionRefusedError:
+        return False, f"nobody listens on port {port} of {host} (connection refused)"
+    except socket.timeout:
+        return False, f"{host} does not answer within {_LOOK_S:.0f} s"
+    except OSError as error:
+        return False, f"{host} cannot be reached ({error.strerror})"
+    with contextlib.closing(plain):
+        why = _why_not_plain(plain) if files is None else _why_not_tls(plain, host, files)
+    return True, why and f"{endpoint} {why}"
+
+
+def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
+    """Why a client that must have a link at once gets none, on one line."""
+    answers, why = look(endpoint, files)
+    if answers and why:
+        return why
+    if endpoint.startswith("quic/"):  # such a link does not say why it fails
+        why = why or "or one end does not believe the other's certificate"
+    help_ = "start the simulator first, or name its address with --connect"
+    return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
+
+
+def _why_not_plain(plain: socket.socket) -> str:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        context.wrap_socket(plain).close()
+    except OSError as error:
+        if "ALERT" not in (getattr(error, "reason", "") or ""):  # as an SSLError has it
+            return "answers, but not as a simulator or a router does"
+    return "listens with TLS and wants --tls, with tls/ for tcp/"
+
+
+def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
+    context = ssl.create_default_context(cafile=files.ca)
+    context.load_cert_chain(files.certificate, files.key)
+    shaken = False
+    try:
+        with context.wrap_socket(plain, server_hostname=host) as link:
+            shaken = True
+            link.settimeout(_ALERT_S)
+            link.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        return f"shows a certificate that is not believed here: {error.verify_message}"
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).lower().replace("_", " ")
+        if "alert" not in reason:
+            return f"does not speak TLS ({reason})"
+        needs = "both need one authority, and certificates that have not expired"
+        return f"refuses the certificate of {files.name} ({reason}): {needs}"
+    except OSError:  # A link that stays open, and silent, has been accepted.
+        return "" if shaken else "answers, but not with TLS"
+    return ""
+
+
+def check_port_is_free(endpoint: str) -> None:
+    """Raise UserError where it cannot be had: Zenoh names neither the port nor the cause."""
+    _, host, port = _parts(endpoint)
+    try:
+        family, kind, _, _, target = _address(endpoint)
+    except OSError:
+        raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
+    with socket.socket(family, kind) as probe:
+        if kind == socket.SOCK_STREAM:
+            # As the listener does: the last run's closed links are no bar.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(target)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                words = f"port {port} on {host} is in use; choose another with --listen"
+            else:
+                words = f"cannot listen on port {port} of {host}: {error.strerror}"
+            raise UserError(words) from None
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
+    with socket.socket(type=_kind(protocol)) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _kind(protocol: str) -> int:
+    return socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
+
+
+def _parts(endpoint: str) -> Tuple[str, str, int]:
+    protocol, address = endpoint.split("/", 1)
+    host, port = address.rsplit(":", 1)
+    return protocol, host.strip("[]"), int(port)
+
+
+def _address(endpoint: str) -> Any:
+    """The first of `socket.getaddrinfo`; OSError where the host cannot be resolved."""
+    protocol, host, port = _parts(endpoint)
+    try:
+        return socket.getaddrinfo(host, port, type=_kind(protocol))[0]
+    except UnicodeError as error:  # no host can have such a name
+        raise OSError(None, str(error)) from None

@@ -1,0 +1,201 @@
+"""The door of the drivers: built in, installed by others, or named as module:Class; and `drive`."""
+
+import sys
+import threading
+import time
+from typing import Any, cast
+
+import pytest
+
+import edge_runtime
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import Simulator, make_state, run_command, wait_until
+from edge_runtime.tests.rigs import CAR, PEDAL, HunterRig, Ros2Rig, a_manifest
+from edge_runtime.util import UserError
+from edge_runtime.vehicles import find_vehicle, make_vehicle, vehicle_limits
+from edge_runtime.vehicles.mock import MockVehicle
+
+MODULE = """
+from edge_runtime.vehicles.base import Vehicle
+from edge_runtime.vehicles.mock import MockVehicle
+
+class Cart(MockVehicle):
+    name = "cart"
+    open = classmethod(Vehicle.open.__func__)  # no settings of the mock
+    def __init__(self, wheels=4, port=""):
+        super().__init__()
+        self.wheels = wheels
+        if port:
+            raise OSError(2, "no such port")
+
+class Half(Vehicle):
+    def enable(self, now_s): ...
+
+class Boundless(Cart):
+    limits = {"pedal": (-1.0, 1.0)}  # no ActionLimit
+
+number = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def carts(tmp_path, monkeypatch):
+    """A package of somebody else's on the path, with an entry point."""
+    (tmp_path / "carts.py").write_text(MODULE)
+    (tmp_path / "broken_cart.py").write_text("import nowhere_to_be_found")
+    about = tmp_path / "carts-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: carts\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[phil.vehicles]\nmilk_cart = carts:Cart\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("carts", None)
+
+
+WHOLE = {
+    "throttle_mps2": 1.0, "brake_mps2": 2.0, "max_speed_mps": 5.0,
+    "full_steering_rad": 0.3, "wheelbase_m": 1.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("tank", {}, r"'tank' is not known; choose from none, mock, hunter, ros2, milk_cart, or a"),
+        ("nowhere:Cart", {}, "'nowhere:Cart' cannot be loaded: .*No module named 'nowhere'"),
+        ("broken_cart:Cart", {}, "cannot be loaded: .*nowhere_to_be_found"),
+        ("carts:Wagon", {}, "cannot be loaded: .*Wagon"),
+        ("carts:", {}, "cannot be loaded"),
+        ("carts:number", {}, "carts:number is no edge_runtime.vehicles.base.Vehicle"),
+        ("carts:Half", {}, "no whole Vehicle: it lacks brake, close, command, feedback"),
+        (
+            "carts:Boundless",
+            {},
+            "cart: its limits must be like {'pedal': ActionLimit.*not {",
+        ),
+        ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
+        ("milk_cart", {"port": "ttyS9"}, "milk_cart cannot be opened: .*no such port"),
+        ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`; known are dead_time_s"),
+        ("hunter", {"speed": 3}, "vehicle.hunter: .*unknown field `speed`; known are model, scale"),
+        ("hunter", {"bus": "can0"}, "bus 'can0'.*INTERFACE:CHANNEL"),
+        ("hunter", {"model": "3.0"}, "vehicle.hunter.model '3.0'.*2.0, se"),
+        ("hunter", {"profile": "v9"}, "vehicle.hunter.profile 'v9'.*v2, manual"),
+        ("hunter", {"scale": 0.0}, "scale 0.0.*above 0"),
+        ("hunter", {"scale": float("nan")}, "scale nan.*above 0"),
+        ("hunter", {"car": {"throttle_mps2": 1.0}}, "vehicle.hunter.car: .*brake_mps2"),
+        ("hunter", {"car": {**WHOLE, "mass": 1.0}}, "vehicle.hunter.car: .*unknown field `mass`"),
+        ("hunter", {"car": {**WHOLE, "full_steering_rad": 2.0}}, "2.0 is not valid: .*below 1.5"),
+        ("ros2", {"topic": 1}, "vehicle.ros2: .*unknown field `topic`; known are .*listen,"),
+        ("ros2", {"connect": "tls/h:1"}, "plain text"),
+    ],
+)
+def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words):
+    table = "cart" if ":" in name else name
+    with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
+        make_vehicle(name, {table: settings}, a_manifest())
+
+
+def test_a_driver_of_another_package_gets_its_own_table():
+    tables = {"milk_cart": {"wheels": 3}, "cart": {"wheels": 2}, "other": {"speed": 1}}
+    for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):
+        vehicle: Any = make_vehicle(name, tables, a_manifest())
+        assert (vehicle.name, vehicle.wheels) == ("cart", wheels)
+        assert vehicle_limits(name, tables, a_manifest()) == MockVehicle.limits
+    assert find_vehicle("carts:Cart").name == "cart"
+    assert vehicle_limits("none", tables, a_manifest()) == {}
+
+
+def test_a_robot_follows_the_manifests_car_or_that_of_the_settings():
+    for name in ("hunter", "ros2"):
+        known = vehicle_limits(name, {}, a_manifest(CAR))
+        assert known == vehicle_limits(name, {name: {"car": WHOLE}}, a_manifest())
+        assert known != vehicle_limits(name, {}, a_manifest())
+        with pytest.raises(UserError, match=rf"'parking'.* set car in \[vehicle.{name}\]"):
+            vehicle_limits(name, {}, a_manifest(None))
+
+
+@pytest.mark.parametrize("make", [HunterRig, Ros2Rig])
+@pytest.mark.parametrize(("period_s", "holds_s"), [(0.1, 0.24), (0.05, 0.13), (0.5, 1.12)])
+def test_a_streamed_command_holds_for_two_periods_of_the_policy(make, period_s, holds_s):
+    rig = make()
+    rig.core.follow_period(period_s)
+    rig.enabled().core.command(PEDAL, rig.now_s)
+    assert rig.core.late_at_s == pytest.approx(rig.now_s + holds_s)
+    assert rig.core._heard.silence_s == pytest.approx(2 * period_s)
+
+
+def test_the_mock_holds_a_command_for_two_periods_of_the_policy():
+    vehicle = MockVehicle()
+    vehicle.control_period_s = 0.5
+    vehicle.enable(0.0)
+    vehicle.command(PEDAL, 0.0)
+    assert [vehicle.feedback(at_s).self_braking for at_s in (0.3, 0.99, 1.01)] == [
+        False,
+        False,
+        True,
+    ]
+
+
+class Noting(MockVehicle):
+    def __init__(self):
+        super().__init__()
+        self.closed = 0
+
+    def close(self):
+        super().close()
+        self.closed += 1
+
+
+def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, capsys):
+    signed, endpoint, until = make_policy(value=1.0), free_endpoint(), threading.Event()
+    vehicle, ended = Noting(), []
+    settings = {"public_key": str(signed.public_key), "vehicle_id": "cart7", "log_level": "error"}
+
+    def drive():
+        call = edge_runtime.drive(
+            signed.path, connect=endpoint, vehicle=vehicle, until=until, **settings
+        )
+        ended.append(call)
+
+    thread = threading.Thread(target=drive)
+    with Simulator(endpoint, "cart7") as simulator:
+        thread.start()
+        simulator.wait_for_edge()
+        assert simulator.query("status")["vehicle"] == "mock"
+        for step in range(20):
+            simulator.ask(make_state(step))
+            time.sleep(0.05)
+        wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps > 0.1, "it to move")
+        until.set()
+        thread.join(20.0)
+    assert (ended, vehicle.closed > 0) == ([True], True)
+    assert "ready vehicle_id=cart7 vehicle=mock" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"speed": 3}, "unknown field `speed`; known are policy, connect"),
+        ({"cpus": "all"}, "cpus: Expected `array`"),
+        ({"vehicle": "tank"}, "'tank' is not known"),
+        ({}, "absent.onnx does not exist"),
+    ],
+)
+def test_drive_refuses_what_run_refuses_and_closes_the_driver(settings, words, tmp_path):
+    vehicle = Noting()
+    with pytest.raises(UserError, match=words):
+        edge_runtime.drive(tmp_path / "absent.onnx", **{"vehicle": vehicle, **settings})
+    assert vehicle.closed == ("vehicle" not in settings)
+    vehicle.limits = None  # type: ignore[assignment]
+    for wrong, words in ((Noting, "is no edge_runtime.vehicles.base.Vehicle"), (vehicle, "limits")):
+        with pytest.raises(UserError, match=words):
+            edge_runtime.drive(tmp_path / "absent.onnx", vehicle=cast(Any, wrong))
+    with pytest.raises(AttributeError, match="no attribute 'drivee'"):
+        _ = edge_runtime.drivee
+
+
+def test_a_module_on_the_path_drives_a_run(make_policy, carts):
+    (carts / "edge.toml").write_text("[vehicle]\ndriver = 'carts:Cart'\n[vehicle.cart]\nmass = 1\n")
+    ended = run_command("run", *make_policy().flags, "--config", "edge.toml", cwd=carts)
+    words = "error: settings of cart: got an unexpected keyword argument 'mass'; known are wheels"
+    assert (ended.returncode, ended.stderr) == (2, f"{words}, port\n")

@@ -1,0 +1,213 @@
+"""``python -m hil_tests conformance``: a vehicle's driver against the rules that stop it.
+
+The driver is real, and so is the clock; what it moves may be a mock. It is called as the edge
+runtime calls it: by one thread. It will drive, with each action at its highest: lift the wheels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from edge_runtime import log
+from edge_runtime.cli import examples, number
+from edge_runtime.config import NONE, load_config
+from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S, Action, Car, Entry, Manifest
+from edge_runtime.util import UserError, printable
+from edge_runtime.vehicles import make_vehicle
+from edge_runtime.vehicles.base import Vehicle, VehicleReport
+
+BROKEN = 1
+LATE_S = 0.05  # what a driver may be late, besides a fifth of T
+CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
+MOVES_MPS, STANDS_MPS = 0.1, 0.05
+ROUNDING = 1e-3
+PATIENCE_S = 10.0  # until it moves, or stands
+EXAMPLE = examples(
+    "python -m hil_tests conformance --vehicle mock",
+    "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("--vehicle", metavar="NAME|MODULE:CLASS", help="the driver (default: that of --config)")
+    add("--config", metavar="FILE.toml", help="its settings, as for `edge_runtime run`")
+    limits = f"a number from {MIN_PERIOD_S} to {MAX_PERIOD_S}"
+    period = number(limits, lambda value: MIN_PERIOD_S <= value <= MAX_PERIOD_S)
+    add("--period-s", type=period, default=0.1, metavar="S", help="the policy's control period T")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print a table of all rules; 0 where the driver keeps them, 1 where it breaks one."""
+    config = load_config(arguments.config, {"policy": "any", "vehicle": arguments.vehicle})
+    if config.vehicle == NONE:
+        raise UserError("no vehicle to try: name it with --vehicle")
+    log.configure("error")
+    actions = [Action(name=name, low=-1.0, high=1.0) for name in ("pedal", "steering")]
+    car = Car(
+        throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.5, wheelbase_m=5.0
+    )
+    manifest = Manifest(
+        task="conformance", observation={"frames": Entry(dtype="uint8", shape=[1])}, car=car,
+        action=actions, control_period_s=arguments.period_s, algorithm="", training={}, created="",
+    )  # fmt: skip
+    vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
+    bench = Bench(vehicle, arguments.period_s)
+    broken = 0
+    try:
+        for rule, is_kept in RULES.items():
+            try:
+                words = "" if is_kept(bench) else f"it says {bench.last}"
+            except Exception as error:  # a driver may raise anything, and the next rule is due
+                words = f"{type(error).__name__}: {error}"
+            broken += bool(words)
+            verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
+            print(verdict, flush=True)
+    finally:
+        bench.vehicle.close()
+        log.close()
+    print(f"{bench.vehicle.name}: {len(RULES) - broken} rules kept, {broken} broken")
+    return BROKEN if broken else 0
+
+
+class Bench:
+    """A driver, whose calls are timed and whose reports are looked at."""
+
+    def __init__(self, vehicle: Vehicle, period_s: float) -> None:
+        self.vehicle, self.period_s, self.pause_s = vehicle, period_s, min(period_s / 4, 0.02)
+        vehicle.control_period_s = period_s
+        self.go = {name: limit.high for name, limit in vehicle.limits.items()}
+        self.longest_s, self.well_formed = 0.0, True
+        self.last: VehicleReport | None = None
+
+    def call(self, name: str, *arguments: Any, **options: Any) -> Any:
+        """Call the driver with the time after the arguments, as it takes it."""
+        now_s = time.monotonic()
+        try:
+            return getattr(self.vehicle, name)(*arguments, now_s, **options)
+        finally:
+            self.longest_s = max(self.longest_s, time.monotonic() - now_s)
+
+    def report(self, after_s: float = 0.0) -> VehicleReport:
+        """What it says of itself, after a time in which it is asked for nothing else."""
+        end_s = time.monotonic() + after_s
+        while time.monotonic() < end_s:
+            self.call("feedback")
+            time.sleep(self.pause_s)
+        self.last = report = self.call("feedback")
+        numbers = (*report.action.values(), report.speed_mps)
+        has_all = report.action.keys() == self.vehicle.limits.keys() and type(report.faults) is list
+        self.well_formed = self.well_formed and has_all and all(map(math.isfinite, numbers))
+        return report
+
+    def until(self, moves: bool, limit_s: float | None = None, commands: bool = False) -> bool:
+        """Whether it comes to move, or to stand; meanwhile it is told to go each T, or nothing."""
+        end_s = time.monotonic() + (PATIENCE_S if limit_s is None else limit_s)
+        next_s = -math.inf
+        while True:
+            now_s = time.monotonic()
+            if commands and now_s >= next_s:
+                self.call("command", self.go)
+                next_s = now_s + self.period_s
+            speed_mps = abs(self.report().speed_mps)
+            if speed_mps > MOVES_MPS if moves else speed_mps <= STANDS_MPS:
+                return True
+            if now_s >= end_s:
+                return False
+            time.sleep(self.pause_s)
+
+    def goes(self, enables: bool = False, limit_s: float | None = None) -> bool:
+        """Whether commands move it, after `enable` from a stand."""
+        if enables:
+            self.call("enable")
+            self.until(moves=False)
+        return self.until(moves=True, limit_s=limit_s, commands=True)
+
+    def after(self, periods: float) -> VehicleReport:
+        """Its report so many T after a last command."""
+        self.call("command", self.go)
+        return self.report(periods * self.period_s)
+
+    def brakes(self) -> bool:
+        """Whether it gets slower within 2 T of a stop, and then stands."""
+        self.call("brake")
+        # Commands still come: without them it would brake by itself.
+        if self.until(moves=False, limit_s=2 * self.period_s + LATE_S, commands=True):
+            return True
+        before_mps, after_mps = (abs(self.report(LATE_S).speed_mps) for _ in range(2))
+        return after_mps < before_mps and self.until(moves=False)
+
+    def refuses(self, *actions: dict[str, float]) -> bool:
+        """Whether each of these is a ValueError."""
+        for action in actions:
+            try:
+                self.call("command", action)
+                return False
+            except ValueError:
+                pass
+        return True
+
+    def stays_within(self) -> bool:
+        """Whether its actuators stay within the limits, when far more is asked."""
+        for _ in range(10):
+            self.call("command", {name: 10.0 * value for name, value in self.go.items()})
+            action = self.report(self.period_s / 2).action
+            for name, limit in self.vehicle.limits.items():
+                if not limit.low - ROUNDING <= action[name] <= limit.high + ROUNDING:
+                    return False
+        return True
+
+    def closes(self) -> bool:
+        """Whether it may be closed twice, and nothing moves it then."""
+        self.call("brake", latch=False)
+        self.until(moves=False)
+        self.vehicle.close()
+        self.vehicle.close()
+        try:
+            return not self.goes(limit_s=1.0)
+        except Exception:  # what is closed may say so
+            return True
+
+
+def _is_range(low: float, high: float, slew_per_s: float) -> bool:
+    return -math.inf < low < high < math.inf and slew_per_s > 0.0
+
+
+# In this order, because one begins where another ends.
+RULES: dict[str, Callable[[Bench], bool]] = {
+    "each action has a finite range": lambda it: (
+        all(_is_range(*limit[:3]) for limit in it.vehicle.limits.values()) and bool(it.go)
+    ),
+    "no command moves it before `enable`": lambda it: not it.goes(limit_s=5 * it.period_s),
+    "enabled, it stands until the first command": lambda it: (
+        it.call("enable") is None and not it.until(moves=True, limit_s=0.5)
+    ),
+    "commands move it": lambda it: it.goes(),
+    "a command holds for 1.5 T": lambda it: it.goes() and not it.after(1.5).self_braking,
+    "it brakes by itself after 2 T without a command": lambda it: (
+        it.goes(enables=True)
+        and it.after(2.2 + LATE_S / it.period_s).self_braking
+        and it.until(moves=False)
+    ),
+    "it brakes within 2 T of a stop": lambda it: it.goes(enables=True) and it.brakes(),
+    "a stop is latched: no command moves it": lambda it: not it.goes(limit_s=10 * it.period_s),
+    "`enable` after a stop: it stands, then commands move it": lambda it: (
+        it.call("enable") is None and not it.until(moves=True, limit_s=0.5) and it.goes()
+    ),
+    "a stop without a latch ends with the next command": lambda it: (
+        it.call("brake", latch=False) is None and it.until(moves=False) and it.goes()
+    ),
+    "NaN and infinity are a ValueError": lambda it: it.refuses(
+        *({**it.go, name: value} for name in it.go for value in (math.nan, math.inf, -math.inf))
+    ),
+    "a command that lacks its actions is a ValueError": lambda it: it.refuses({}, {"": 0.5}),
+    "far beyond its limits it stays within them": lambda it: it.stays_within(),
+    "each report has its actions, finite numbers, a list of faults": lambda it: it.well_formed,
+    f"no call takes longer than {CALL_S * 1e3:.0f} ms": lambda it: it.longest_s <= CALL_S,
+    "it closes twice, and nothing moves it then": lambda it: it.closes(),
+}

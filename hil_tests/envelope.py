@@ -1,0 +1,375 @@
+"""``python -m hil_tests envelope``: find the smallest networks that break a policy.
+
+Each axis is searched alone, then all together. A point is driven until a sequential test has
+decided, in process and in virtual time, which is the drive over the wire to the bit
+(`tests/test_loop.py`). Every point drives the same seeds.
+
+What is written holds the region in which the policy keeps its promise. With limits L and measured
+values x, a network is inside where::
+
+    every x <= L   and   the sum of x / L <= joint        (0 / 0 counts as 0)
+
+This is conservative where failures of several kinds add up and each grows at least in proportion:
+then a mixture of limits, each at its share, fails no more than one of them alone. ``joint`` starts
+at 1, and is lowered to the least sum at which a mixture that was tried (each pair in equal shares,
+and all together) kept the promise. ``box`` needs only that less is no worse: where every
+x <= box L, the promise is kept, too.
+
+A run of one lost message is no burst (x = 0): it belongs to the loss. The longest run of a window
+is at least its mean run, so comparing it with ``burst_messages``, a mean, is conservative.
+``jitter_ms`` is the smaller of the limits with a normal and with a long (Pareto) tail.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from itertools import combinations
+from multiprocessing import get_context
+from typing import Any
+
+from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
+from bridge.policy_file import network_of_file
+from bridge.report import GOAL, UNKNOWN
+from edge_runtime import cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError, read_json
+from hil_tests.trace import smallest_trace
+from trainer.drivers import load_driver
+from trainer.environments import CONDITIONS, make_environment
+from trainer.evaluation import drive_episodes
+from trainer.experiments.data import success_estimate
+from trainer.options import set_threads
+from trainer.util import cores, die_with_parent
+
+HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
+ZONE = 0.7
+"""The test tells the promise from 0.7 times more, and 0.7 times fewer, failures: for 95 %, from
+98.5 % and from 91.5 %."""
+TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
+MOST_FAILURES = 50  # A point is given up, undecided, after the drives in which so many may fail
+CHUNK = 8  # Drives of one task of a process
+FRESH = 1_000_000  # So far from the seeds of the search are those that confirm it
+OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
+BURST_PERCENT = 5.0  # Share of the messages in bad stretches
+JITTER_FLOOR = 2.0  # Delay below so many standard deviations of jitter would be cut at zero
+SCALE = 20  # Steps of the way to the corner of all limits
+
+AXES = {
+    "delay_ms": (1000.0, 10.0),  # One way, each way; so is all below
+    "jitter_ms": (200.0, 5.0),  # Standard deviation, normal
+    "tail_jitter_ms": (200.0, 5.0),  # The same, Pareto
+    "loss_percent": (50.0, 1.0),  # Independent
+    "burst_messages": (10.0, 0.5),  # Mean run of lost messages; below 1: none
+    "outage_s": (2.0, 0.05),  # Both ways at once, every 3 s
+}
+"""Each axis's largest value, and its resolution."""
+Point = Mapping[str, float]  # Axis -> value; 0 where it is missing
+Ray = Callable[[int], Point]  # The point of a step; 0 is a perfect network
+Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
+"""Drives these seeds behind a network; for each, whether it succeeded."""
+
+
+def network(at: Point) -> LatencySpec:
+    """The network of a point, the same each way."""
+    delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
+    spread_ms, has_bursts = jitter_ms or tail_ms, burst >= 1.0
+    settings: dict[str, Any] = {
+        "delay_ms": max(delay_ms, JITTER_FLOOR * spread_ms),
+        "jitter_ms": spread_ms,
+        "tail": "pareto" if tail_ms else "normal",
+        "loss_percent": loss + has_bursts * BURST_PERCENT * (1.0 - loss / 100.0),
+        "clear_loss_percent": loss * has_bursts,
+        "burst_messages": burst * has_bursts,
+    }
+    rounded: dict[str, Any] = {
+        key: round(x, 6) if isinstance(x, float) else x for key, x in settings.items()
+    }
+    outages = (Outage(outage_s, OUTAGE_START_S, OUTAGE_EVERY_S),) if outage_s else ()
+    one_way = DirectionSpec(**rounded, outages=outages)
+    return LatencySpec(one_way, one_way)
+
+
+class SequentialTest:
+    """Whether the share of successes is above or below a promise, by as few drives as decide it.
+
+    Two of Wald's sequential probability ratio tests (1945, Sequential tests of statistical
+    hypotheses, Annals of Mathematical Statistics 16(2)) on the same drives, as Sobel and Wald
+    (1949, the same journal, 20(4)) choose one of three hypotheses: the promise against ``ZONE``
+    fewer failures, and against ``ZONE`` more. BETWEEN: neither could be shown.
+    """
+
+    def __init__(self, promise: float, confidence: float) -> None:
+        failing, error = 1.0 - promise, 1.0 - confidence
+        self._steps = [
+            (math.log(other / failing), math.log((1.0 - other) / promise))
+            for other in (failing * (1.0 - ZONE), failing * (1.0 + ZONE))
+        ]
+        self._up = math.log((1.0 - error) * TRIES / error)
+        self._down = math.log(error / (1.0 - error / TRIES))
+        self._ratios, self._open = [0.0, 0.0], [True, True]
+        self.most = round(MOST_FAILURES / failing)
+        self.drives = self.successes = 0
+
+    def add(self, success: bool) -> str | None:
+        """Count a drive; the verdict, None while there is none."""
+        self.drives += 1
+        self.successes += success
+        for which, verdict in enumerate((HOLDS, BREAKS)):
+            if self._open[which]:
+                self._ratios[which] += self._steps[which][success]
+                if self._ratios[which] >= self._up:
+                    return verdict
+                self._open[which] = self._ratios[which] > self._down
+        return None if any(self._open) and self.drives < self.most else BETWEEN
+
+
+class Search:
+    """Looks for edges, and keeps what was found at every point that was tried.
+
+    ``drive`` is called with the next seeds, from ``seed`` on and ``at_once`` at a time, until a
+    point is decided. ``confidence`` is that of a statement about an axis.
+    """
+
+    def __init__(
+        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = CHUNK
+    ) -> None:
+        self._drive, self._seed, self._at_once = drive, seed, at_once
+        self._new_test = partial(SequentialTest, promise, confidence)
+        self.tried: dict[str, dict[str, Any]] = {}
+
+    def verdict(self, at: Point) -> str:
+        """HOLDS, BREAKS or BETWEEN."""
+        spec = network(at)
+        if str(spec) not in self.tried:
+            test, verdict = self._new_test(), None
+            while verdict is None:
+                first = self._seed + test.drives
+                for success in self._drive(spec, range(first, first + self._at_once)):
+                    verdict = verdict or test.add(success)
+            found = {"verdict": verdict, "drives": test.drives, "successes": test.successes}
+            self.tried[str(spec)] = found
+            print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
+        return str(self.tried[str(spec)]["verdict"])
+
+    def holds_up_to(self, ray: Ray, most: int) -> int:
+        """The largest step up to which every tried one holds, by bisection; 0 is not tried.
+
+        That less is no worse is not taken for granted: half of it is tried, too.
+        """
+        edge = self._bisect(ray, 0, most, (HOLDS,))[0]
+        if edge > 1 and self.verdict(ray(edge // 2)) != HOLDS:
+            edge = self._bisect(ray, 0, edge // 2, (HOLDS,))[0]
+        return edge
+
+    def edge(self, ray: Ray, most: int) -> dict[str, Any]:
+        """The largest step that holds, the smallest beyond it that breaks, and both networks.
+
+        None where none breaks. Where one breaks and the most does not, it is looked for below it.
+        """
+        inside = self.holds_up_to(ray, most)
+        names = {k: str(network(ray(k))) for k in range(inside + 1, most + 1)}
+        broken = [k for k in names if self.tried.get(names[k], {}).get("verdict") == BREAKS]
+        beyond = self._bisect(ray, inside, min(broken, default=most), (HOLDS, BETWEEN))[1]
+        outside = beyond if beyond <= most else None
+        found = {"steps": (inside, outside), "inside": str(network(ray(inside)))}
+        return {**found, "outside": None if outside is None else str(network(ray(outside)))}
+
+    def _bisect(self, ray: Ray, low: int, most: int, is_low: tuple[str, ...]) -> tuple[int, int]:
+        """Neighbours of which the lower is low; the most is tried first, ``low`` is not tried."""
+        middle, high = most, most + 1
+        while high - low > 1:
+            low, high = (middle, high) if self.verdict(ray(middle)) in is_low else (low, middle)
+            middle = (low + high) // 2
+        return low, high
+
+
+def find_region(search: Search) -> dict[str, Any]:
+    """The limits, ``joint`` and ``box`` (module docstring), and the edges; UserError: none."""
+    if search.verdict({}) != HOLDS:
+        raise UserError("the promise is not kept even on a perfect network: lower --promise")
+
+    def of_axis(name: str) -> dict[str, Any]:
+        most, step = AXES[name]
+        found = search.edge(lambda k: {name: k * step}, round(most / step))
+        limit, breaks_at = (k and round(k * step, 6) for k in found.pop("steps"))
+        return {"limit": limit, "breaks_at": breaks_at, **found}
+
+    edges = dict(zip(AXES, _side_by_side([partial(of_axis, name) for name in AXES]), strict=True))
+    limits = {name: edge["limit"] for name, edge in edges.items()}
+    limits["burst_messages"] *= limits["burst_messages"] >= 1.0
+    worse, other = sorted(("jitter_ms", "tail_jitter_ms"), key=limits.__getitem__)
+    corner = {name: limit for name, limit in limits.items() if limit and name != other}
+
+    def mixture(names: Sequence[str], k: int) -> Point:
+        return {name: corner[name] * k / SCALE for name in names}
+
+    pairs = [partial(mixture, names) for names in combinations(corner, 2)]
+    edges["together"], *held = _side_by_side(
+        [
+            partial(search.edge, partial(mixture, list(corner)), 2 * SCALE),
+            *(partial(search.holds_up_to, pair, SCALE // 2) for pair in pairs),
+        ]
+    )
+    box = min(1.0, edges["together"].pop("steps")[0] / SCALE)
+    joint = min(1.0, len(corner) * box, *(2 * k / SCALE for k in held))
+    tail_ms, limits["jitter_ms"] = limits.pop("tail_jitter_ms"), limits[worse]
+    return {"limits": limits, "joint": joint, "box": box, "tail_jitter_ms": tail_ms, "edges": edges}
+
+
+def _side_by_side(work: Sequence[Callable[[], Any]]) -> list[Any]:
+    """Do all in threads, which wait for drives. After ^C none is waited for: drives end first."""
+    threads = ThreadPoolExecutor(len(work))
+    try:
+        return [future.result() for future in [threads.submit(one) for one in work]]
+    finally:
+        threads.shutdown(wait=False, cancel_futures=True)
+
+
+class Drivers(ProcessPoolExecutor):
+    """Processes that drive, each with an environment and the policy; ``spent`` has each task's
+    processor seconds and drives.
+    """
+
+    def __init__(self, jobs: int, *task: str | None) -> None:
+        begin: Any = _begin
+        super().__init__(jobs, get_context("spawn"), begin, task)
+        self.spent: list[tuple[float, int]] = []
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown(cancel_futures=True)
+
+    def result(self, future: Future[tuple[float, Any]], drives: int = 0) -> Any:
+        """Wait for what `_work` gives, and count it."""
+        cpu_s, found = future.result()
+        self.spent.append((cpu_s, drives))
+        return found
+
+    def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
+        """Drive each seed behind a network; whether it succeeded."""
+        parts = [seeds[start : start + CHUNK] for start in range(0, len(seeds), CHUNK)]
+        futures = [self.submit(_work, _drive, spec, part) for part in parts]
+        found = (self.result(*pair) for pair in zip(futures, map(len, parts), strict=True))
+        return [success for part in found for success in part]
+
+
+_mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
+
+
+def _begin(policy: str, env: str, condition: str, public_key: str | None) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
+    threading.Thread(target=die_with_parent, daemon=True).start()
+    set_threads(1)
+    environment = make_environment(env, condition)
+    _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
+
+
+def _work(work: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Processor seconds of ``work(environment, driver, condition, ...)``, and what it gives."""
+    began_s = time.process_time()
+    found = work(*_mine, *arguments)
+    return time.process_time() - began_s, found
+
+
+def _drive(env: Any, driver: Any, condition: str, spec: LatencySpec, seeds: range) -> list[bool]:
+    drives = drive_episodes(env, driver, seeds, condition, latency=spec)
+    outcomes = [drive.outcome for drive in drives]
+    if UNKNOWN in outcomes:
+        raise UserError("the environment does not say of each drive whether it succeeded")
+    return [outcome == GOAL for outcome in outcomes]
+
+
+def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
+    """Of the networks just outside, the failing drive that needs the fewest disturbed messages."""
+    broken = [parse_spec(edge["outside"]) for edge in edges.values() if edge["outside"]]
+    seeds = range(seed, seed + FRESH)
+    futures = [drivers.submit(_work, smallest_trace, spec, seeds) for spec in broken]
+    traces = filter(None, [drivers.result(future) for future in futures])
+    return min(traces, key=lambda trace: int(trace["disturbed"]), default=None)
+
+
+def confirm(drivers: Drivers, known: Mapping[str, Any], seeds: range) -> dict[str, Any]:
+    """Drive every edge's two networks; whether inside kept the promise, and outside did not."""
+    rows = []
+    for name, edge in known["edges"].items():
+        for side in ("inside", "outside"):
+            if (spec := edge[side]) is None:
+                continue
+            successes = sum(drivers.drive(parse_spec(spec), seeds))
+            found = success_estimate(successes, len(seeds))
+            as_told = (found.value >= known["promised_success"]) == (side == "inside")
+            what = {"edge": name, "side": side, "network": spec, "successes": successes}
+            share = {"share": found.value, "low": found.low, "high": found.high}
+            rows.append({**what, **share, "as_told": as_told})
+            print(f"{name} {side}: {found.value:.1%} {spec}", file=sys.stderr)
+    return {"runs": len(seeds), "rows": rows, "confirmed": all(row["as_told"] for row in rows)}
+
+
+EXAMPLE = cli.examples(
+    "python -m hil_tests envelope --policy P.onnx --env left_turn --out E.json",
+    "python -m hil_tests envelope --confirm E.json --runs 500 --out C.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    inner = cli.number("a share between 0 and 1", lambda value: 0.0 < value < 1.0)
+    add, count = parser.add_argument, cli.not_negative
+    add("--out", required=True, metavar="F.json", help="what is found")
+    add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
+    cli.add_public_key(parser)
+    add("--env", default="left_turn", help="scenario, gymnasium id or module:id")
+    add("--condition", choices=CONDITIONS, default="nominal", help="of the scene")
+    add("--promise", type=inner, default=0.95, help="share of successes")
+    add("--confidence", type=inner, default=0.95, help="of each axis's limit")
+    add("--seed", type=count, default=0, help="of the first drive")
+    add("--jobs", type=count, default=0, help="processes that drive; 0: one a core")
+    confirms = "drive just inside and outside of this file's edges, with fresh seeds"
+    add("--confirm", metavar="F.json", help=confirms)
+    add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find an envelope, or confirm one: 0, or 1 where an edge is not confirmed."""
+    check_writable(arguments.out)
+    began_s, jobs = time.monotonic(), arguments.jobs or cores()
+    known = read_json(arguments.confirm, "envelope") if arguments.confirm else {}
+    asked = {"env": arguments.env, "condition": arguments.condition}
+    env, condition = (str(known.get(name, asked[name])) for name in asked)
+    policy = arguments.policy or known.get("policy") or f"results/policies/{env}.onnx"
+    environment = make_environment(env, condition)
+    policy_id = load_driver(policy, environment, arguments.public_key)[1]
+    if known and known["policy_id"] != policy_id:
+        raise UserError(f"{arguments.confirm} is of another policy than {policy}")
+    found: dict[str, Any] = {
+        "schema": 1, "policy_id": policy_id, "policy": policy, "env": env, "condition": condition,
+        "promised_success": known.get("promised_success", arguments.promise),
+        "confidence": known.get("confidence", arguments.confidence), "seed": arguments.seed,
+        "control_period_s": environment.control_period_s,
+        "network": network_of_file(policy) if policy.endswith(".onnx") else "",
+    }  # fmt: skip
+    task = (jobs, policy, env, condition, arguments.public_key)
+    with cli.sigterm_as_interrupt(), Drivers(*task) as drivers:
+        if known:
+            first = arguments.seed + FRESH
+            found |= confirm(drivers, known, range(first, first + arguments.runs))
+        else:
+            rule = found["promised_success"], found["confidence"]
+            search = Search(drivers.drive, *rule, arguments.seed, jobs * CHUNK)
+            found |= {**find_region(search), "tried": search.tried}
+            found["trace"] = find_trace(drivers, found["edges"], arguments.seed)
+    cpu_s, drives = map(sum, zip(*drivers.spent, strict=True))
+    found |= {"drives": drives, "seconds": round(time.monotonic() - began_s, 1), "cpu_s": cpu_s}
+    found["command"] = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
+    write_json_out(arguments.out, found)
+    shown = ("limits", "joint", "box", "confirmed", "drives", "seconds")
+    print(", ".join(f"{name} {found[name]}" for name in shown if name in found))
+    return 0 if found.get("confirmed", True) else 1

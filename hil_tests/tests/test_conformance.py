@@ -1,0 +1,91 @@
+"""Each rule of the conformance can fail, and the Hunter keeps them all over the mock chassis."""
+
+import pytest
+
+from edge_runtime.tests.harness import exit_status
+from edge_runtime.vehicles.mock import MockVehicle
+from hil_tests.__main__ import main
+from hil_tests.conformance import RULES
+from hil_tests.faults.rig import ChassisProcess, free_bus
+
+
+def flawed(flaw):
+    """The mock, wrong in one way."""
+
+    class Flawed(MockVehicle):
+        name = "flawed"
+
+        def enable(self, now_s):
+            super().enable(now_s)
+            if flaw == "moves at once":
+                super().command({"pedal": 1.0}, now_s)
+
+        def command(self, action, now_s, scenario_speed_mps=None):
+            if flaw == "takes nan":
+                action = {name: 0.0 if value != value else value for name, value in action.items()}
+            if flaw == "takes anything":
+                action = {"pedal": 0.0, **action}
+            if flaw in ("moves disabled", "never latches"):
+                self._latched = False
+            super().command(action, now_s, scenario_speed_mps)
+
+        def brake(self, now_s, latch=True):
+            if flaw != "no brake":
+                super().brake(now_s, latch or flaw == "latches always")
+
+        def feedback(self, now_s):
+            report = super().feedback(now_s)
+            if flaw == "silent brake":
+                report = report._replace(self_braking=False)
+            if flaw == "impatient":
+                report = report._replace(self_braking=now_s - self._commanded_s > 0.1)
+            if flaw == "leaves its limits":
+                return report._replace(action=dict.fromkeys(report.action, 2.0))
+            return report._replace(action={}) if flaw == "no actions" else report
+
+        def close(self):
+            if flaw != "moves closed":
+                super().close()
+
+    return Flawed
+
+
+@pytest.mark.parametrize(
+    ("flaw", "rule"),
+    [
+        ("moves disabled", "no command moves it before"),
+        ("moves at once", "enabled, it stands until"),
+        ("impatient", "holds for 1.5 T"),
+        ("silent brake", "brakes by itself after 2 T"),
+        ("no brake", "within 2 T of a stop"),
+        ("never latches", "a stop is latched"),
+        ("latches always", "ends with the next command"),
+        ("takes nan", "NaN and infinity"),
+        ("takes anything", "lacks its actions"),
+        ("leaves its limits", "far beyond its limits"),
+        ("no actions", "each report has its actions"),
+        ("moves closed", "it closes twice"),
+    ],
+)
+def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys):
+    monkeypatch.setattr("hil_tests.conformance.PATIENCE_S", 2.0)
+    monkeypatch.setattr(f"{__name__}.Driver", flawed(flaw), raising=False)
+    assert exit_status(main, ["conformance", "--vehicle", f"{__name__}:Driver"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(RULES) + 1
+    assert [line for line in lines if line.startswith("broken") and rule in line], lines
+
+
+def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
+    bus, config = free_bus(), tmp_path / "edge.toml"
+    config.write_text(f"vehicle.driver = 'hunter'\nvehicle.hunter.bus = '{bus}'\n")
+    chassis = ChassisProcess(bus)
+    with chassis.process:
+        status = exit_status(main, ["conformance", "--config", str(config)])
+    assert status == 0, capsys.readouterr().out
+
+
+def test_no_vehicle_and_no_driver_are_one_line(capsys):
+    for words, said in (([], "name it with --vehicle"), (["--vehicle", "tank"], "'tank' is not")):
+        assert exit_status(main, ["conformance", *words]) == 2
+        assert said in capsys.readouterr().err

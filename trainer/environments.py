@@ -1,0 +1,317 @@
+"""What is driven, by its name: the two scenarios, and any other environment made to look like them.
+
+Everything in the trainer sees an environment in one form: an observation is one array (of several
+entries a structured one), an action is float32 [n] in [-1, 1], and the info of a step says where
+the car is, how fast it is and, at the end, how that came. `Adapted` makes that form of any
+environment; its ``outer`` and ``inner`` are the one place where actions are scaled.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import EntryPoint
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict
+from numpy.typing import NDArray
+
+from bridge import environments as bridge
+from bridge.report import FAILED, GOAL, UNKNOWN
+from edge_runtime.manifest import Task
+from edge_runtime.util import UserError
+from trainer.human.guide import Action, Driver, Expert, Reason
+from trainer.learner.replay import PAPERS, Layout
+from trainer.scenarios import SCENARIOS
+from trainer.scenarios.environment import Scene
+
+COMMAND_NOISE = 0.05 * 2.0
+"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
+MOST_STEPS = 1000  # Of an episode whose environment has no end of its own
+PERIOD_S = 0.1  # Of an environment that does not say how long a step is
+
+
+class Condition(NamedTuple):
+    """How test episodes are driven."""
+
+    scene: Scene
+    noise_std: float  # Standard deviation of the Gaussian noise on the command
+    meaning: str
+
+
+CONDITIONS = {
+    "nominal": Condition("nominal", 0.0, "the scene that is trained in"),
+    "noise": Condition(
+        "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
+    ),
+    "variant": Condition("variant", 0.0, "more vehicles, and other types of them"),
+    "dense": Condition("dense", 0.0, "closer and less even traffic"),
+}
+"""Only the first is trained and validated in."""
+
+
+def make_environment(name: str, condition: str = "nominal", printed_reward: bool = False) -> Any:
+    """The environment of a scenario's word, a gymnasium id or ``module:id``.
+
+    The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
+    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight.
+
+    Raises UserError: no such environment, or one that nothing here could drive.
+    """
+    name, scene = scenario_of(name), CONDITIONS[condition].scene
+    if name not in SCENARIOS:
+        if printed_reward:
+            raise UserError(f"printed_reward is the paper's, and {name} is none of its scenarios")
+        return Adapted(bridge.make_environment(name, scene), name)
+    scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
+    if printed_reward:
+        scenario.config = scenario.config.with_printed_reward()
+    return scenario
+
+
+def scenario_of(name: str) -> str:
+    """The word of a scenario of ours that is named by its id; any other name as it is."""
+    words = {environment_id: word for word, environment_id in SCENARIOS.items()}
+    return words.get(name.rpartition(":")[2], name)
+
+
+def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]]:
+    """Observations as the entries that a policy file names; a single one is ``plain``."""
+    names = observations.dtype.names
+    return {name: observations[name] for name in names} if names else {plain: observations}
+
+
+def task_of(env: Any) -> Task:
+    """What the environment asks of a policy file."""
+    return bridge.describe(env if env.scenario in SCENARIOS else env.env, env.control_period_s)
+
+
+def layout_of(env: Any) -> Layout:
+    """How the environment's observations lie in an array."""
+    return PAPERS if env.scenario in SCENARIOS else env.layout
+
+
+def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:
+    """The observation, and those that the action held for so many steps would lead to.
+
+    A copy of the environment takes them; an episode that ends there has fewer.
+    """
+    seen, ahead = [observation], copy.deepcopy(env)
+    for _ in range(steps):
+        observation, _, terminated, truncated, _ = ahead.step(action)
+        seen.append(observation)
+        if terminated or truncated:
+            break
+    return seen
+
+
+def check_foresight(env: Any) -> None:
+    """Raise UserError unless a copy of the environment does as it does, and leaves it alone."""
+    action = np.full(env.action_space.shape, 0.5, np.float32)
+    try:
+        trial = copy.deepcopy(env)
+        observation, _ = trial.reset(seed=0)
+        foreseen, again = (foresee(trial, observation, action, 1)[1] for _ in range(2))
+        same = foreseen.tobytes() == again.tobytes() == trial.step(action)[0].tobytes()
+        why = "" if same else ": it does not do what the environment does"
+    except Exception as error:  # Of any class of an environment.
+        why = f": {type(error).__name__}: {error}"
+    if why:
+        raise UserError(f"nothing can be foreseen in {env.scenario} by a copy of it{why}")
+
+
+def expert_of(env: Any, human: str = "expert") -> Expert:
+    """The environment's scripted expert, with a memory of its own.
+
+    ``human`` may be ``module:Class`` of another one, which is made from the environment.
+
+    Raises UserError: there is none.
+    """
+    if ":" not in human and env.expert is None:
+        raise UserError(f"{env.scenario} offers no expert(): --human module:Class may be one")
+    if ":" not in human:
+        expert: Expert = env.expert()
+        return expert
+    try:
+        own = EntryPoint(human, human, "").load()(env.unwrapped)
+    except Exception as error:  # A module may raise anything when it is imported.
+        raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
+    return _ScaledExpert(env, own)
+
+
+def outer(action_range: tuple[Any, Any], action: Any) -> NDArray[np.float32]:
+    """An action in [-1, 1], float32 [n], in a range (low, high); so it is in a policy file."""
+    low, high = action_range
+    return np.asarray(low + 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * (high - low), np.float32)
+
+
+def inner(action_range: tuple[Any, Any], action: Any) -> Action:
+    """The action of a range, of any shape, in [-1, 1], float32 [n]."""
+    low, high = action_range
+    share = (np.asarray(action, np.float64).reshape(-1) - low) / np.maximum(high - low, 1e-12)
+    return np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+class Adapted:
+    """Any environment in the form of the two scenarios.
+
+    Args:
+        env: with Box or flat Dict observations, and a Box of actions with finite bounds.
+        name: what it was asked for by.
+
+    Raises UserError: what `bridge.environments.describe` refuses.
+    """
+
+    goal_m = float("nan")
+    biased_action = 1.0
+
+    def __init__(self, env: gymnasium.Env[Any, Any], name: str) -> None:
+        self.env, self.scenario = env, name
+        self.unwrapped: Any = env.unwrapped
+        self.observation_space = env.observation_space
+        task = bridge.describe(env, PERIOD_S)
+        self.layout = _layout(task, isinstance(env.observation_space, Dict))
+        self.control_period_s = task.control_period_s
+        self.action_names = tuple(row.name for row in task.action)
+        own = self._own_space = env.action_space
+        assert isinstance(own, Box)  # described
+        self.action_range = own.low.reshape(-1), own.high.reshape(-1)
+        self.action_space = Box(-1.0, 1.0, (len(task.action),), np.float32)
+        self.key_rate_per_s = float(getattr(self.unwrapped, "key_rate_per_s", 5.0))
+        self.expert = self._expert if hasattr(self.unwrapped, "expert") else None
+        self._limited = env.spec is not None and env.spec.max_episode_steps is not None
+        if not self._limited:
+            most = f"an episode ends after {MOST_STEPS} steps at the latest"
+            _say_once(f"{name} has no limit of its own: {most}")
+        try:
+            bridge.describe(env)
+        except UserError:
+            _say_once(f"{name} does not say how long a step is: {PERIOD_S} s is taken")
+        self._steps = 0
+        self._last = np.zeros(len(task.action), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._steps = 0
+        return self._seen(observation), _said(info)
+
+    def step(self, action: Action) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+        """One control period."""
+        self._last = np.asarray(action, np.float32)
+        observation, reward, terminated, truncated, info = self.env.step(self._own(action))
+        self._steps += 1
+        truncated = bool(truncated) or (not self._limited and self._steps >= MOST_STEPS)
+        info = _said(info)
+        if terminated or truncated:
+            told = {True: GOAL, False: FAILED, None: UNKNOWN}[info.get("is_success")]
+            info["outcome"] = str(info.get("outcome") or told)
+        return self._seen(observation), float(reward), bool(terminated), truncated, info
+
+    @property
+    def brake_action(self) -> Action:
+        """The environment's own stop, or the last action where it has none."""
+        own = getattr(self.unwrapped, "brake_action", None)
+        return self._last if own is None else inner(self.action_range, own)
+
+    def press_brake(self, pressed: bool) -> None:
+        """Press or release the brake, where it has one."""
+        getattr(self.unwrapped, "press_brake", lambda pressed: None)(pressed)
+
+    def scene(self) -> dict[str, Any] | None:
+        """The scene from above in metres; None where it has none."""
+        return bridge.scene_of(self.env)
+
+    @property
+    def can_be_seen(self) -> bool:
+        """Whether there is something to show a person."""
+        return callable(getattr(self.unwrapped, "scene", None)) or self._draws
+
+    def render(self) -> NDArray[np.uint8]:
+        """The environment's own picture, uint8 [height, width, 3]; UserError without one."""
+        picture: Any = self.env.render() if self._draws else None
+        if not isinstance(picture, np.ndarray):
+            raise UserError(f"{self.scenario} draws no picture (render_mode rgb_array)")
+        return picture
+
+    @property
+    def _draws(self) -> bool:
+        return type(self.unwrapped).render is not gymnasium.Env.render
+
+    @property
+    def keys(self) -> dict[str, Action]:
+        """Key -> the action while it is held, in [-1, 1]; of a single action the arrows."""
+        own: Mapping[str, Any] = getattr(self.unwrapped, "keys", {})
+        if not own and len(self.action_names) == 1:
+            one = np.ones(1, np.float32)
+            return {"up": one, "right": one, "down": -one, "left": -one}
+        return {name: inner(self.action_range, action) for name, action in own.items()}
+
+    @property
+    def rest_action(self) -> Action:
+        """Hands off: zeros of the environment's own."""
+        return inner(self.action_range, np.clip(0.0, *self.action_range))
+
+    def _own(self, action: Action) -> NDArray[Any]:
+        space = self._own_space
+        return outer(self.action_range, action).reshape(space.shape).astype(space.dtype)
+
+    def _expert(self) -> Expert:
+        return _ScaledExpert(self, self.unwrapped.expert())
+
+    def _seen(self, observation: Any) -> NDArray[Any]:
+        if self.layout.dtype.names is None:
+            return np.asarray(observation, self.layout.dtype)
+        seen = np.zeros((), self.layout.dtype)
+        for name in self.layout.dtype.names:
+            seen[name] = observation[name]
+        return seen
+
+
+class _ScaledExpert(Driver):
+    """An expert whose actions are the environment's own."""
+
+    def __init__(self, env: Any, own: Any) -> None:
+        self._env, self._own = env, own
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        getattr(self._own, "reset", lambda: None)()
+
+    def act(self, observation: Any = None) -> Action:
+        """The expert's action, from the true state."""
+        return inner(self._env.action_range, self._own.act())
+
+    def wants_control(self, action: Action) -> Reason | None:
+        """Why it would take over from ``action``, or None."""
+        reason: Reason | None = self._own.wants_control(outer(self._env.action_range, action))
+        return reason
+
+    def may_return(self) -> bool:
+        """Whether it would give control back here."""
+        return bool(getattr(self._own, "may_return", lambda: True)())
+
+
+def _said(info: Mapping[str, Any]) -> dict[str, Any]:
+    """The info with all that the trainer looks at; what is not known is nan, or no distance."""
+    unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
+    still = {"lateral_acceleration_mps2": 0.0, "longitudinal_acceleration_mps2": 0.0}
+    return {**unknown, **still, **info}
+
+
+def _layout(task: Task, several: bool) -> Layout:
+    entries = [(name, np.dtype(e.dtype), tuple(e.shape)) for name, e in task.observation.items()]
+    (_, dtype, shape), *_ = entries
+    return Layout((), np.dtype(entries)) if several else Layout(shape, dtype)
+
+
+@cache
+def _say_once(text: str) -> None:
+    """A training makes many environments."""
+    print(text, file=sys.stderr)

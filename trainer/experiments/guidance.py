@@ -1,0 +1,179 @@
+"""The fair table of human guidance: what each row costs the human, and what comes of it.
+
+One page and one figure beside the records, made of what is there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bridge.report import markdown_table
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError
+from trainer.environments import CONDITIONS
+from trainer.experiments import data, plan
+from trainer.experiments.data import Line, Result, Results
+from trainer.experiments.report import COMMAND, LEARNED, WELL, colour, human_seconds
+from trainer.experiments.run import Store
+from trainer.pictures import write_figure
+
+TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
+
+
+def write_guidance(store: Store, seeds: int) -> Path:
+    """Write the page and its figure; the page's path.
+
+    Raises:
+        UserError: there are no records at all.
+    """
+    results = data.load(store, seeds, plan.GUIDANCE)
+    if not results.found:
+        raise UserError(f"there are no results to report in {store.results}")
+    write_figure(draw(results), store.results / f"{plan.GUIDANCE}.png")
+    path = store.results / "README.md"
+    write_atomic(path, ("\n".join(_page(results, store)) + "\n").encode())
+    return path
+
+
+def write_typical(results: Path, humans: Path, seeds: int, path: Path) -> None:
+    """Write the curves that a person's coach shows, of the records in both directories of results.
+
+    Raises:
+        UserError: there is no record to make a curve of.
+    """
+    curves: dict[str, dict[str, Any]] = {}
+    for name, work, units, human in (  # The good human goes before the paper's model of it.
+        ("paper", plan.PLAN, "all", plan.NORMAL),
+        (plan.GUIDANCE, plan.GUIDANCE_PLAN, plan.GUIDANCE, plan.GOOD),
+    ):
+        found = data.load(Store(work, results / name, Path(), humans), seeds, units)
+        for environment, rows in typical_curves(found, human).items():
+            curves.setdefault(environment, {}).update(rows)
+    if not curves:
+        raise UserError(f"there are no records of a guided training in {results}")
+    write_atomic(path, (json.dumps(curves) + "\n").encode())
+
+
+def typical_curves(results: Results, human: str) -> dict[str, dict[str, Any]]:
+    """Environment -> algorithm -> the medians of its seeds with this human, at the grid's steps.
+
+    ``points`` are pairs: the seconds that the human had driven, and the policy's success alone.
+    """
+    curves: dict[str, dict[str, Any]] = {}
+    for scenario, environment, row in sorted({(u.scenario, u.environment, u.algorithm)
+                                              for u in results.found}):  # fmt: skip
+        found = [one for one in results.of(scenario, Line(row, human)) if one.unit.trained]
+        if not any(one.costs.human_steps for one in found):
+            continue
+        given = np.median([one.given() for one in found], axis=0).round(1)
+        alone = np.median([one.curve(data.ALONE, data.SUCCESS) for one in found], axis=0).round(3)
+        curves.setdefault(environment, {})[row] = {
+            "human": human, "seeds": len(found), "points": np.stack([given, alone], axis=1).tolist()
+        }  # fmt: skip
+    return curves
+
+
+def _page(results: Results, store: Store) -> Iterator[str]:
+    wanted = len(plan.units_of([plan.GUIDANCE], results.seeds))
+    budgets = ", ".join(f"{data.words(name)} {store.plan.steps[name]:,}" for name in TASKS)
+    yield from (
+        "# The fair table of human guidance",
+        "",
+        f"`{COMMAND} {plan.GUIDANCE}` computes what is missing and writes this page. "
+        f"{len(results.found)} of {wanted} trainings and tests are there.",
+        "",
+        "Every row has the same scenes, human, replay buffer and budget of environment steps "
+        f"({budgets}). **Every human here is a script or a model of one: no person's cost is "
+        "claimed.** Seconds are simulated ones in which the human drove. Numbers are means of the "
+        "seeds with their 95 % interval; behind a level, in brackets, how many seeds reach it.",
+        "",
+        f"![Success of the policy alone by what the human has given]({plan.GUIDANCE}.png)",
+        "",
+        f"## With {plan.HUMANS[plan.GOOD].meaning}",
+        "",
+    )
+    head = (
+        "", "task", "seeds", *(f"human s to {level:.0%}" for level in (LEARNED, WELL)),
+        f"take-overs to {LEARNED:.0%}", "human s in all", "failures",
+        *(f"{name}, %" for name in CONDITIONS), "return over the human's",
+    )  # fmt: skip
+    rows = [
+        _row(results, task, Line(row, plan.GOOD), found)
+        for task in TASKS
+        for row in plan.ROWS
+        if (found := results.of(task, Line(row, plan.GOOD)))
+    ]
+    yield from markdown_table(head, rows)
+    yield from (
+        "## Which row forgives which human",
+        "",
+        "Left turn: success of the policy alone in %, then the human's seconds until it "
+        f"reached {LEARNED:.0%} in validation.",
+        "",
+    )
+    kinds = [f"{data.words(name)}: {human.meaning}" for name, human in plan.HUMANS.items()]
+    yield from markdown_table(
+        ("", *kinds), [(Line(row).name, *_cells(results, row)) for row in plan.ROWS]
+    )
+    if results.stale:
+        yield f"{len(results.stale)} records are of other settings than today's and left out."
+
+
+def _row(results: Results, task: str, line: Line, found: list[Result]) -> tuple[str, ...]:
+    until = [cost.takeovers for result in found if (cost := result.until(LEARNED))]
+    nominal, tested = data.Scene(task, "nominal"), found[0].record["tests"]
+    shares = {
+        name: results.estimate(data.Scene(task, name), line, data.SUCCESS).as_share()
+        for name in tested
+    }
+    over = results.differences(nominal, line, Line(plan.EXPERT, plan.GOOD), data.REWARD).values()
+    return (
+        Line(line.algorithm).name,
+        data.words(task),
+        str(len(found)),
+        *(human_seconds(found, level) for level in (LEARNED, WELL)),
+        data.mean_estimate(until).text(0),
+        data.mean_estimate(result.costs.human_s for result in found).text(0),
+        data.mean_estimate(result.costs.failures for result in found).text(0),
+        *(shares.get(name, "–") for name in CONDITIONS),
+        data.mean_estimate(over).text(2),
+    )
+
+
+def _cells(results: Results, row: str) -> Iterator[str]:
+    for human in plan.HUMANS:
+        found = results.of(plan.LEFT[0], Line(row, human))
+        share = results.estimate(
+            data.Scene(plan.LEFT[0], "nominal"), Line(row, human), data.SUCCESS
+        ).as_share()
+        yield f"{share}, {human_seconds(found, LEARNED)}" if found else "–"
+
+
+def draw(results: Results) -> Figure:
+    """Success in validation by the human's seconds so far, a panel a task, with the good human."""
+    figure = Figure(figsize=(4.6 * len(TASKS), 4.4), layout="constrained")
+    for panel, task in zip(figure.subplots(1, len(TASKS), sharey=True), TASKS, strict=True):
+        panel.set_title(data.words(task), fontsize=10)
+        for place, row in enumerate(plan.ROWS):
+            line = Line(row, plan.GOOD)
+            found = [result for result in results.of(task, line) if result.unit.trained]
+            if not found:
+                continue
+            given = np.mean([result.given() for result in found], axis=0)
+            success = np.mean([r.curve(data.ALONE, data.SUCCESS) for r in found], axis=0)
+            panel.plot(given, success, "-o", ms=3, color=colour(line, place), label=Line(row).name)
+        panel.grid(alpha=0.3)
+        panel.set_xlabel("seconds that the human has driven", fontsize=9)
+    shown = [zip(*panel.get_legend_handles_labels(), strict=True) for panel in figure.axes]
+    rows = {label: handle for handle, label in chain(*shown)}
+    if rows:
+        figure.legend(rows.values(), rows.keys(), fontsize=8, ncols=5, loc="outside upper center")
+    figure.supylabel("success of the policy alone, validation", fontsize=9)
+    return figure

@@ -1,0 +1,170 @@
+"""The coach: what a person's guidance has come to, what is typical, and one line of advice.
+
+It draws nothing and drives nothing: the loop tells it of episodes and of the policy alone, and the
+window and the page show what it says.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.report import failed
+from edge_runtime.util import counted
+from trainer.person.recording import DISCARDED, RESTARTED, STOPPED
+from trainer.training.metrics import LEARNED as LEVELS
+
+LEARNED, WELL = LEVELS
+"""Success of the policy alone from which the person only watches, and from which all is done."""
+RECENT = 10  # Episodes that are listed, and that the advice looks at
+TOO_LATE_S = 2.0
+"""A failure so soon after a take-over says that it came too late."""
+LATE_ONES = 3  # Recent failures without the person, or after a late take-over, to say so
+NEEDLESS_ONES, NEEDLESS_SHARE = 3, 2.0 / 3.0
+"""At least so many recent episodes with take-overs, and this share of them, must be ones that the
+policy alone masters, to say that they were needless."""
+MOST_POINTS = 60  # Of a curve: every view carries it
+TYPICAL_FILE = Path(__file__).parent / "typical.json"
+
+Curve = list[tuple[float, float]]
+"""Seconds that the human has driven -> success of the policy alone, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of a sitting."""
+
+    number: int
+    outcome: str
+    human_s: float
+    takeovers: int
+    since_takeover_s: float = math.nan
+    """From the last take-over's beginning to the episode's end; nan: there was none, or unknown."""
+
+    @property
+    def unattended(self) -> bool:
+        """Whether it failed without the person, or too soon after a take-over."""
+        if not failed(self.outcome) or self.outcome in (STOPPED, RESTARTED, DISCARDED):
+            return False
+        return not self.takeovers or self.since_takeover_s <= TOO_LATE_S
+
+
+@dataclass(frozen=True)
+class Coaching:
+    """What is shown of the coach."""
+
+    advice: str  # Empty where there is none
+    said: str
+    """What the person has given, beside the typical human where one is known."""
+    alone: str
+    """Success of the policy alone, in words; empty before the first validation."""
+    curve: Curve
+    typical: Curve
+    """Of a scripted human with the same algorithm; empty where none is known."""
+    human_s: float  # How far along the curves the person is
+    episodes: list[Episode]  # The newest last
+
+
+class Coach:
+    """Collects what happens. ``learning``: something does, so there is something to advise."""
+
+    def __init__(self, typical: Curve | None = None, learning: bool = False) -> None:
+        self.typical, self.learning = typical or [], learning
+        self.episodes: deque[Episode] = deque(maxlen=RECENT)
+        self.curve: Curve = []
+        self.checking = False
+        """Whether the policy alone is being validated."""
+        self._mastered: Mapping[int, bool] = {}
+
+    def recall(self, rows: Iterable[Mapping[str, str]], period_s: float) -> None:
+        """Take up what ``metrics.csv`` says of the run so far."""
+        given_s = 0.0
+        for row in rows:
+            human_s = int(row["human_steps"]) * period_s
+            given_s += human_s
+            known = int(row["episode"]), row["outcome"], human_s, int(row["interventions"])
+            self.episodes.append(Episode(*known))
+            if row["validation_success"] not in ("", "nan"):
+                self.curve.append((given_s, float(row["validation_success"])))
+
+    def to_check(self) -> list[int]:
+        """The recent episodes in which the person took over: does the policy master them alone?"""
+        return [episode.number for episode in self.episodes if episode.takeovers]
+
+    def take(self, human_s: float, success: float, mastered: Mapping[int, bool]) -> None:
+        """The policy was validated as it stood when the person had given so much.
+
+        ``mastered``: an episode that was to be checked -> whether it reached the goal alone.
+        """
+        self.curve.append((human_s, success))
+        self._mastered = mastered
+
+    def show(self, cost: Mapping[str, float]) -> Coaching | None:
+        """What is to be shown; None where there is nothing yet. ``cost`` as ``View.cost``."""
+        if not self.learning and not self.episodes:
+            return None
+        alone = self.curve[-1][1] if self.curve else None
+        known = ([] if alone is None else [f"{alone:.0%}"]) + ["checking"] * self.checking
+        advice = advise(list(self.episodes), alone, self._mastered) if self.learning else ""
+        thin = len(self.curve) // MOST_POINTS + 1
+        return Coaching(
+            advice=advice,
+            said=said(cost, self.typical),
+            alone=", ".join(known),
+            curve=[(round(x, 1), round(y, 3)) for x, y in self.curve[::-thin]][::-1],
+            typical=self.typical,
+            human_s=cost["human_s"],
+            episodes=list(self.episodes),
+        )
+
+
+def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[int, bool]) -> str:
+    """One line of advice: of the first rule that fits, empty where none does.
+
+    Args:
+        episodes: the recent ones.
+        alone: newest success of the policy alone, 0 to 1; None: not known.
+        mastered: episode -> whether the policy alone reaches the goal in it today.
+    """
+    if alone is not None and alone >= WELL:
+        return f"The policy alone reaches {alone:.0%}: you may stop here."
+    if alone is not None and alone >= LEARNED:
+        return f"The policy alone reaches {alone:.0%}: watch only."
+    late = sum(episode.unattended for episode in episodes)
+    if late >= LATE_ONES:
+        return (
+            f"Take over earlier: {late} of the last {len(episodes)} episodes failed without you, "
+            f"or within {TOO_LATE_S:.0f} s of your taking over."
+        )
+    checked = [mastered[one.number] for one in episodes if one.takeovers and one.number in mastered]
+    if sum(checked) >= max(NEEDLESS_ONES, NEEDLESS_SHARE * len(checked)):
+        return (
+            f"Let it go on for longer: alone, it masters {sum(checked)} of the last {len(checked)} "
+            "episodes in which you took over."
+        )
+    return ""
+
+
+def said(cost: Mapping[str, float], typical: Curve) -> str:
+    """What the person has given so far, and after how long a scripted human was done."""
+    given = (
+        f"{cost['human_s']:.0f} s at the wheel, {counted(int(cost['takeovers']), 'take-over')}, "
+        f"{counted(int(cost['failures']), 'failure')}."
+    )
+    there = next((human_s for human_s, success in typical if success >= LEARNED), None)
+    if there is None:
+        return given
+    return f"{given} A scripted human: {LEARNED:.0%} after {there:.0f} s."
+
+
+def typical_curve(scenario: str, algorithm: str) -> Curve:
+    """The curve of a scripted human's ordinary run; empty where none is known.
+
+    ``python -m trainer experiment typical`` makes the file from the experiments' records.
+    """
+    known = json.loads(TYPICAL_FILE.read_text()).get(scenario, {}).get(algorithm, {"points": []})
+    return [(human_s, success) for human_s, success in known["points"]]

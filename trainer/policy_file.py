@@ -1,0 +1,202 @@
+"""Write a trained actor as the policy file that may drive (contract section 4)."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+from bridge.policy_file import add_envelope, make_policy, write_policy
+from edge_runtime.cli import examples
+from edge_runtime.files import check_writable
+from edge_runtime.policy import policy_id_of
+from edge_runtime.tls import read_signing_key
+from edge_runtime.util import UserError
+from trainer.drivers import load_actor
+from trainer.environments import entries_of, make_environment, task_of
+from trainer.learner.networks import Actor
+from trainer.options import existing_directory, read_json
+from trainer.training.config import CONFIG_FILE
+
+EXAMPLE = examples(
+    "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key"
+)
+OPSET, IR_VERSION = 17, 8  # The oldest onnxruntime that a board may have reads these
+PARITY_OBSERVATIONS = 1000
+PARITY_TOLERANCE = 1e-5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
+    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
+    parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
+    add_envelope(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Export, check, sign; returns the exit status."""
+    run_dir = existing_directory(arguments.run_dir, "run directory")
+    made = export(run_dir, arguments.out, key=arguments.key, envelope=arguments.envelope)
+    signed = "signed" if arguments.key else "not signed"
+    size = f"{len(made.model) / 1e6:.1f} MB"
+    print(f"{arguments.out}: {size}, {signed}, policy_id {made.policy_id}")
+    print(f"torch and onnxruntime differ by at most {made.max_difference:.1e}")
+    return 0
+
+
+def export(
+    run: str | PathLike[str],
+    out: str | PathLike[str],
+    *,
+    key: str | PathLike[str] | None = None,
+    envelope: str | PathLike[str] | None = None,
+) -> Export:
+    """Write a run's actor as a policy file, as ``python -m trainer export`` does.
+
+    ``run`` is what ``train`` gave, or its directory; ``key`` the private key (PEM) that signs;
+    ``envelope`` the JSON of ``hil_tests envelope`` for the same network.
+
+    Raises UserError: no run there, a wrong name or key, or a file that would do something else.
+    """
+    path, key_file = Path(out), None if key is None else Path(key)
+    if path.suffix != ".onnx":
+        raise UserError(f"--out {path}: a policy file's name ends in .onnx")
+    check_writable(path)
+    if key_file:
+        read_signing_key(key_file)
+    actor, label = load_actor(Path(run))
+    if "known_latency" in label:
+        raise UserError(f"{run} needs the actions that are under way, which no state carries")
+    config = read_json(Path(run) / CONFIG_FILE, "run config")
+    made = export_policy(actor, label, config, envelope and read_json(Path(envelope), "envelope"))
+    write_policy(made.model, path, key_file)
+    return made
+
+
+@dataclass(frozen=True)
+class Export:
+    """A policy file's bytes and how far onnxruntime is from torch on real observations."""
+
+    model: bytes
+    policy_id: str
+    max_difference: float
+
+
+def export_policy(
+    actor: Actor,
+    label: dict[str, Any],
+    training: dict[str, Any],
+    envelope: Any = None,
+) -> Export:
+    """Convert, describe, check and compare.
+
+    Args:
+        actor: the network.
+        label: ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run.
+        training: the run's whole config, for the manifest.
+        envelope: the networks in which it may drive, for the manifest.
+
+    Raises UserError: the file would not do what the network does.
+    """
+    env = make_environment(label["scenario"])
+    network = _InOwnUnits(actor, env.action_range).eval()
+    observations = real_observations(label["scenario"], PARITY_OBSERVATIONS)
+    task = task_of(env)
+    entries = entries_of(observations, next(iter(task.observation)))
+    about = {
+        "seed": label["seed"],
+        "episodes": label["episode"],
+        "config": training,
+        "source_revision": training.get("source_revision", "unknown"),
+    }
+    graph = _to_onnx(network, entries).SerializeToString()
+    model = make_policy(graph, task, label["algorithm"], about, envelope)
+    difference = parity(network, model, entries)
+    if not difference < PARITY_TOLERANCE * max(1.0, float(network.reach.max())):
+        raise UserError(
+            f"onnxruntime and torch differ by {difference:.1e} (allowed: {PARITY_TOLERANCE:.0e}); "
+            "nothing was written"
+        )
+    return Export(model, policy_id_of(model), difference)
+
+
+class _InOwnUnits(torch.nn.Module):
+    """The actor with its actions in the environment's range, as ``environments.outer`` has it."""
+
+    reach: torch.Tensor
+
+    def __init__(self, actor: Actor, action_range: tuple[Any, Any]) -> None:
+        super().__init__()
+        low, high = (torch.from_numpy(np.asarray(ends, np.float32)) for ends in action_range)
+        self.actor, self.low = actor, low
+        self.register_buffer("reach", 0.5 * (high - low))
+        self.scaled = not bool((low == -1).all() and (high == 1).all())
+
+    def forward(self, *entries: torch.Tensor) -> torch.Tensor:
+        action = self.actor(*entries)
+        return self.low + (action + 1.0) * self.reach if self.scaled else action
+
+
+def real_observations(scenario: str, count: int, seed: int = 0) -> NDArray[Any]:
+    """Observations [count, ...] from driving the scenario at random."""
+    env, random = make_environment(scenario), np.random.default_rng(seed)
+    size = env.action_space.shape
+    observation, _ = env.reset(seed=seed)
+    seen: list[NDArray[Any]] = []
+    action = np.zeros(size, np.float32)
+    while len(seen) < count:
+        seen.append(observation)
+        # A pedal that wanders instead of trembling: the car gets everywhere.
+        action = np.clip(action + random.normal(0.0, 0.3, size), -1, 1).astype(np.float32)
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            observation, _ = env.reset(seed=seed + len(seen))
+    return np.stack(seen)
+
+
+def parity(network: torch.nn.Module, model: bytes, entries: Mapping[str, NDArray[Any]]) -> float:
+    """Largest absolute difference between torch and onnxruntime over observations, by entry."""
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    entries = {name: np.ascontiguousarray(values) for name, values in entries.items()}
+    with torch.no_grad():
+        wanted = network(*map(torch.from_numpy, entries.values())).numpy()
+    (got,) = session.run(["action"], entries)
+    return float(np.abs(wanted - got).max())
+
+
+def _to_onnx(network: torch.nn.Module, entries: Mapping[str, NDArray[Any]]) -> onnx.ModelProto:
+    examples = tuple(torch.zeros_like(torch.from_numpy(v[:1].copy())) for v in entries.values())
+    buffer = BytesIO()
+    with warnings.catch_warnings():
+        # The newer exporter writes opset 18 and IR 10, which old boards refuse.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network,
+            examples,
+            buffer,  # type: ignore[arg-type]  # torch's own stubs forget file objects
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(entries),
+            output_names=["action"],
+            dynamic_axes={name: {0: "batch"} for name in (*entries, "action")},
+        )
+    model = onnx.load_from_string(buffer.getvalue())
+    opset = {entry.domain: entry.version for entry in model.opset_import}[""]
+    if (opset, model.ir_version) != (OPSET, IR_VERSION):
+        raise UserError(
+            f"torch wrote opset {opset}, IR {model.ir_version}; "
+            f"boards need opset {OPSET}, IR {IR_VERSION}"
+        )
+    return model

@@ -1,0 +1,302 @@
+"""Environments that are none of our two, from their spaces to a policy file and a person's keys."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict
+
+from edge_runtime.policy import load_policy
+from edge_runtime.util import UserError
+from trainer import evaluate, export, train
+from trainer.drivers import OnnxDriver, constant_driver, load_driver
+from trainer.environments import (
+    Adapted,
+    check_foresight,
+    expert_of,
+    foresee,
+    inner,
+    make_environment,
+    outer,
+    task_of,
+)
+from trainer.human.model import HumanModel, HumanModelConfig
+from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
+from trainer.learner.networks import Actor, CriticPair, tensors
+from trainer.learner.replay import Layout, ReplayBuffer
+from trainer.learner.td3 import TD3Learner
+from trainer.person.controls import controls_of
+from trainer.person.interface import LET_GO, Reading
+from trainer.person.recording import Recorder, demonstrate, read_steps
+from trainer.person.session import Sitting, drive
+from trainer.person.tests.people import QUICK, Puppet
+from trainer.person.web import encode_view
+from trainer.view import Shown, Steps
+
+ROVER = f"{__name__}:test/Rover-v0"
+CAMERA = Box(0, 255, (12, 20, 3), np.uint8)
+GENTLE = PHIL
+
+
+class Rover(gymnasium.Env):
+    """Two wheels in metres a second; a camera, and numbers of which one has no bound."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    observation_space = Dict(
+        {"camera": CAMERA, "far": Box(-np.inf, np.inf, (1,)), "wheels": Box(-1, 3, (2,))}
+    )
+    action_space = Box(np.array([-1, 0], np.float32), np.array([3, 1], np.float32))
+    action_names = ("left", "right")
+    keys: ClassVar = {"ArrowUp": (3.0, 1.0), "KeyA": (-1.0, 0.0)}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        self.done: Any = np.zeros(2)
+
+    def _seen(self):
+        camera = self.np_random.integers(0, 255, CAMERA.shape).astype(np.uint8)
+        return {
+            "camera": camera,
+            "far": np.full(1, 7.5, np.float32),
+            "wheels": np.asarray(self.done, np.float32),
+        }
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._seen(), {}
+
+    def step(self, action):
+        self.done = action
+        return self._seen(), float(action[0]), False, False, {"is_success": action[0] > 2.9}
+
+    def render(self):
+        return np.zeros((8, 8, 3), np.uint8)
+
+    def expert(self):
+        return Careful(self)
+
+
+class Careful:
+    def __init__(self, env):
+        self.env = env
+
+    def act(self):
+        return np.array([3.0, 0.5])
+
+    def wants_control(self, policy_action):
+        return "slow" if policy_action[0] < 1.0 else None
+
+
+class Dark(Rover):
+    metadata = {}  # noqa: RUF012
+    render = gymnasium.Env.render  # raises NotImplementedError
+
+
+for kind in ("Rover", "Dark"):
+    gymnasium.register(f"test/{kind}-v0", f"{__name__}:{kind}", max_episode_steps=12)
+
+
+@pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
+def test_what_is_foreseen_is_what_happens_and_foreseeing_changes_nothing(name):
+    env, untouched = make_environment(name), make_environment(name)
+    check_foresight(env)
+    observation, _ = env.reset(seed=3)
+    untouched.reset(seed=3)
+    for action in np.array([[0.7], [-0.4], [1.0]], np.float32):
+        ahead = foresee(env, observation, action, 4)
+        other, real = (
+            [observation, *(e.step(action)[0] for _ in range(4))] for e in (untouched, env)
+        )
+        found, *wanted = ([seen.tobytes() for seen in drive] for drive in (ahead, other, real))
+        assert wanted == [found, found]
+        assert len(set(found)) == 5
+        observation = real[-1]
+    assert 2 < len(foresee(env, observation, action, 1000)) < 500  # not beyond the end
+
+
+class Shared(Rover):
+    def __deepcopy__(self, memo):
+        return self
+
+
+class Unmoved(Rover):
+    def __deepcopy__(self, memo):
+        raise TypeError("a motor cannot be copied")
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"), [(Shared, "it does not do what"), (Unmoved, "TypeError: a motor cannot")]
+)
+def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path, kind, why):
+    gymnasium.register(f"test/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")
+    name = f"{__name__}:test/{kind.__name__}-v0"
+    with pytest.raises(UserError, match=f"nothing can be foreseen in .*: {why}"):
+        train(name, out=tmp_path / "run", algorithm="ppl_td3", episodes=1)
+
+
+def test_the_papers_networks_begin_as_ever():
+    """Bit for bit: the first weights of fixed seeds are those of the released results."""
+    with torch.random.fork_rng():
+        torch.manual_seed(5)
+        state = {**Actor(1, 2).state_dict(), **CriticPair(1, 2, 0.25, True).state_dict()}
+    digest = hashlib.sha256(b"".join(value.numpy().tobytes() for value in state.values()))
+    assert digest.hexdigest()[:16] == "b658a8f7c54f1abe"
+
+
+def test_the_papers_shape_learns_as_ever():
+    """Three updates from fixed seeds: numbers of the day before any other shape was known."""
+    random = np.random.default_rng(4)
+    buffer = ReplayBuffer(60, steps=8, gamma=0.95, overruled_value=-10.0)
+    frames = random.integers(0, 255, (42, 45, 80), np.uint8)
+    buffer.start_episode(frames[:2])
+    for i in range(40):
+        action = random.uniform(-1, 1, 1).astype(np.float32)
+        seen, human, penalised = frames[i + 1 : i + 3], i % 3 == 0, i % 9 == 0
+        buffer.add(action, float(action[0]), seen, False, human, -action, penalised)
+    learner = TD3Learner(LearnerConfig(precision="float32"), PHIL, seed=2)
+    losses = [learner.update(buffer.sample(32, random))[:4] for _ in range(3)][-1]
+    assert losses == pytest.approx((90.22279, 1.52736, 0.43012, -1.525), rel=1e-4)
+
+
+def test_an_observation_is_one_array_and_an_action_has_one_scale():
+    env = make_environment(ROVER)
+    seen, _ = env.reset(seed=1)
+    assert (seen.dtype.names, seen["far"].dtype) == (("camera", "far", "wheels"), np.float32)
+    env.step(np.array([-1.0, 1.0], np.float32))
+    np.testing.assert_allclose(env.unwrapped.done, [-1.0, 1.0])
+    assert inner(env.action_range, [3.0, 0.5]).tolist() == [1.0, 0.0]
+    task = task_of(env)
+    assert (task.control_period_s, [row.high for row in task.action]) == (0.05, [3.0, 1.0])
+    ended = [env.step(np.ones(2, np.float32)) for _ in range(11)][-1]
+    assert (ended[3], ended[4]["outcome"]) == (True, "goal")
+    for space in (gymnasium.spaces.Discrete(2), Box(-np.inf, np.inf, (1,))):
+        wrong: Any = Rover()
+        wrong.action_space = space
+        with pytest.raises(UserError, match=r"acts in .*Box with bounds"):
+            Adapted(wrong, "wrong")
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        CAMERA,
+        Box(0, 255, (9, 7), np.uint8),
+        Box(0, 9, (3, 4)),
+        Box(0, 9, ()),
+        Rover.observation_space,
+    ],
+)
+def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space):
+    env: Any = Rover()
+    env.observation_space = space
+    layout: Layout = Adapted(env, "any").layout
+    random, buffer = np.random.default_rng(0), ReplayBuffer(50, 2, steps=3, layout=layout)
+    size = layout.dtype.itemsize * int(np.prod(layout.shape))
+    seen = np.frombuffer(random.bytes(41 * size), np.uint8) & 63  # no float that is not finite
+    rows = seen.view(layout.dtype).reshape(41, *layout.shape)
+    buffer.start_episode(rows[0])
+    for row in rows[1:]:
+        buffer.add(np.zeros(2, np.float32), 1.0, row, False, bool(random.random() < 0.3))
+    copy = ReplayBuffer(50, 2, steps=3, layout=layout)
+    copy.load_state_dict(buffer.state_dict())
+    batch, again = (each.sample(16, np.random.default_rng(1)) for each in (buffer, copy))
+    assert batch.frames.tobytes() == again.frames.tobytes() == rows[batch.indices].tobytes()
+    assert batch.next_frames.tobytes() == rows[batch.indices + batch.spans].tobytes()
+    learner = TD3Learner(LearnerConfig(batch_size=16), PHIL, 0, 2, space=space)
+    before = learner.act(rows[0])
+    assert np.isfinite(learner.update(batch)[:4]).all()
+    assert not np.array_equal(before, learner.act(rows[0]))
+    assert [part.shape[0] for part in tensors(rows)] == [41] * len(tensors(rows))
+
+
+def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_path):
+    settings = {"batch_size": 8, "warmup_steps": 20, "evaluation_runs": 1}
+    row = f"{__name__}:GENTLE"
+    run = train(ROVER, algorithm=row, episodes=4, settings=settings, out=tmp_path / "run")
+    assert sum(int(each["human_steps"]) for each in run.metrics) > 0
+    alone = evaluate(run, runs=2)
+    made = export(run, tmp_path / "p.onnx")
+    assert made.max_difference < 1e-5
+    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
+    assert list(policy.manifest.observation) == ["camera", "far", "wheels"]
+    filed = evaluate(tmp_path / "p.onnx", ROVER, runs=2)
+    assert filed.mean_return == pytest.approx(alone.mean_return, abs=1e-3)
+    env = make_environment(ROVER)
+    driver, _ = load_driver(str(tmp_path / "p.onnx"), env)
+    assert isinstance(driver, OnnxDriver)
+    seen = env.reset(seed=3)[0]
+    raw = policy.act({name: seen[name] for name in seen.dtype.names})
+    np.testing.assert_allclose(outer(env.action_range, driver.act(seen)), raw, atol=1e-5)
+    # What it wrote is all that it takes to go on; what is given goes before it.
+    directory = str(run.directory)
+    words = ["--config", f"{directory}/config.toml", "--episodes", "5", "--resume"]
+    words += ["--out", directory]
+    done = subprocess.run(
+        [sys.executable, "-m", "trainer", "train", *words], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(run.metrics) == 5
+
+
+def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
+    """In Python, too, where no option's choices stand before it."""
+    for wrong in ({"device": "gpu"}, {"threads": -1}, {"seed": -1}, {"preset": "mine"}):
+        with pytest.raises(UserError, match=f"{next(iter(wrong))} (must be one of|= -1 is out of)"):
+            train(ROVER, out=tmp_path / "run", **wrong)
+    assert not (tmp_path / "run").exists()
+
+
+def test_experts_rows_and_keys_are_found_by_name(capsys):
+    env = make_environment(ROVER)
+    env.reset(seed=0)
+    for expert in (expert_of(env), expert_of(env, f"{__name__}:Careful")):
+        assert expert.act().tolist() == [1.0, 0.0]
+        assert expert.wants_control(np.array([-1.0, 0.0], np.float32)) == "slow"
+        assert expert.may_return()
+    with pytest.raises(UserError, match=r"offers no expert\(\)"):
+        expert_of(make_environment("Pendulum-v1"))
+    assert find_algorithm(f"{__name__}:GENTLE") is PHIL
+    for wrong in ("magic", f"{__name__}:Rover", "nowhere:ROW"):
+        with pytest.raises(UserError):
+            find_algorithm(wrong)
+    with pytest.raises(UserError, match=r"a person cannot see .*no render\(\)"):
+        controls_of(f"{__name__}:test/Dark-v0")
+    with pytest.raises(UserError, match="draws no picture"):
+        make_environment(f"{__name__}:test/Dark-v0").render()
+    assert "Dark-v0 does not say how long a step is: 0.1 s is taken" in capsys.readouterr().err
+    controls = controls_of(ROVER)
+    assert controls.rest == pytest.approx((-0.5, -1.0))
+    assert controls.mix({"up": 1.0}) == (1.0, 1.0)
+    assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
+
+
+def test_the_package_is_light_before_something_is_asked_for():
+    said = "import trainer, sys; print('torch' in sys.modules, hasattr(trainer, 'no'))"
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
+
+
+def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
+    env, hands = make_environment(ROVER), Reading((1.0, 0.5), engaged=True)
+    person = Puppet([LET_GO] * 3 + [hands] * 5)
+    sitting = Sitting(person, Recorder(tmp_path), env, speed=QUICK)
+    drive(sitting, constant_driver(0.0, 2), abs, 1)
+    sitting.close()
+    steps = list(read_steps(sitting.recorder.path))
+    assert [step.action for step in steps[2:5]] == [(0.0, 0.0), (0.5, 0.5), (1.0, 0.5)]
+    assert steps[4].next_observation.tobytes() == steps[5].observation.tobytes()
+    assert json.loads(encode_view(person.views[4], 1, 0.0))["picture"]
+    model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
+    assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
+    assert np.isfinite(model.learn(2))
+    shown = Shown()
+    first, *_ = shown.entries([sitting.recorder.path])
+    assert isinstance(first, Steps)
+    assert isinstance(first.scene, np.ndarray)
+    assert first.scene.shape == (8, 8, 3)
