@@ -1,12 +1,8 @@
-"""Property tests compute; on a busy machine they are given the time. How a refusal looks."""
+"""How a refusal looks."""
 
 import pytest
-from hypothesis import settings
 
 from bridge.tests.harness import bridge_status
-
-settings.register_profile("patient", deadline=None)
-settings.load_profile("patient")
 
 
 @pytest.fixture

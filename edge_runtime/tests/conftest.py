@@ -3,13 +3,8 @@ from typing import Callable, NamedTuple
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from hypothesis import settings
 
 from edge_runtime.tests.policies import public_pem, write_policy
-
-# A busy machine is no defect of what runs on it.
-settings.register_profile("patient", settings.default, deadline=None)
-settings.load_profile("patient")
 
 
 class SignedPolicy(NamedTuple):

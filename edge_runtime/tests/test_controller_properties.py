@@ -218,6 +218,6 @@ class AnyHistory(RuleBasedStateMachine):
     ("vehicle", "armed_at_start"), [(False, True), (True, True), (True, False)]
 )
 def test_any_history(vehicle, armed_at_start, ride_s):
-    patient = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
+    patient = settings(max_examples=60, stateful_step_count=30)
     make: Any = partial(AnyHistory, vehicle, armed_at_start, ride_s)
     run_state_machine_as_test(make, settings=patient)

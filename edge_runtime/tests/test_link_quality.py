@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.envelope import read_envelope
@@ -67,7 +67,7 @@ class Network:
         self.step, self.episode = 0, self.episode + 1
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     ahead_ms=st.floats(-1e5, 1e5), up_ms=st.floats(0, 300), down_ms=st.floats(0, 300),
     spread_ms=st.floats(0, 50), seed=st.integers(0, 99),
@@ -104,8 +104,9 @@ def test_ways_that_are_alike_are_told_apart_from_their_jitter():
     )  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(up=st.floats(0.0, 0.3), down=st.floats(0.0, 0.3), seed=st.integers(0, 99))
+@example(up=0.125, down=0.25, seed=38)  # by chance, some of the runs read as bursts
 def test_the_share_lost_is_what_was_lost(up, down, seed):
     chance, network = random.Random(seed), Network()
     link = network.run(900, lose=lambda way: chance.random() < (up if way == "up" else down))
@@ -113,8 +114,20 @@ def test_the_share_lost_is_what_was_lost(up, down, seed):
     shares = network.lost["up"] / 900, network.lost["down"] / came
     # What the newest messages lost shows with the next that comes.
     expected = 100.0 * math.hypot(*shares) / math.sqrt(2.0)
-    assert link["loss_percent"] == pytest.approx(expected, abs=0.7)
-    assert link["outage_s"] < 0.12  # independent losses make no bursts, but by chance
+    assert link["lost_percent"] == pytest.approx(expected, abs=0.7)
+    if link["outage_s"] == 0.0:
+        assert link["loss_percent"] == pytest.approx(expected, abs=0.7)
+    else:  # where some runs read as bursts, they are told apart from the rest
+        assert link["loss_percent"] < link["lost_percent"]
+
+
+def test_independent_losses_read_as_bursts_only_by_a_rare_chance():
+    def outage_s(seed):
+        chance = random.Random(seed)
+        share = chance.uniform(0.0, 0.3)
+        return Network().run(900, lose=lambda way: chance.random() < share)["outage_s"]
+
+    assert sum(outage_s(seed) > 0.0 for seed in range(60)) <= 2  # of 400 such drives, 5 did
 
 
 @pytest.mark.parametrize(

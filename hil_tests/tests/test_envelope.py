@@ -85,7 +85,7 @@ def lucky(harm, slack=1e-6):
 
 
 @given(st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_bisection_finds_a_planted_edge_at_the_resolution(data):
     name = data.draw(st.sampled_from([name for name in AXES if name != "burst_messages"]))
     most, step = AXES[name]

@@ -34,7 +34,7 @@ rectangles = st.builds(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(rectangles, rectangles)
 def test_overlap_is_symmetric_and_agrees_with_sampled_points(a, b):
     assert pictures.overlap(a, b) == pictures.overlap(b, a)

@@ -56,7 +56,7 @@ def filled(*episodes, capacity=100, **options):
     return buffer, source
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     st.lists(st.tuples(st.integers(1, 30), st.booleans()), min_size=1, max_size=12),
     st.integers(8, 60),

@@ -72,7 +72,7 @@ def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
     return mdp._replace(rewards=rewards)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6), st.lists(st.booleans(), min_size=STATES, max_size=STATES))
 def test_the_proofs_potential_changes_no_optimal_policy_whatever_the_human_dislikes(seed, disliked):
     mdp = random_mdp(seed)
@@ -81,7 +81,7 @@ def test_the_proofs_potential_changes_no_optimal_policy_whatever_the_human_disli
     np.testing.assert_allclose(optimal_values(shaped), wanted, atol=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_intervention_shaping_keeps_the_optimum_where_only_bad_states_are_unacceptable(seed):
     mdp = random_mdp(seed, deterministic=True)

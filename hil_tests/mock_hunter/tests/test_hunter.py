@@ -115,10 +115,6 @@ bodies = st.builds(
 steps_s = st.floats(0.001, 0.02)
 
 
-settings.register_profile("patient", deadline=None)  # a busy machine pauses
-settings.load_profile("patient")
-
-
 @given(bodies, st.one_of(st.none(), setpoints), steps_s)
 def test_nothing_leaps_no_limit_is_passed_and_the_speed_comes_closer(body, setpoint, step_s):
     after = advance(body, setpoint, step_s, P)
