@@ -39,7 +39,9 @@ LEAST = 600  # No drive stops for a share of fewer: one loss in 20 would be 5 %
 EVERY = 5  # So many commands from one look to the next: a look takes a quarter of a millisecond
 UNSEEN = 3  # So many losses may have been missed (rule of three): to arm, they count
 FLOOR = 0.05  # The part of the times below their floor: one alone is a matter of luck
-ARM_BELOW = 0.9  # Hysteresis: above 1 it stops, and below this it is inside again
+STOP_ABOVE, ARM_BELOW = 0.9, 0.8
+"""Loads; 1 is the envelope's edge. What is known of a link lags behind it, so that one that gets
+worse stops the vehicle before the edge. Below the lower one it is inside again."""
 ACCURACY = {
     "delay_ms": 5.0, "jitter_ms": 5.0, "loss_percent": 1.0, "burst_messages": 1.0, "outage_s": 0.1
 }  # fmt: skip
@@ -190,8 +192,8 @@ class LinkQuality:
         """Look at what is known, every fifth command, and keep `outside`."""
         if self._commands % EVERY == 0 and (values := self.values()):
             load, words = self._load(values)
-            if load > 1.0 or load < ARM_BELOW:
-                self.outside = words if load > 1.0 else ""
+            if load > STOP_ABOVE or load < ARM_BELOW:
+                self.outside = words if load > STOP_ABOVE else ""
 
     def refusal(self) -> str:
         """Why a vehicle may not be armed; empty if it may."""

@@ -71,13 +71,6 @@ def test_what_is_no_topic_is_refused_in_one_line(name):
         ros2.topic_key("/hunter01", "/")
 
 
-@given(st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True))
-def test_any_vehicle_id_gives_a_valid_namespace(vehicle_id):
-    ros2.check_ros_name(ros2.namespace_of(vehicle_id))
-    given = ("hunter01", "a-b", "7up")
-    assert [ros2.namespace_of(name) for name in given] == ["/hunter01", "/a_b", "/v7up"]
-
-
 @pytest.mark.parametrize("kind", [ros.Twist, ros.AckermannDriveStamped, ros.Odometry])
 @pytest.mark.parametrize(("role", "reliable"), [(ros.PUBLISHER, 1), (ros.SUBSCRIBER, 0)])
 def test_tokens_are_the_bridges_with_the_second_librarys_hash(role, reliable, kind):

@@ -79,12 +79,6 @@ def topic_key(namespace: str, topic: str) -> str:
     return joined
 
 
-def namespace_of(vehicle_id: str) -> str:
-    """A ROS namespace for a vehicle id, which may hold a hyphen and begin with a digit."""
-    word = vehicle_id.replace("-", "_")
-    return f"/v{word}" if word[:1].isdigit() else f"/{word}"
-
-
 def check_ros2_endpoint(endpoint: Optional[str]) -> None:
     """Raise UserError for an endpoint (None is one that was not given) that cannot be used."""
     if endpoint is not None and is_tls(check_endpoint(endpoint)):
@@ -94,22 +88,17 @@ def check_ros2_endpoint(endpoint: Optional[str]) -> None:
         )
 
 
-def open_ros2_session(
-    listen: Optional[str], connect: Optional[str], option: str = "--ros2-listen"
-) -> zenoh.Session:
+def open_ros2_session(listen: Optional[str], connect: Optional[str]) -> zenoh.Session:
     """Listen as a router (the default, on loopback), or go on connecting to a bridge as a peer.
 
-    Raises UserError for a malformed endpoint and for a busy port; `option` is where the user has
-    set `listen`.
+    Raises UserError for a busy port. The endpoints are checked already.
     """
-    check_ros2_endpoint(listen)
-    check_ros2_endpoint(connect)
     if connect is not None:
         return open_session(connect=connect, mode="peer")
     try:
         return open_session(listen=listen or DEFAULT_ROS2_ENDPOINT, mode="router")
     except UserError as error:
-        raise UserError(str(error).replace("--listen", option)) from None
+        raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
 
 
 class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
@@ -241,9 +230,7 @@ class Ros2Vehicle(StreamedVehicle):
         super().__init__(Ros2Core(settings, similarity))
         self._failing = False
         self._publish: List[Callable[[Motion], None]] = []
-        self._session = open_ros2_session(
-            settings.listen, settings.connect, "[vehicle.ros2] listen"
-        )
+        self._session = open_ros2_session(settings.listen, settings.connect)
         try:
             self._node = node = ros.Ros2Node(self._session, settings.namespace)
             if settings.twist_topic:
