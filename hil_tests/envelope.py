@@ -93,7 +93,7 @@ def network(at: Point) -> LatencySpec:
     rounded: dict[str, Any] = {
         key: round(x, 6) if isinstance(x, float) else x for key, x in settings.items()
     }
-    outages = (Outage(outage_s, OUTAGE_START_S, OUTAGE_EVERY_S),) if outage_s else ()
+    outages = (Outage(round(outage_s, 6), OUTAGE_START_S, OUTAGE_EVERY_S),) if outage_s else ()
     one_way = DirectionSpec(**rounded, outages=outages)
     return LatencySpec(one_way, one_way)
 
