@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Dict, NamedTuple, Optional, Tuple
 
 # One lost state leaves a gap of exactly 2 T. Without a little patience the jitter of the sender's
-# clock would decide whether it costs one step or a stop; 2 T + T / 2 is the promise.
+# clock would decide whether it costs one step or a stop. A stop is promised within 2 T + T / 2.
 SILENCE_PERIODS = 2.2
 FRESH_STATES_TO_RECOVER = 5
 # Between two episodes of one drive a simulator resets in seconds. After a longer pause nobody

@@ -107,7 +107,7 @@ EXAMPLE = examples(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.description = (
-        f"{parser.description}. "
+        f"{parser.description} "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
