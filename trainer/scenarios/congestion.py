@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env.road.lane import LineType, StraightLane
+from highway_env.road.lane import StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
@@ -122,9 +122,8 @@ def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
     for lane in range(LANES):
         y = (lane - EGO_LANE) * lane_width_m
         ends = (-REACH_M, y), (goal_m + REACH_M, y)
-        lines = (LineType.CONTINUOUS if lane == 0 else LineType.NONE, LineType.CONTINUOUS)
         # No speed limit: the cars' own desired speeds are what limits them.
-        road = StraightLane(*ends, lane_width_m, line_types=lines, speed_limit=None)
+        road = StraightLane(*ends, lane_width_m, speed_limit=None)
         network.add_lane("start", "end", road)
     return network
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from highway_env.road.lane import CircularLane, LineType, StraightLane
+from highway_env.road.lane import StraightLane
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.utils import wrap_to_pi
 from numpy.typing import NDArray
@@ -91,20 +91,6 @@ class LeftTurnPath:
         """Signed curvature at ``s_m``, 1/m; negative is a left turn (headings are clockwise)."""
         return -1.0 / self.radius_m if 0.0 < s_m - self.straight_m <= self.arc_m else 0.0
 
-    def lanes(self, end_m: float, width_m: float) -> list[StraightLane | CircularLane]:
-        """The same path as highway-env lanes, ending at arc length ``end_m``."""
-        straight_end = (self.start_x, self.centre_y)
-        centre, quarter = (self.centre_x, self.centre_y), (0.0, -0.5 * math.pi)
-        arc = CircularLane(centre, self.radius_m, *quarter, clockwise=False, width=width_m)
-        exit_start = (self.centre_x, self.centre_y - self.radius_m)
-        exit_m = max(end_m - self.straight_m - self.arc_m, 0.1)
-        exit_end = (exit_start[0] - exit_m, exit_start[1])
-        return [
-            StraightLane((self.start_x, self.start_y), straight_end, width=width_m),
-            arc,
-            StraightLane(exit_start, exit_end, width=width_m),
-        ]
-
 
 class PathTracker:
     """PI control of the front wheels along a planned path (section VI, auxiliary functions).
@@ -141,25 +127,12 @@ class PathTracker:
         return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
 
 
-def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> RoadNetwork:
-    """Both lanes of the main road (y = 0 between them), and the ego car's path as lanes."""
-    network, half, reach = RoadNetwork(), 0.5 * lane_width_m, LANE_REACH_M
-    lines = (LineType.STRIPED, LineType.CONTINUOUS)
-    for start, end, y in (("west", "east", half), ("east", "west", -half)):
-        direction = 1.0 if start == "west" else -1.0
-        lane = StraightLane(
-            (-direction * reach, y),
-            (direction * reach, y),
-            lane_width_m,
-            line_types=lines,
-            # The cars' own desired speeds are what limits them.
-            speed_limit=None,
-        )
-        network.add_lane(start, end, lane)
-    nodes = ("south", "turn", "exit", "goal")
-    lanes = path.lanes(goal_m, lane_width_m)
-    for start, end, lane in zip(nodes[:-1], nodes[1:], lanes, strict=True):
-        network.add_lane(start, end, lane)
+def near_lane(lane_width_m: float) -> RoadNetwork:
+    """The one lane in which there is traffic, as highway-env has it; y = 0 is its left edge."""
+    network, y = RoadNetwork(), 0.5 * lane_width_m
+    # No speed limit: the cars' own desired speeds are what limits them.
+    lane = StraightLane((-LANE_REACH_M, y), (LANE_REACH_M, y), lane_width_m, speed_limit=None)
+    network.add_lane(*NEAR_LANE[:2], lane)
     return network
 
 
@@ -249,7 +222,7 @@ class LeftTurnEnv(DrivingEnv):
             Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m),
         ]
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
-        self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
+        self.network = near_lane(c.lane_width_m)
         self._offset_m = 0.0
 
     @property
