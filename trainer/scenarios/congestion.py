@@ -189,16 +189,11 @@ class CongestionEnv(DrivingEnv):
     keys = MappingProxyType({"left": (-1.0,), "a": (-1.0,), "right": (1.0,), "d": (1.0,)})
     key_rate_per_s = 2.5  # A tap turns the wheel a little.
     biased_action = 0.5  # Half of the full angle.
+    scenes = SCENES
     config: CongestionConfig
 
-    def __init__(
-        self,
-        config: CongestionConfig | None = None,
-        render_mode: str | None = None,
-        scene: Scene = "nominal",
-    ) -> None:
-        super().__init__(render_mode)
-        self.config = c = config or SCENES[scene]
+    def _build(self) -> None:
+        c = self.config
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)

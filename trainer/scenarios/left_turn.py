@@ -11,7 +11,6 @@ import numpy as np
 from highway_env.road.lane import StraightLane
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.utils import wrap_to_pi
-from numpy.typing import NDArray
 
 from trainer.scenarios.environment import (
     Action,
@@ -199,18 +198,13 @@ class LeftTurnEnv(DrivingEnv):
     keys = MappingProxyType({"up": (1.0,), "w": (1.0,), "down": (-1.0,), "s": (-1.0,)})
     key_rate_per_s = 5.0  # A pedal is down in 0.2 s.
     biased_action = 1.0  # Full throttle.
+    scenes = SCENES
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
     """The action that stops the car: what a simulator applies when commands stop."""
 
-    def __init__(
-        self,
-        config: LeftTurnConfig | None = None,
-        render_mode: str | None = None,
-        scene: Scene = "nominal",
-    ) -> None:
-        super().__init__(render_mode)
-        self.config = c = config or SCENES[scene]
+    def _build(self) -> None:
+        c = self.config
         half = 0.5 * c.lane_width_m
         # Right-hand traffic: the ego car comes up the right lane of the side road, crosses the
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
@@ -305,9 +299,6 @@ class LeftTurnEnv(DrivingEnv):
         cars = queue(self.road, NEAR_LANE, positions, speeds)
         equip(cars, types)
         return cars
-
-    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         if any(overlap(ego, car) for car in cars):
