@@ -15,18 +15,8 @@ from scipy import stats
 from bridge.report import GOAL, failed
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
-from trainer.experiments.plan import (
-    FULL_PATH_M,
-    LABELS,
-    NORMAL,
-    ONE_FRAME,
-    PAPER_TESTS,
-    RANDOM,
-    SCENARIOS,
-    TESTED_ONLY,
-    Unit,
-    units_of,
-)
+from trainer.experiments import plan
+from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit
 from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
 
 Numbers = NDArray[np.float64]
@@ -152,7 +142,7 @@ class Line(NamedTuple):
     def name(self) -> str:
         """The algorithm in words, with its setting where that is not the normal one."""
         setting = "" if self.setting == NORMAL else f" ({words(self.setting)})"
-        return LABELS[self.algorithm] + setting
+        return plan.LABELS[self.algorithm] + setting
 
 
 class Scene(NamedTuple):
@@ -297,7 +287,7 @@ class Result:
         return 1e4 * self.record["computed"]["training_s"] / self.record["totals"]["steps"]
 
     def _cut(self, distances_m: Numbers) -> Numbers:
-        return np.minimum(distances_m, FULL_PATH_M.get(self.unit.scenario, np.inf))
+        return np.minimum(distances_m, plan.FULL_PATH_M.get(self.unit.scenario, np.inf))
 
 
 @dataclass(frozen=True)
@@ -378,7 +368,7 @@ class Results:
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
-        count = PAPER_TESTS if paper else None
+        count = plan.PAPER_TESTS if paper else None
         parts = [r.drives(scene.condition, quantity)[:count] for r in self.of(scene.scenario, line)]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -412,7 +402,7 @@ def load(store: Store, seeds: int, name: str = "all") -> Results:
     Raises:
         UserError: a record lacks what this project writes.
     """
-    found, stale = store.find(units_of([name], seeds))
+    found, stale = store.find(plan.units_of([name], seeds))
     for unit, record in found.items():
         _check(unit, record, f"{store.records_file(unit.scenario)}: the record of {unit}")
     return Results({unit: Result(unit, found[unit]) for unit in found}, seeds, stale)

@@ -35,19 +35,8 @@ from trainer import drivers
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together
-from trainer.experiments.plan import (
-    CONSTANT,
-    EXPERT,
-    Plan,
-    Unit,
-    deciding,
-    obstacle,
-    run_config,
-    testing,
-    training_id,
-    unit_id,
-    units_of,
-)
+from trainer.experiments import plan
+from trainer.experiments.plan import Plan, Unit
 from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
@@ -119,7 +108,7 @@ class Store:
 
     def id(self, unit: Unit) -> str:
         """The id of the unit's record."""
-        return unit_id(unit, self.plan, self.humans)
+        return plan.unit_id(unit, self.plan, self.humans)
 
     def records_file(self, scenario: str) -> Path:
         """The records of a scenario, a line each."""
@@ -127,7 +116,10 @@ class Store:
 
     def run_dir(self, unit: Unit) -> Path:
         """Where the unit is trained; its actor stays there."""
-        return self.runs / f"{'-'.join(map(str, unit))}-{training_id(unit, self.plan, self.humans)}"
+        return (
+            self.runs
+            / f"{'-'.join(map(str, unit))}-{plan.training_id(unit, self.plan, self.humans)}"
+        )
 
     def lock_file(self, unit: Unit) -> Path:
         """Beside the unit's directory."""
@@ -168,7 +160,7 @@ class Store:
             record = records[unit.scenario].get(unit)
             if record is None:
                 continue
-            if obstacle(unit, self.humans) or record["id"] != self.id(unit):
+            if plan.obstacle(unit, self.humans) or record["id"] != self.id(unit):
                 stale.append(unit)
             else:
                 found[unit] = record
@@ -199,7 +191,7 @@ class Store:
 
     def status_lines(self, seeds: int) -> Iterator[str]:
         """A line for each algorithm and setting: how many of its units are done."""
-        units = units_of(["all"], seeds)
+        units = plan.units_of(["all"], seeds)
         found, stale = self.find(units)
         done = Counter(unit[:3] for unit in found)
         for line, count in Counter(unit[:3] for unit in units).items():
@@ -242,8 +234,8 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     began_s = time.monotonic()
     record: dict[str, Any] = {
         "id": store.id(unit),
-        **deciding(unit, store.plan, store.humans),
-        "testing": testing(unit, store.plan),
+        **plan.deciding(unit, store.plan, store.humans),
+        "testing": plan.testing(unit, store.plan),
     }
     seconds = {}
     if unit.trained:
@@ -260,10 +252,10 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
         policy = str(run_dir)
-    elif unit.algorithm == CONSTANT:
+    elif unit.algorithm == plan.CONSTANT:
         record["action"], record["success_of"] = best_constant(unit.scenario, store.plan)
         policy = f"{drivers.CONSTANT}{record['action']}"
-    elif unit.algorithm == EXPERT:
+    elif unit.algorithm == plan.EXPERT:
         policy = unit.scripted_human
     else:
         policy = str(store.humans / unit.scenario)
@@ -293,7 +285,7 @@ def _train(task: Task, run_dir: Path) -> bool:
     Time is looked at only where a checkpoint was just written, and not through the deadline of
     ``TrainingRun.train``: that one validates once more when it stops, as no unbroken run does.
     """
-    config = run_config(task.unit, task.store.plan, task.store.humans)
+    config = plan.run_config(task.unit, task.store.plan, task.store.humans)
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
     validated = over and rows[-1]["validation_success"] not in NOT_VALIDATED
