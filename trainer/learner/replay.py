@@ -227,17 +227,6 @@ class Batch:
     """Others, whose ``next_frames`` are what an overruled action would have led to, or None."""
 
 
-class _Returns(NamedTuple):
-    """n-step returns without their bootstrap, [n] each."""
-
-    rewards: NDArray[np.float32]
-    lasts: Indices
-    """The transitions that they end with."""
-    terminals: NDArray[np.float32]
-    """1 where nothing is to be bootstrapped from."""
-    spans: NDArray[np.int64]
-
-
 class ReplayBuffer:
     """A ring of transitions, drawn in proportion to priority ** alpha.
 
@@ -398,23 +387,28 @@ class ReplayBuffer:
             self._foreseen.load_state_dict(own)
 
     def _gather(self, indices: Indices) -> Batch:
-        returns = self._returns(indices)
+        rewards, lasts, terminals, spans = self._returns(indices)
         return Batch(
             indices=indices,
             frames=self._ring.frames(indices, 0),
             actions=self._actions[indices],
-            rewards=returns.rewards,
-            next_frames=self._ring.frames(returns.lasts, 1),
-            terminals=returns.terminals,
+            rewards=rewards,
+            next_frames=self._ring.frames(lasts, 1),
+            terminals=terminals,
             human=self._human[indices],
             probabilities=self._probabilities(indices),
-            spans=returns.spans,
+            spans=spans,
             overruled=self._overruled[indices],
             penalised=self._penalised[indices],
         )
 
-    def _returns(self, indices: Indices) -> _Returns:
+    def _returns(
+        self, indices: Indices
+    ) -> tuple[NDArray[np.float32], Indices, NDArray[np.float32], NDArray[np.int64]]:
         """The n-step returns, without their bootstrap, that begin with these transitions.
+
+        In the order: rewards, the transitions that they end with, 1 where nothing is to be
+        bootstrapped from, and how many steps they sum up; [n] each.
 
         A sum ends early where the episode does, for good or by a timeout, and at the newest step.
         It ends for good, too, at an overruled action that is penalised: what the human did there
@@ -440,7 +434,7 @@ class ReplayBuffer:
             sums = sums + going * (discount * self._rewards[following])
             terminals = np.where(going, self._terminals[lasts], terminals)
             spans += going
-        return _Returns(sums.astype(np.float32), lasts, terminals, spans)
+        return sums.astype(np.float32), lasts, terminals, spans
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         if len(self._trees) == 1:
