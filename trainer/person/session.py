@@ -30,14 +30,7 @@ from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
 from trainer.person.controls import Amount, amount, vector
 from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
-from trainer.person.recording import (
-    DISCARDED,
-    RESTARTED,
-    STOPPED,
-    Recorder,
-    Step,
-    layout_text,
-)
+from trainer.person.recording import DISCARDED, RESTARTED, STOPPED, Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, quit_on_signals

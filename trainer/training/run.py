@@ -271,7 +271,7 @@ class TrainingRun:
             distance_m=float(info["distance_m"]),
             outcome=info["outcome"],
             exploration_std=self._exploration_std(),
-            **vars(self.learning.end_episode(self.progress)),
+            **self.learning.end_episode(self.progress),
         )
 
     def _step(
