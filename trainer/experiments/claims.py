@@ -62,8 +62,7 @@ UNITS = {
 }
 """Quantity -> factor, digits and unit as it is shown."""
 SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
-SAME_LEVEL = 0.05
-"""What is on one level differs by no more than this share, or by so much success."""
+SAME_LEVEL = 0.05  # What is on one level differs by no more than this share, or by so much success
 NEARLY = 0.02
 """Share of the distance that poor guidance may change where the paper says nearly 50:50."""
 RESAMPLES = 2000
@@ -75,11 +74,9 @@ too."""
 class Claim(NamedTuple):
     """A row: what the paper says, and the comparisons by which it is judged."""
 
-    source: str
-    """Experiment, and figure or table of the paper."""
+    source: str  # Experiment, and figure or table of the paper
     text: str
-    paper: str
-    """Its number or word."""
+    paper: str  # Its number or word
     test: Callable[[Results, str, Claim], Iterator[Comparison]]
     """Makes the comparisons, with curves in training or of the policy alone. All must hold."""
     places: Sequence[Place]
@@ -96,18 +93,15 @@ class Comparison(NamedTuple):
 
     text: str
     holds: Holds
-    margin: float
-    """How far on the good side it is; nan where nothing is measured."""
-    complete: bool
-    """Whether all trainings are there."""
+    margin: float  # How far on the good side it is; nan where nothing is measured
+    complete: bool  # Whether all trainings are there
 
 
 class Finding(NamedTuple):
     """What was measured about a claim."""
 
     holds: Holds
-    ours: str
-    """The worst of the comparisons that decide, in words."""
+    ours: str  # The worst of the comparisons that decide, in words
 
 
 def judge(results: Results, claim: Claim, kind: str) -> Finding:

@@ -22,8 +22,7 @@ from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_C
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
 CONFIDENCE = 0.95
-TAIL = 0.5 * (1.0 - CONFIDENCE)
-"""Outside each end of an interval."""
+TAIL = 0.5 * (1.0 - CONFIDENCE)  # Outside each end of an interval
 
 
 class Estimate(NamedTuple):
@@ -32,8 +31,7 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
-    size: int
-    """Values behind it."""
+    size: int  # Values behind it
 
     def times(self, factor: float) -> Estimate:
         """The number and its interval multiplied."""
@@ -111,12 +109,10 @@ def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
     return Estimate(point, float(ends[0]), float(ends[1]), size)
 
 
-BySeed = dict[int, float]
-"""Training seed -> a number of that training."""
+BySeed = dict[int, float]  # Training seed -> a number of that training
 GRID_STEPS = 500
 """Curves are drawn and compared at multiples of it: the distance between two validations."""
-END_STEPS = 1_500
-"""What ended within so many steps of the last one is the end of a training."""
+END_STEPS = 1_500  # What ended within so many steps of the last one is the end of a training
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
@@ -158,10 +154,8 @@ class Scene(NamedTuple):
         return letter if self.condition == "nominal" else f"{letter}-{self.condition[0].upper()}"
 
 
-Place = str | Scene
-"""A scenario, for its trainings, or a scene of the tests."""
-EVERYWHERE = "mean of the scenes"
-"""A place, too: the paper's six scenes together."""
+Place = str | Scene  # A scenario, for its trainings, or a scene of the tests
+EVERYWHERE = "mean of the scenes"  # A place, too: the paper's six scenes together
 
 
 def words(place: Place) -> str:
@@ -295,10 +289,8 @@ class Results:
     """The results of a plan."""
 
     found: Mapping[Unit, Result]
-    seeds: int
-    """How many are wanted."""
-    stale: Collection[Unit] = ()
-    """Units whose record is of other settings, and left out."""
+    seeds: int  # How many are wanted
+    stale: Collection[Unit] = ()  # Units whose record is of other settings, and left out
 
     def of(self, scenario: str, line: Line) -> list[Result]:
         """What there is of a line in a scenario, by seed; what is only tested has seed 0."""
@@ -399,8 +391,7 @@ class Results:
 def load(store: Store, seeds: int, name: str = "all") -> Results:
     """What there is of an experiment, or of all the paper's.
 
-    Raises:
-        UserError: a record lacks what this project writes.
+    Raises UserError: a record lacks what this project writes.
     """
     found, stale = store.find(plan.units_of([name], seeds))
     for unit, record in found.items():

@@ -53,8 +53,7 @@ Judged = tuple[Claim, Finding, Finding | None]
 def write_report(store: Store, seeds: int) -> Path:
     """Draw all figures and write the page beside the records; returns its path.
 
-    Raises:
-        UserError: there are no records at all.
+    Raises UserError: there are no records at all.
     """
     results = data.load(store, seeds)
     if not results.found:

@@ -87,8 +87,7 @@ TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
 NOT_VALIDATED = ("", "nan")
 DIGITS = 5
-PATIENCE_S = 1.0
-"""How long a unit may be held before it counts as another process's work."""
+PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
 EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 """Exit status of a unit's process -> how the unit ended."""
 
@@ -97,14 +96,10 @@ EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 class Store:
     """Where the units of a plan are."""
 
-    plan: Plan
-    """What they have in common."""
-    results: Path
-    """Directory of the records, to be committed."""
-    runs: Path
-    """Directory of checkpoints and actors, which is not."""
-    humans: Path
-    """Directory with a human model for each scenario."""
+    plan: Plan  # What they have in common
+    results: Path  # Directory of the records, to be committed
+    runs: Path  # Directory of checkpoints and actors, which is not
+    humans: Path  # Directory with a human model for each scenario
 
     def id(self, unit: Unit) -> str:
         """The id of the unit's record."""
@@ -136,8 +131,7 @@ class Store:
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
         """All records of a scenario, current or not; none where there is no file.
 
-        Raises:
-            UserError: a line is not what ``put`` writes.
+        Raises UserError: a line is not what ``put`` writes.
         """
         path, found = self.records_file(scenario), {}
         text = read_bytes(path, "records").decode(errors="replace") if path.exists() else ""
@@ -418,8 +412,7 @@ def _work(task: Task) -> None:
     sys.exit(list(EXITS.values()).index(end))
 
 
-WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
-"""What a unit goes on from."""
+WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)  # What a unit goes on from
 Files = dict[str, bytes]
 Parcel = tuple[Task, Files, Files]
 """A task on its way to a node: with its human model, and with what it goes on from."""
@@ -455,8 +448,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
 
     ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
 
-    Raises:
-        UserError: Ray is not installed, or nothing answers at the address.
+    Raises UserError: Ray is not installed, or nothing answers at the address.
     """
     ray = _connected(address)
     remote = ray.remote(num_cpus=1, max_retries=3)(compute_parcel)  # for nodes that die

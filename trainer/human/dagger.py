@@ -109,11 +109,9 @@ class HumanEpisode(NamedTuple):
     """One episode of the human model's training."""
 
     loss: float
-    demonstrations: int
-    """The human's steps so far."""
+    demonstrations: int  # The human's steps so far
     interventions: int = 0
-    outcome: str = ""
-    """Empty where nobody drove: the model learned from recordings."""
+    outcome: str = ""  # Empty where nobody drove: the model learned from recordings
 
     def figures(self) -> dict[str, str]:
         """What the progress bar shows."""

@@ -111,8 +111,7 @@ ALGORITHMS: dict[str, Algorithm] = {
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
 and the others are what came after it."""
-PLUGIN_GROUP = "phil.algorithms"
-"""Entry points that are rows of their own."""
+PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
 
 
 def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
@@ -123,8 +122,7 @@ def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
 def find_algorithm(name: str) -> Algorithm:
     """The row of this name: of the table, of an installed package, or ``module:ROW``.
 
-    Raises:
-        UserError: no such row.
+    Raises UserError: no such row.
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]

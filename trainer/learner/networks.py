@@ -63,10 +63,8 @@ FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME
 
 PICTURES = Box(0, 255, (2, FRAME_ROWS, FRAME_COLUMNS), np.uint8)
 """The paper's observation: frames [t-1, t]."""
-UNBOUNDED = 1e6
-"""A bound beyond this is none: a number is not divided by it."""
-SMALL_SIDE = 8
-"""A picture is halved until it is no larger."""
+UNBOUNDED = 1e6  # A bound beyond this is none: a number is not divided by it
+SMALL_SIDE = 8  # A picture is halved until it is no larger
 
 
 def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:

@@ -69,8 +69,7 @@ class Layout(NamedTuple):
     """How an observation lies in an array."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    """Of several entries: a structured one."""
+    dtype: np.dtype[Any]  # Of several entries: a structured one
     stacked: bool = False
     """It is [older, newer], and its newer half is the older one of the next observation."""
 
@@ -98,8 +97,7 @@ class RingIndex:
         self.frame_ids = np.zeros((capacity, 2 + layout.stacked), np.int64)
         """The running numbers of each transition's three (or two) pictures, oldest first."""
         self.added = self.frames_added = 0
-        self.oldest = 0
-        """Running number of the oldest transition that is not forgotten."""
+        self.oldest = 0  # Running number of the oldest transition that is not forgotten
         self._current: tuple[int, ...] | None = None
 
     def __len__(self) -> int:
@@ -130,8 +128,7 @@ class RingIndex:
     def add(self, frames: NDArray[Any]) -> tuple[int, Lost]:
         """Number a transition that led to an observation; its slot.
 
-        Raises:
-            RuntimeError: no episode has begun.
+        Raises RuntimeError: no episode has begun.
         """
         if self._current is None:
             raise RuntimeError("start_episode comes before add")
@@ -193,8 +190,7 @@ COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
 """What is kept of a transition beside its pictures."""
-AHEAD = "foreseen_"
-"""What the names of the foreseen ones' state begin with."""
+AHEAD = "foreseen_"  # What the names of the foreseen ones' state begin with
 
 
 @dataclass(frozen=True)
@@ -202,23 +198,17 @@ class Batch:
     """A minibatch of ``n`` transitions."""
 
     indices: Indices
-    frames: NDArray[Any]
-    """s, [n, 2, 45, 80], or [n, ...] of another layout."""
-    actions: NDArray[np.float32]
-    """a, the action that was carried out, [n, action size]."""
-    rewards: NDArray[np.float32]
-    """r after shaping: the discounted sum over ``spans`` steps, [n]."""
-    next_frames: NDArray[Any]
-    """s' after those steps, likewise."""
+    frames: NDArray[Any]  # s, [n, 2, 45, 80], or [n, ...] of another layout
+    actions: NDArray[np.float32]  # a, the action that was carried out, [n, action size]
+    rewards: NDArray[np.float32]  # r after shaping: the discounted sum over ``spans`` steps, [n]
+    next_frames: NDArray[Any]  # s' after those steps, likewise
     terminals: NDArray[np.float32]
     """1 where s' ends the episode for good, or the policy's action in s' is overruled and
     penalised; a timeout is not terminal, [n]."""
-    human: NDArray[np.bool_]
-    """Delta of the first step: whether the human acted, [n]."""
+    human: NDArray[np.bool_]  # Delta of the first step: whether the human acted, [n]
     probabilities: NDArray[np.float64]
     """p(i), the probability with which each was drawn (eq. 20), [n]."""
-    spans: NDArray[np.int64] | int = 1
-    """Steps from s to s', [n]; or as many in all rows."""
+    spans: NDArray[np.int64] | int = 1  # Steps from s to s', [n]; or as many in all rows
     overruled: NDArray[np.float32] | None = None
     """What the policy would have done where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_] | None = None

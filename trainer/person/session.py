@@ -172,8 +172,7 @@ class Sitting:
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
         and the episodes that missed the goal. A run that goes on adds what it had."""
         self.coach = Coach()
-        self._taken_over_at = math.nan
-        """The step at which the last take-over began."""
+        self._taken_over_at = math.nan  # The step at which the last take-over began
         self._paused = False
         self._last_step: Step | None = None
         """Of an episode that has ended, until it is known whether the person discards it."""

@@ -52,8 +52,7 @@ DEFAULTS = RunConfig()
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
 DEVICES = ("cpu", "cuda")
-EXTENT = ("episodes", "steps")
-"""How long a run is: it may go on for longer."""
+EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 LEARNERS = tuple(field.name for field in fields(LearnerConfig))
 OWN = tuple(
     field.name for field in fields(RunConfig) if field.name not in (*OPTIONS, *EXTENT, "learner")
@@ -135,8 +134,7 @@ class Run:
     """A training run as a path: what is in its directory is all that there is of it."""
 
     directory: Path
-    interrupted: bool = False
-    """Whether it was asked to end before its time; ``resume`` goes on."""
+    interrupted: bool = False  # Whether it was asked to end before its time; ``resume`` goes on
 
     def __fspath__(self) -> str:
         return str(self.directory)
@@ -175,8 +173,8 @@ def train(
     ``settings`` what ``--set`` changes, name to value. Gives the run, for ``evaluate`` and
     ``export``.
 
-    Raises:
-        UserError: no such environment, algorithm, human or setting, or a directory that is taken.
+    Raises UserError: no such environment, algorithm, human or setting, or a directory that is
+    taken.
     """
     if device not in DEVICES:
         raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
@@ -352,8 +350,7 @@ def setting_lines() -> Iterator[str]:
 def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     """The config with one NAME=VALUE.
 
-    Raises:
-        UserError: no such setting, or no such value of it.
+    Raises UserError: no such setting, or no such value of it.
     """
     name, given, text = assignment.partition("=")
     if not given:

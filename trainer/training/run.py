@@ -80,15 +80,12 @@ def check_weights(learner: TD3Learner) -> None:
 class Seen:
     """One control period, once it is stored; nothing in it changes afterwards."""
 
-    observation: NDArray[Any]
-    """s."""
+    observation: NDArray[Any]  # s
     policy_action: NDArray[np.float32]
     """With the exploration's noise, as the vehicle would have had it."""
     intervention: Intervention | None
-    action: NDArray[np.float32]
-    """What was carried out."""
-    speed_mps: float
-    """After the step."""
+    action: NDArray[np.float32]  # What was carried out
+    speed_mps: float  # After the step
 
 
 OnStep = Callable[[Seen], None]
@@ -118,14 +115,12 @@ class TrainingRun:
         self.policy = behind(self.network, self.learning, self.env, aware)
         self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
         self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
-        self.gate: Asking | None = None
-        """Where the robot asks for help."""
+        self.gate: Asking | None = None  # Where the robot asks for help
         self.guide = self._make_guide()
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, where the run is watched."""
-        self.quitting = False
-        """The episode under way is to be the last of this call."""
+        self.quitting = False  # The episode under way is to be the last of this call
         if resume:
             self._load()
 

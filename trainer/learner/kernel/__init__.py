@@ -28,8 +28,7 @@ from torch.autograd.function import once_differentiable
 _LOGGER = logging.getLogger(__name__)
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared")
 _OPENMP = "-fopenmp"
-_TIMEOUT_S = 120.0
-"""For a build; it takes a few."""
+_TIMEOUT_S = 120.0  # For a build; it takes a few
 
 
 class _BuildError(Exception):
