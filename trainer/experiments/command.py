@@ -118,7 +118,8 @@ def run(arguments: argparse.Namespace) -> int:
     if reasons:
         say(f"{len(wanted) - len(possible)} units left out: {'; '.join(sorted(reasons))}")
     done, _ = store.find(possible)
-    stop_at_s = deadline_s(arguments, time.time)  # the clock that the processes have, too
+    # The clock that the processes have, too.
+    stop_at_s = deadline_s(arguments.max_minutes, time.time)
     left = [Task(unit, store, stop_at_s) for unit in possible if unit not in done]
     if left and arguments.ray:
         ends = run_on_ray(left, arguments.ray)

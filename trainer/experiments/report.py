@@ -224,20 +224,11 @@ def _cost(results: Results) -> Iterator[str]:
                 *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
             )
         )
-    learned = f"steps to {LEARNED:.0%}"
-    late = ("late below best, points", "at most")
-    seconds = [f"human s to {level:.0%}" for level in (LEARNED, WELL)]
     head = (
-        "",
-        "scenario",
-        learned,
-        "seeds",
-        *seconds,
-        *late,
-        "human steps",
-        "take-overs",
-        "failures",
-    )
+        "", "scenario", f"steps to {LEARNED:.0%}", "seeds",
+        *(f"human s to {level:.0%}" for level in (LEARNED, WELL)), "late below best, points",
+        "at most", "human steps", "take-overs", "failures",
+    )  # fmt: skip
     yield from markdown_table(head, rows)
 
 

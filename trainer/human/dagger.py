@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
-    end_s = options.deadline_s(arguments)
+    end_s = options.deadline_s(arguments.max_minutes)
     about: dict[str, Any] = {"scenario": arguments.scenario, "seed": arguments.seed}
     if arguments.recordings is None:
         training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)

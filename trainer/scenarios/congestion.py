@@ -189,6 +189,7 @@ class CongestionEnv(DrivingEnv):
     keys = MappingProxyType({"left": (-1.0,), "a": (-1.0,), "right": (1.0,), "d": (1.0,)})
     key_rate_per_s = 2.5  # A tap turns the wheel a little.
     biased_action = 0.5  # Half of the full angle.
+    expert_class = "trainer.human.congestion:CongestionHuman"
     scenes = SCENES
     config: CongestionConfig
 
@@ -201,12 +202,6 @@ class CongestionEnv(DrivingEnv):
             -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]
         )
         self._steering = 0.0
-
-    def expert(self) -> Any:
-        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        from trainer.human.congestion import CongestionHuman  # which imports this module
-
-        return CongestionHuman(self)
 
     @property
     def car(self) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import Any, ClassVar, Literal, Self
 
 import gymnasium
@@ -114,6 +115,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     keys: Mapping[str, tuple[float, ...]]  # Key -> the action while a person holds it
     key_rate_per_s: float  # How quickly a key presses
     biased_action: float  # What a human of biased guidance does whenever wrong
+    expert_class: str  # By its name: its module imports the scenario
     scenes: ClassVar[Mapping[Scene, Any]]  # Their configs
     config: ScenarioConfig
     ego: EgoVehicle
@@ -144,7 +146,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def expert(self) -> Any:
         """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        raise NotImplementedError
+        return resolve_name(self.expert_class)(self)
 
     def render(self) -> NDArray[np.uint8]:
         """The scene from above for a person, uint8 [height, width, 3]."""

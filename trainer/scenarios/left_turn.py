@@ -198,6 +198,7 @@ class LeftTurnEnv(DrivingEnv):
     keys = MappingProxyType({"up": (1.0,), "w": (1.0,), "down": (-1.0,), "s": (-1.0,)})
     key_rate_per_s = 5.0  # A pedal is down in 0.2 s.
     biased_action = 1.0  # Full throttle.
+    expert_class = "trainer.human.left_turn:LeftTurnHuman"
     scenes = SCENES
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
@@ -242,12 +243,6 @@ class LeftTurnEnv(DrivingEnv):
         self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
-
-    def expert(self) -> Any:
-        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        from trainer.human.left_turn import LeftTurnHuman  # which imports this module
-
-        return LeftTurnHuman(self)
 
     def pedal_for_speed(self, speed_mps: float) -> float:
         """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.

@@ -11,7 +11,6 @@ import os
 import re
 import sys
 import textwrap
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -211,8 +210,7 @@ def train(
     )  # fmt: skip
     with claimed(run_dir):
         check_directory(run_dir, config, resume)
-        end_s = math.inf if max_minutes is None else time.monotonic() + 60.0 * max_minutes
-        return _train(person, config, run_dir, rerun, end_s)
+        return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
 
 
 def _new_directory(config: RunConfig) -> Path:
