@@ -159,11 +159,8 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
 class Adapted:
     """Any environment in the form of the two scenarios.
 
-    Args:
-        env: with Box or flat Dict observations, and a Box of actions with finite bounds.
-        name: what it was asked for by.
-
-    Raises UserError: what `bridge.environments.describe` refuses.
+    It has Box or flat Dict observations, and a Box of actions with finite bounds; ``name`` is what
+    it was asked for by. Raises UserError: what `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")

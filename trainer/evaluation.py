@@ -195,13 +195,8 @@ def drive_together(
 ) -> list[EpisodeResult]:
     """Drive an episode for each seed, as many at once as there are environments.
 
-    A network answers many pictures much sooner than each alone; its last bits may differ.
-
-    Args:
-        envs: of one scenario and condition.
-        act: actions [n, action size] for observations [n, ...], of a driver without memory.
-        seeds: of the episodes.
-        condition: one of ``CONDITIONS``.
+    A network answers many pictures much sooner than each alone; its last bits may differ. ``act``
+    is that of a driver without memory: actions [n, action size] for observations [n, ...].
     """
     noise_std = CONDITIONS[condition].noise_std
     results: dict[int, EpisodeResult] = {}

@@ -157,12 +157,8 @@ def sooner(
 ) -> Iterator[Comparison]:
     """Whether each of ours gets more than so many times as soon where each of the others ends.
 
-    Args:
-        results: of the trainings.
-        kind: of the curves.
-        claim: with the times as its bar; others must be named.
-        common: the level is the lower end of the two, so that both can reach it.
-        best: only the best of the others counts.
+    The claim's bar is the times, and its others must be named. ``common``: the level is the lower
+    end of the two, so that both can reach it; ``best``: only the best of the others counts.
     """
     for place, quantity in product(claim.places, claim.quantities):
 

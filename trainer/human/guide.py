@@ -108,11 +108,8 @@ class Asking(Trigger):
 class Inattentive(Trigger):
     """A human that comes late, or not at all: what is overlooked is not looked at for a while.
 
-    Args:
-        trigger: when this human should take over.
-        late_steps: the least and the longest delay, in control periods; each is drawn anew.
-        missed_share: how often nothing is noticed at all.
-        random: what is drawn from.
+    ``trigger`` is when it should take over; ``late_steps`` the least and the longest delay, in
+    control periods, of which each is drawn anew; ``missed_share`` how often it notices nothing.
     """
 
     BLIND_STEPS = 15

@@ -84,9 +84,7 @@ Lost = list[int]
 class RingIndex:
     """Running numbers of pictures and transitions, the rings they are kept in, and the pictures.
 
-    Args:
-        capacity: transitions kept.
-        layout: of the observations. One that is not stacked counts as a picture.
+    ``capacity`` is in transitions. An observation that is not stacked counts as a picture.
     """
 
     def __init__(self, capacity: int, layout: Layout = PAPERS) -> None:

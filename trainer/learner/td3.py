@@ -48,15 +48,8 @@ class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
     Both losses are taken at the same weights, before either optimiser steps: a picture is then
-    embedded once for each network and shared by every term that needs it.
-
-    Args:
-        config: hyper-parameters.
-        algorithm: the row of the table of switches.
-        seed: of the initial weights and of the smoothing noise.
-        action_size: length of an action.
-        device: where the networks are.
-        space: of the observations.
+    embedded once for each network and shared by every term that needs it. ``seed`` is that of the
+    initial weights and of the smoothing noise.
     """
 
     def __init__(

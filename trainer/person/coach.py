@@ -120,10 +120,8 @@ class Coach:
 def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[int, bool]) -> str:
     """One line of advice: of the first rule that fits, empty where none does.
 
-    Args:
-        episodes: the recent ones.
-        alone: newest success of the policy alone, 0 to 1; None: not known.
-        mastered: episode -> whether the policy alone reaches the goal in it today.
+    ``alone`` is the newest success of the policy alone, 0 to 1, where it is known; ``mastered``:
+    episode -> whether the policy alone reaches the goal in it today.
     """
     if alone is not None and alone >= WELL:
         return f"The policy alone reaches {alone:.0%}: you may stop here."

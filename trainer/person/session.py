@@ -110,12 +110,9 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
 def drive(
     sitting: Sitting, policy: Driver | None, seed_of: SeedOf, episodes: int | None
 ) -> Counter[str]:
-    """Drive until the person quits, or so many episodes (None: no end).
+    """Drive until the person quits, or so many episodes (None: no end); how often one ended how.
 
     The policy drives until the person takes over; without one, the person drives alone.
-
-    Returns:
-        How often an episode ended how.
     """
     outcomes = Counter[str]()
     number = sitting.recorder.sitting

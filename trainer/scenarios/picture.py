@@ -172,10 +172,8 @@ def draw_scene(
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
-    ``ego`` is the ego car's colour, which tells what drives it.
-
-    Returns:
-        uint8 [height, width, 3].
+    The picture is uint8 [height, width, 3]; ``ego`` is the ego car's colour, which tells what
+    drives it.
     """
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
     image = Image.new("RGB", size, COLOURS["ground"])

@@ -40,11 +40,7 @@ class DelayAware:
 
     With a constant delay and these actions the decision process is Markov again (Katsikopoulos and
     Engelbrecht, 2003; rtgym's action buffer). So a command that comes early waits (the conservative
-    agent). ``space`` and ``layout`` are of the larger observation.
-
-    Args:
-        env: the environment, whose actions are in [-1, 1].
-        spec: the network; it decides d.
+    agent). ``spec`` decides d; ``space`` and ``layout`` are of the larger observation.
     """
 
     def __init__(self, env: Any, spec: LatencySpec) -> None:
@@ -70,12 +66,9 @@ class DelayAware:
 class VehicleEnd:
     """One episode of a policy behind a network.
 
-    Args:
-        env: the scenario; its brake is pressed here when commands stop.
-        spec: the network, or one episode's link.
-        seed: of the network: the episode's, as in ``bridge simulate``.
-        observation: any one, for its size.
-        aware: where the policy sees what is on its way; then each command waits for its tick.
+    The brake of ``env`` is pressed here when commands stop. ``seed`` is the episode's, as in
+    ``bridge simulate``, ``observation`` any one, for its size. ``aware``: the policy sees what is
+    on its way, and each command waits for its tick.
     """
 
     def __init__(
@@ -103,13 +96,10 @@ class VehicleEnd:
         return self._link.hold.newest_step
 
     def tick(self, observation: Observation, policy: Policy) -> Action:
-        """Send the tick's observation, let the policy answer all that arrive, and decide.
+        """What the vehicle does, float32 [action size], once the policy has answered what arrives.
 
         The policy is asked for each fresh observation that reaches the edge within the tick: often
         one, but none or several where the network drops, delays or bundles them.
-
-        Returns:
-            What the vehicle does, float32 [action size].
         """
         self._link.send_state(self._step, observation)
         self._step += 1

@@ -36,8 +36,7 @@ class LearningThread:
     of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
     loop's thread, beside the update: a batch of one needs no other thread.
 
-    Arguments as `TD3Learner`'s, and ``layout``: how observations lie in an array. The replay buffer
-    is in the processor's memory.
+    The networks are on ``device``, the replay buffer is in the processor's memory.
 
     Raises UserError: there is no memory for the replay buffer.
     """

@@ -49,8 +49,7 @@ NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 def divergence_said(episode: int) -> Iterator[None]:
     """Turn the FloatingPointError of learning that diverged into a UserError.
 
-    Args:
-        episode: the one under way, from 0; people count from 1.
+    The episode under way counts from 0; people count from 1.
     """
     try:
         yield
