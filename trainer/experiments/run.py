@@ -31,7 +31,7 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer import drivers
+from trainer import drivers, util
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together
@@ -42,16 +42,6 @@ from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import (
-    Purpose,
-    die_with_parent,
-    episode_seed,
-    held,
-    holder,
-    interrupts_blocked,
-    processor_model,
-    source_revision,
-)
 
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since
@@ -125,7 +115,7 @@ class Store:
     def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
         """Hold a unit against other processes; gives whether that was possible."""
         make_directory(self.runs)
-        with held(self.lock_file(unit), patience_s) as mine:
+        with util.held(self.lock_file(unit), patience_s) as mine:
             yield mine
 
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
@@ -164,7 +154,7 @@ class Store:
         """Add a record, in place of an older one of the unit: whole or not at all."""
         path = self.records_file(unit.scenario)
         make_directory(path.parent)
-        with held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
+        with util.held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
             if not mine:
                 raise UserError(f"{path} is held by another process")
             records = {**self.records(unit.scenario), unit: record}
@@ -209,7 +199,7 @@ def compute(task: Task) -> str:
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
         if not free:
-            say(f"left to {holder(store.lock_file(unit))}: {unit}")
+            say(f"left to {util.holder(store.lock_file(unit))}: {unit}")
             return BUSY
         if unit in store.find([unit])[0]:
             return FINISHED
@@ -259,11 +249,11 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         seconds["search_s"] = round(tested_s - began_s)
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
-        "processor": processor_model(),
+        "processor": util.processor_model(),
         "bfloat16": multiplies_bfloat16("cpu"),
         "compiled_kernel": load_kernel("trunk") is not None,
         "torch": torch.__version__,
-        "source_revision": source_revision(),
+        "source_revision": util.source_revision(),
         **seconds,
     }
     return record
@@ -337,7 +327,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     Searched on two grids: from -1 to 1, then a step to either side of the best one.
     """
     envs = [make_environment(scenario) for _ in range(plan.together)]
-    drives = [episode_seed(0, Purpose.VALIDATION, run) for run in range(plan.search_runs)]
+    drives = [util.episode_seed(0, util.Purpose.VALIDATION, run) for run in range(plan.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
     def search(grid: Iterable[float]) -> float:
@@ -372,7 +362,7 @@ def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
                         ends[STOPPED] += 1
                         continue
                     process = context.Process(target=_work, args=(task,), daemon=True)
-                    with interrupts_blocked():
+                    with util.interrupts_blocked():
                         process.start()
                     working[process.sentinel] = process, task
                 for sentinel in wait([*working]) if working else ():
@@ -397,7 +387,7 @@ def say(line: str) -> None:
 def _work(task: Task) -> None:
     """A process's life: its exit status tells how the unit ended."""
     os.nice(5)  # a machine on which somebody works stays usable
-    threading.Thread(target=die_with_parent, daemon=True).start()
+    threading.Thread(target=util.die_with_parent, daemon=True).start()
     end, why = FAILED, ""
     try:
         end = compute(task)

@@ -13,6 +13,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
+from trainer.scenarios import traffic
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
@@ -23,19 +24,7 @@ from trainer.scenarios.environment import (
     Step,
 )
 from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import (
-    CAR,
-    CARS_ONLY,
-    MIXED,
-    Mix,
-    TrafficVehicle,
-    VehicleType,
-    bodies_m,
-    draw_types,
-    equip,
-    idm_acceleration,
-    queue,
-)
+from trainer.scenarios.traffic import TrafficVehicle
 
 
 @dataclass(frozen=True)
@@ -68,7 +57,7 @@ class CongestionConfig(ScenarioConfig):
     cars_behind: int = 1
     """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
     elsewhere has nothing to react to."""
-    traffic_mix: Mix = CARS_ONLY
+    traffic_mix: traffic.Mix = traffic.CARS_ONLY
     side_front_m: Range = (9.0, 13.0)
     """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
     gap_m: Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
@@ -94,7 +83,7 @@ class CongestionConfig(ScenarioConfig):
 
 SCENES: dict[Scene, CongestionConfig] = {
     "nominal": CongestionConfig(),
-    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED),
+    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=traffic.MIXED),
     # A jam in lanes as narrow as at roadworks, in which cars keep to their lane's middle, and lanes
     # to the jam's speed, about half as well as usual. The narrowest gap leaves 0.5 m to each side
     # of an ego car in mid-lane instead of 1.25, and its walls move; were it narrower, cars of two
@@ -138,12 +127,12 @@ def spawn_traffic(
         first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
         types, x = (_own_lane if lane == EGO_LANE else _side_lane)(config, random)
         speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
-        own = queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
+        own = traffic.queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
         for car in own:
             car.target_speed = config.desired_speed_mps
         if lane == EGO_LANE and config.cars_behind:
             own[1].leader = ego
-        equip(own, types, config.time_gap_factor)
+        traffic.equip(own, types, config.time_gap_factor)
         # The first of a lane goes with the jam, the others would go faster if they could.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
@@ -154,20 +143,20 @@ def spawn_traffic(
 
 def _side_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[VehicleType], list[float]]:
+) -> tuple[list[traffic.VehicleType], list[float]]:
     """The vehicles of a neighbouring lane, and where they are."""
-    types = draw_types(config.traffic_mix, config.side_cars, random)
+    types = traffic.draw_types(config.traffic_mix, config.side_cars, random)
     x = [float(random.uniform(*config.side_front_m))]
     for ahead, behind in itertools.pairwise(types):
-        x.append(x[-1] - bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
+        x.append(x[-1] - traffic.bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
     return types, x
 
 
 def _own_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[VehicleType], list[float]]:
+) -> tuple[list[traffic.VehicleType], list[float]]:
     """One car ahead of the ego car; those behind follow the ego car as one of theirs."""
-    types = draw_types(config.traffic_mix, 1 + config.cars_behind, random)
+    types = traffic.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
     nose_m = 0.5 * EgoVehicle.LENGTH
     x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
     tail_m = -nose_m
@@ -208,7 +197,7 @@ class CongestionEnv(DrivingEnv):
         """Its throttle is the IDM's, which no action reaches; the action +1 turns right."""
         c = self.config
         return {
-            "throttle_mps2": CAR.acceleration_mps2,
+            "throttle_mps2": traffic.CAR.acceleration_mps2,
             "brake_mps2": c.brake_mps2,
             "max_speed_mps": c.desired_speed_mps,
             "full_steering_rad": -c.lambda_rad,
@@ -275,7 +264,9 @@ class CongestionEnv(DrivingEnv):
             gap_m -= 0.5 * (leader.LENGTH + self.ego.LENGTH)
             closing_mps = self.ego.speed - leader.speed
         speed_mps, wanted_mps = self.ego.speed, c.desired_speed_mps
-        idm = idm_acceleration(CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor)
+        idm = traffic.idm_acceleration(
+            traffic.CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor
+        )
         return max(idm, -c.brake_mps2)
 
     def _leader(self) -> TrafficVehicle | None:

@@ -12,6 +12,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.utils import wrap_to_pi
 
+from trainer.scenarios import traffic
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
@@ -22,17 +23,7 @@ from trainer.scenarios.environment import (
     Step,
 )
 from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import (
-    CAR,
-    CARS_ONLY,
-    MIXED,
-    Mix,
-    TrafficVehicle,
-    bodies_m,
-    draw_types,
-    equip,
-    queue,
-)
+from trainer.scenarios.traffic import TrafficVehicle
 
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
@@ -151,7 +142,7 @@ class LeftTurnConfig(ScenarioConfig):
     throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
     brake_mps2: float = 4.0  # Deceleration at full brake (-1)
     traffic_cars: int = 3
-    traffic_mix: Mix = CARS_ONLY
+    traffic_mix: traffic.Mix = traffic.CARS_ONLY
     traffic_speed_mps: Range = (4.0, 6.0)
     """Initial and desired speed of each car of the main road (section VI-A)."""
     first_car_m: Range = (2.0, 12.0)
@@ -176,7 +167,7 @@ class LeftTurnConfig(ScenarioConfig):
 SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
     # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
-    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300),
+    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=traffic.MIXED, max_steps=300),
     # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
     # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between
     # them the two cars' speeds decide, and a policy that only ever met gaps up to 16 m and from
@@ -281,18 +272,18 @@ class LeftTurnEnv(DrivingEnv):
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random
         crossing_m = LANE_REACH_M + 0.5 * c.lane_width_m
-        types = draw_types(c.traffic_mix, c.traffic_cars, random)
+        types = traffic.draw_types(c.traffic_mix, c.traffic_cars, random)
         positions: list[float] = []
         for number in range(c.traffic_cars):
             if positions:
                 gap_m = c.long_gap_m if random.random() < c.long_gap_share else c.short_gap_m
-                longer_m = bodies_m(types[number], types[number - 1]) - CAR.length_m
+                longer_m = traffic.bodies_m(types[number], types[number - 1]) - traffic.CAR.length_m
                 positions.append(positions[-1] - float(random.uniform(*gap_m)) - longer_m)
             else:
                 positions.append(crossing_m - float(random.uniform(*c.first_car_m)))
         speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=c.traffic_cars)]
-        cars = queue(self.road, NEAR_LANE, positions, speeds)
-        equip(cars, types)
+        cars = traffic.queue(self.road, NEAR_LANE, positions, speeds)
+        traffic.equip(cars, types)
         return cars
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
