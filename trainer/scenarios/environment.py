@@ -132,17 +132,8 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.frames = np.zeros((2, ROWS, COLUMNS), np.uint8)
         self.steps = 0
         self.distance_m = 0.0
+        self.control_period_s, self.goal_m = self.config.control_period_s, self.config.goal_m
         self._build()
-
-    @property
-    def control_period_s(self) -> float:
-        """T, seconds."""
-        return self.config.control_period_s
-
-    @property
-    def goal_m(self) -> float:
-        """Distance from start to goal."""
-        return self.config.goal_m
 
     def expert(self) -> Any:
         """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
