@@ -172,41 +172,16 @@ class Store(Protocol):
         """
 
 
-class DirectPolicy:
-    """A policy as the training loop has it, without a network: it acts on what is there.
+class DelayedPolicy:
+    """The policy as the training loop has it: behind a network, in virtual time, or ``none``.
 
     Each tick goes to ``store`` as a transition.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
-
-    def start(self, observation: Observation, seed: int) -> None:
-        """Begin an episode; a network's luck depends on the seed."""
-        self._store.start_episode(observation)
-
-    def act(self, observation: Observation, policy: Policy) -> Action:
-        """What the vehicle is told in the tick of this observation."""
-        return policy(observation)
-
-    def yield_to_human(self) -> None:
-        """A human has taken over in this tick: only what they do moves the vehicle."""
-
-    def store(
-        self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
-    ) -> None:
-        """Keep the tick that led to ``observation``; arguments as ``Store.add``."""
-        self._store.add(action, reward, observation, *rest, **guidance)
-
-
-class DelayedPolicy(DirectPolicy):
-    """The policy behind a network, in virtual time."""
-
     def __init__(
         self, store: Store, env: Any, spec: LatencySpec, aware: DelayAware | None = None
     ) -> None:
-        super().__init__(store)
-        self._env, self._spec, self._aware = env, spec, aware
+        self._store, self._env, self._spec, self._aware = store, env, spec, aware
         late = aware.ticks if aware else ticks_late(spec, env.control_period_s)
         self._known: deque[Observation] = deque(maxlen=late + 1)
         """Observations of the ticks n - d to n."""
@@ -216,7 +191,9 @@ class DelayedPolicy(DirectPolicy):
 
     def start(self, observation: Observation, seed: int) -> None:
         """Begin an episode; the seed decides the network's luck."""
-        self._vehicle_end = VehicleEnd(self._env, self._spec, seed, observation, self._aware)
+        self._vehicle_end = None
+        if self._spec != LatencySpec():
+            self._vehicle_end = VehicleEnd(self._env, self._spec, seed, observation, self._aware)
         self._known.clear()
         self._carried_out.clear()
         self._storing = False
@@ -227,22 +204,27 @@ class DelayedPolicy(DirectPolicy):
         if not self._storing and len(self._known) == self._known.maxlen:
             self._store.start_episode(self._seen(self._known[0], self._carried_out))
             self._storing = True
-        return self._vehicle_end.tick(observation, policy)
+        end = self._vehicle_end
+        return end.tick(observation, policy) if end else policy(observation)
 
     def yield_to_human(self) -> None:
         """The vehicle lets go of the brake that it may have pressed for want of commands."""
-        self._vehicle_end.press_brake(False)
+        if self._vehicle_end:
+            self._vehicle_end.press_brake(False)
 
     def store(
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
-        """Keep the tick; the first d of an episode answer to nothing the policy could know."""
+        """Keep the tick that led to ``observation``; arguments as ``Store.add``.
+
+        The first d of an episode answer to nothing that the policy could know.
+        """
         if ahead := guidance.get("foreseen"):
             guidance["foreseen"] = self._foreseen(ahead, guidance["overruled"])
         self._carried_out.append(action)
         if self._storing:
             known = self._seen([*self._known, observation][1], self._carried_out)
-            super().store(action, reward, known, *rest, **guidance)
+            self._store.add(action, reward, known, *rest, **guidance)
 
     def _foreseen(self, ahead: Sequence[Observation], held: Action) -> list[Observation]:
         """The same, each as late as all that the policy sees."""
@@ -264,10 +246,3 @@ def ticks_late(spec: LatencySpec, period_s: float, jitters: float = 0.0) -> int:
     round_trip_s = (spec.up.delay_ms + spec.down.delay_ms + jitters * jitter_ms) * 1e-3
     beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW * period_s - ROUNDING_S)
     return math.ceil(beyond_window_s / period_s)
-
-
-def behind(
-    spec: LatencySpec, store: Store, env: Any, aware: DelayAware | None = None
-) -> DirectPolicy:
-    """The policy behind a network; ``none`` is no network."""
-    return DirectPolicy(store) if spec == LatencySpec() else DelayedPolicy(store, env, spec, aware)

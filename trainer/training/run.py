@@ -23,7 +23,7 @@ from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
-from trainer.training.delayed import DelayAware, behind
+from trainer.training.delayed import DelayAware, DelayedPolicy
 from trainer.training.learning import Action, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -111,7 +111,7 @@ class TrainingRun:
             LearningThread(*switches, config.seed, action_size, config.device, *seen)
         )
         self.validation = Validation(config, run_dir, self.learning, aware)
-        self.policy = behind(self.network, self.learning, self.env, aware)
+        self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
         self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
         self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
         self.gate: Asking | None = None  # Where the robot asks for help
