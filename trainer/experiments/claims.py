@@ -97,25 +97,18 @@ class Comparison(NamedTuple):
     complete: bool  # Whether all trainings are there
 
 
-class Finding(NamedTuple):
-    """What was measured about a claim."""
-
-    holds: Holds
-    ours: str  # The worst of the comparisons that decide, in words
-
-
-def judge(results: Results, claim: Claim, kind: str) -> Finding:
-    """Hold results against a claim; it is undecided where trainings are missing."""
+def judge(results: Results, claim: Claim, kind: str) -> Comparison:
+    """The worst of a claim's comparisons that decide; undecided where trainings are missing."""
     made = list(claim.test(results, kind, claim))
     holds = all_of([one.holds for one in made])
     measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
     if not measured:
-        return Finding("undecided", "not measured")
+        return Comparison("not measured", "undecided", float("nan"), False)
     worst = min(measured, key=lambda one: one.margin)
-    return Finding(holds if all(one.complete for one in made) else "undecided", worst.text)
+    return worst if all(one.complete for one in made) else worst._replace(holds="undecided")
 
 
-def judge_both(results: Results, claim: Claim) -> tuple[Finding, Finding | None]:
+def judge_both(results: Results, claim: Claim) -> tuple[Comparison, Comparison | None]:
     """As the paper does, with training curves; and of the policy alone, where it has curves."""
     alone = judge(results, claim, ALONE) if claim.source in OF_CURVES else None
     return judge(results, claim, TRAINING), alone

@@ -45,11 +45,11 @@ class Estimate(NamedTuple):
         held = self._replace(low=max(self.low, 0.0), high=min(self.high, 1.0))
         return held.times(100.0).text(1)
 
-    def text(self, digits: int = 2, unit: str = "") -> str:
+    def text(self, digits: int = 2) -> str:
         """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
         if not self.size:
             return "–"
-        shown = f"{self.value:.{digits}f}{unit}"
+        shown = f"{self.value:.{digits}f}"
         if np.isinf([self.low, self.high]).all():
             return shown
         low, high = (f"{end:.{digits}f}".replace("inf", "∞") for end in (self.low, self.high))

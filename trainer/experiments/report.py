@@ -19,7 +19,7 @@ from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.experiments import data, plan
-from trainer.experiments.claims import CLAIMS, Claim, Finding, first_reached, judge_both
+from trainer.experiments.claims import CLAIMS, Claim, Comparison, first_reached, judge_both
 from trainer.experiments.data import Line, Place, Result, Results, Scene, words
 from trainer.experiments.plan import EXPERIMENTS, HUMAN_MODEL, NORMAL, PAPER_TESTS, SCENARIOS
 from trainer.experiments.run import Store
@@ -46,7 +46,7 @@ PAPER_S = dict(zip(plan.FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
 """The paper's table of time efficiency: seconds for 10,000 steps."""
 EVERY_LINE = [Line(name, setting) for _, setting, names in plan.LINES for name in names]
 """Every line that is computed, in the order of work."""
-Judged = tuple[Claim, Finding, Finding | None]
+Judged = tuple[Claim, Comparison, Comparison | None]
 """A claim with what was measured, and with the same of the policy alone."""
 
 
@@ -78,7 +78,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         elif name in MORE:
             yield from MORE[name](results)
         rows = [
-            (claim.text, claim.paper, f.ours, f.holds, *((a.ours, a.holds) if a else ("", "")))
+            (claim.text, claim.paper, f.text, f.holds, *((a.text, a.holds) if a else ("", "")))
             for claim, f, a in judged
             if claim.source == name
         ]
