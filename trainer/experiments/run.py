@@ -251,7 +251,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     record["computed"] = {
         "processor": util.processor_model(),
         "bfloat16": multiplies_bfloat16("cpu"),
-        "compiled_kernel": load_kernel("trunk") is not None,
+        "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
         "source_revision": util.source_revision(),
         **seconds,
