@@ -143,7 +143,7 @@ class LearningThread:
             self.replay.update_priorities(batch.indices, losses.priorities)
         return waited_s
 
-    def end_episode(self, progress: float) -> dict[str, float]:
+    def end_episode(self, progress: float) -> dict[str, Any]:
         """What was learned since the last call, as fields of `EpisodeMetrics`; rates fall.
 
         Losses are nan where there was no update.
