@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bridge.network import parse_spec
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
+from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
 from trainer.human.guide import STUCK, Asking, Guide, HumanGuide, Inattentive, Intervention, Trigger
@@ -32,14 +33,6 @@ from trainer.training.metrics import (
     Validation,
     read_metrics,
     totals,
-)
-from trainer.util import (
-    Purpose,
-    episode_seed,
-    load_torch,
-    random_stream,
-    save_torch,
-    source_revision,
 )
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
@@ -112,8 +105,8 @@ class TrainingRun:
         )
         self.validation = Validation(config, run_dir, self.learning, aware)
         self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
-        self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
-        self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
+        self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
+        self.guidance = util.random_stream(config.seed, util.Purpose.GUIDANCE)
         self.gate: Asking | None = None  # Where the robot asks for help
         self.guide = self._make_guide()
         self.episode = self.steps = 0
@@ -133,7 +126,7 @@ class TrainingRun:
         Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
         ``resume`` goes on.
         """
-        about = {**self.config.as_dict(), "source_revision": source_revision()}
+        about = {**self.config.as_dict(), "source_revision": util.source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
         write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
         period_s = self.env.control_period_s
@@ -184,7 +177,7 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        save_torch(
+        util.save_torch(
             self.run_dir / CHECKPOINT_FILE,
             {
                 **self.config.label(self.episode),
@@ -206,7 +199,7 @@ class TrainingRun:
     def _load(self) -> None:
         path = self.run_dir / CHECKPOINT_FILE
         try:
-            self._restore(load_torch(path))
+            self._restore(util.load_torch(path))
         except (KeyError, TypeError, RuntimeError) as error:
             raise UserError(f"{path} does not fit this run") from error
 
@@ -247,7 +240,7 @@ class TrainingRun:
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
-        seed = episode_seed(config.seed, Purpose.TRAINING, self.episode)
+        seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.policy.start(observation, seed)
         self._drawn = np.zeros(self.env.action_space.shape)
