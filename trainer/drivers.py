@@ -134,9 +134,8 @@ def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
     """A run's actor: the best on the validation seeds, or the last one where none was validated.
 
-    Returns:
-        The network, and a dict with ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
-        knows a delay, ``known_latency``, too.
+    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
+    knows a delay, ``known_latency``, too.
     """
     there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
     path = next((path for path in there if path.is_file()), None)
