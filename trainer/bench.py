@@ -3,8 +3,6 @@
 Contenders take turns within one run, so that the machine's noise hits all of them alike.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

@@ -4,8 +4,6 @@ A name is the word expert, ``module:Class`` of one, ``constant:ACTION``, an expo
 training run or a human model.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -6,8 +6,6 @@ the car is, how fast it is and, at the end, how that came. `Adapted` makes that 
 environment; its ``outer`` and ``inner`` are the one place where actions are scaled.
 """
 
-from __future__ import annotations
-
 import copy
 import sys
 from collections.abc import Mapping

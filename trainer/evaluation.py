@@ -1,7 +1,5 @@
 """Drive test episodes with a policy and report how well it does."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections import deque

@@ -1,7 +1,5 @@
 """Options that several commands share; options and their meanings from a config's own fields."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import inspect

@@ -5,8 +5,6 @@ their end, and what made a result. torch takes two seconds to load, so it is imp
 function needs it: ``--help`` and the configs need none of it.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

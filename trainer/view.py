@@ -5,8 +5,6 @@ its own draws, because calls of rerun take time. A recording of a sitting does n
 the road: driving the same seed with the same actions again gives it back.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import queue

@@ -1,7 +1,5 @@
 """Run the paper's experiments and hold their results against its claims; or compare guidance."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path

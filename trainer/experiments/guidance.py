@@ -3,8 +3,6 @@
 One page and one figure beside the records, made of what is there.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from itertools import chain

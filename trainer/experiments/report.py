@@ -3,8 +3,6 @@
 A summary, a part for each experiment; figures 7 to 15, the ablation, the printed settings.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial

@@ -5,8 +5,6 @@ checkpoint and its actor lie in a directory of its own under ``runs``, which is 
 Whatever is killed goes on from its last checkpoint, to the same bits.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import multiprocessing

@@ -1,7 +1,5 @@
 """The human in the congestion: the scripted expert, and when a person would take the wheel."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

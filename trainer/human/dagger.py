@@ -3,8 +3,6 @@
 The person is the scripted expert, or a real one in recorded sittings.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The human beside the policy: watches each action, takes over, and hands control back."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol

@@ -3,8 +3,6 @@
 All three know the true state. The activation conditions are those that section V leaves open.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

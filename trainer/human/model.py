@@ -1,7 +1,5 @@
 """The DAgger human model of section V: imitates the human from what the human did so far."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -13,8 +13,6 @@ picture: ``embed``. It follows the ``torch.autocast`` around it, and is computed
 all that is asked of it; the rest is small, and always in single precision.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from itertools import chain, pairwise, repeat

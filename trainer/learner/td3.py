@@ -3,8 +3,6 @@
 ``reference.py`` is the same written plainly; this one computes nothing twice.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ A thread would share Python's lock with the person's loop: on a busy machine eve
 period began late.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

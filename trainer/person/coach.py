@@ -4,8 +4,6 @@ It draws nothing and drives nothing: the loop tells it of episodes and of the po
 window and the page show what it says.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque

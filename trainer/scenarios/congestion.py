@@ -1,7 +1,5 @@
 """``phil/Congestion-v0``: a car hemmed in by others in highway congestion (section VI)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

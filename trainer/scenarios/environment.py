@@ -1,7 +1,5 @@
 """What the scenarios share: the ego car, spaces, the two frames, and what a step reports."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """``phil/LeftTurn-v0``: an unprotected left turn from a side road into a main road (section VI)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from types import MappingProxyType

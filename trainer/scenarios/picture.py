@@ -5,8 +5,6 @@ mixed by the covered area: a car that moves by a tenth of a pixel changes the pi
 show speed (eq. 28 stacks two). A picture takes tens of microseconds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple

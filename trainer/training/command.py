@@ -1,7 +1,5 @@
 """Train a policy with human guidance: options, settings, and whether a run may begin or go on."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import importlib

@@ -1,7 +1,5 @@
 """What a training run is: everything that decides its result."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, field

@@ -13,8 +13,6 @@ only partially observed. `DelayAware` (``delay_known``) adds it to the observati
 delay constant by waiting.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence

@@ -5,8 +5,6 @@ an update on what was stored before is begun, the environment takes its step, th
 finished, and only then the step is stored.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Validation drives on seeds of their own, without help; the best actor is kept.
 """
 
-from __future__ import annotations
-
 import copy
 import csv
 import io

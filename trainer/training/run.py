@@ -1,7 +1,5 @@
 """One training run: algorithm 1 around an environment, a human and a learner."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ package needs no compiler to be installed; without one, callers take their torch
 ``PHIL_KERNEL=0`` in the environment does the same on purpose.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib
