@@ -87,7 +87,10 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         )
     with ProgressBar("human model", config.episodes) as bar:
         for episode in options.until(end_s, episodes):
-            bar.advance(episode.figures())
+            shown = {"demonstrations": str(episode.demonstrations), "loss": f"{episode.loss:.3f}"}
+            if episode.outcome:
+                shown |= {"interventions": str(episode.interventions), "outcome": episode.outcome}
+            bar.advance(shown)
     if bar.done < config.episodes:
         print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
     # In proportion: a part of the episodes has shown a part of the examples, in a part of the time.
@@ -110,13 +113,6 @@ class HumanEpisode(NamedTuple):
     demonstrations: int  # The human's steps so far
     interventions: int = 0
     outcome: str = ""  # Empty where nobody drove: the model learned from recordings
-
-    def figures(self) -> dict[str, str]:
-        """What the progress bar shows."""
-        shown = {"demonstrations": f"{self.demonstrations}", "loss": f"{self.loss:.3f}"}
-        if self.outcome:
-            shown |= {"interventions": f"{self.interventions}", "outcome": self.outcome}
-        return shown
 
 
 class HumanTraining:
