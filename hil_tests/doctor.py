@@ -40,7 +40,7 @@ ARRIVAL_S = 5.0
 _KERNEL = """
 import os, sys, torch
 from trainer.learner.kernel import load
-if load("trunk") is None:  # it has said why
+if load() is None:  # it has said why
     sys.exit("turned off by PHIL_KERNEL=0" if os.environ.get("PHIL_KERNEL") == "0" else 1)
 print("the learner's kernel is built and loaded")
 """

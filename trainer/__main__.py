@@ -1,7 +1,5 @@
 """``python -m trainer``: train, evaluate, export, and all else that a learner needs."""
 
-from __future__ import annotations
-
 import sys
 
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli

@@ -3,8 +3,6 @@
 Contenders take turns within one run, so that the machine's noise hits all of them alike.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os
@@ -15,12 +13,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from bridge.progress import ProgressBar
@@ -238,32 +235,28 @@ def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield from ((f"  of it {name}", f"{seconds[name]:.1f}") for name in PARTS)
 
 
-class Experience(NamedTuple):
-    """``n`` transitions of one long drive: real observations, invented rewards."""
-
-    frames: NDArray[np.uint8]  # [n + 1, 2, 45, 80]
-    actions: NDArray[np.float32]  # [n, 1]
-    rewards: NDArray[np.float32]  # [n]
-    human: NDArray[np.bool_]  # [n]; in a fifth of the steps, about as in a guided run
+Experience = list[tuple[Any, ...]]
+"""Transitions of one long drive: frames [2, 45, 80], action [1], reward, the frames that it led to,
+and whether the human acted. The observations are real, the rewards invented."""
 
 
 def gather(size: int, seed: int = 0) -> Experience:
-    """Drive the left turn at random for so many steps."""
-    random = np.random.default_rng(seed)
-    return Experience(
-        frames=real_observations("left_turn", size + 1, seed),
-        actions=random.uniform(-1, 1, (size, 1)).astype(np.float32),
-        rewards=random.normal(size=size).astype(np.float32),
-        human=random.random(size) < 0.2,
-    )
+    """Drive the left turn at random for so many steps; the human acts in a fifth, about as often
+    as in a guided run.
+    """
+    random, frames = np.random.default_rng(seed), real_observations("left_turn", size + 1, seed)
+    actions = random.uniform(-1, 1, (size, 1)).astype(np.float32)
+    rewards = random.normal(size=size).astype(np.float32)
+    human = random.random(size) < 0.2
+    return [*zip(frames[:-1], actions, rewards, frames[1:], human, strict=True)]
 
 
 def filled(experience: Experience) -> ReplayBuffer:
     """A buffer of ours that holds all of it."""
-    replay = ReplayBuffer(len(experience.actions))
-    replay.start_episode(experience.frames[0])
-    for action, reward, human, frames in zip(*experience[1:], experience.frames[1:], strict=True):
-        replay.add(action, float(reward), frames, False, bool(human))
+    replay = ReplayBuffer(len(experience))
+    replay.start_episode(experience[0][0])
+    for _, action, reward, after, human in experience:
+        replay.add(action, float(reward), after, False, bool(human))
     return replay
 
 
@@ -289,16 +282,14 @@ def make_sb3_model(experience: Experience) -> Any:
         def forward(self, images: torch.Tensor) -> torch.Tensor:
             return self.layers(images)
 
-    size = len(experience.actions)
     model = TD3(
         "CnnPolicy", gymnasium.make(SCENARIOS["left_turn"]), learning_rate=2e-4, gamma=0.95,
-        tau=1e-3, buffer_size=size, policy_delay=1, device="cpu", seed=0,
+        tau=1e-3, buffer_size=len(experience), policy_delay=1, device="cpu", seed=0,
         policy_kwargs={"features_extractor_class": Trunk, "net_arch": [256, 128, 64]},
     )  # fmt: skip
     model.set_logger(Logger(folder=None, output_formats=[]))
     assert model.replay_buffer is not None
-    for i in range(size):
-        before, after = experience.frames[i, None], experience.frames[i + 1, None]
-        action, reward = experience.actions[i, None], experience.rewards[i, None]
+    for *transition, _ in experience:
+        before, action, reward, after = (each[None] for each in transition)
         model.replay_buffer.add(before, after, action, reward, np.zeros(1), [{}])
     return model

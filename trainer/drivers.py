@@ -4,8 +4,6 @@ A name is the word expert, ``module:Class`` of one, ``constant:ACTION``, an expo
 training run or a human model.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -43,11 +41,6 @@ class TogetherDriver(Driver):
     def act(self, observation: Observation) -> Action:
         """The action, float32 [action size]."""
         return self.act_together(observation[None])[0]
-
-
-def network_driver(actor: Actor, aware: DelayAware | None = None) -> TogetherDriver:
-    """A policy network that drives: pi(s)."""
-    return TogetherDriver(actor.eval().act, aware)
 
 
 def constant_driver(action: float, size: int = 1) -> TogetherDriver:
@@ -127,7 +120,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
         )
     if about["scenario"] != env.scenario:
         raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
-    return network_driver(actor, _awareness(env, about)), policy_id
+    return TogetherDriver(actor.eval().act, _awareness(env, about)), policy_id
 
 
 def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
@@ -139,17 +132,13 @@ def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
     """A run's actor: the best on the validation seeds, or the last one where none was validated.
 
-    Returns:
-        The network, and a dict with ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
-        knows a delay, ``known_latency``, too.
+    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
+    knows a delay, ``known_latency``, too.
     """
-    for name in (BEST_FILE, CHECKPOINT_FILE):
-        if (run_dir / name).is_file():
-            return _read_actor(run_dir / name)
-    raise UserError(f"{run_dir} holds no training run ({BEST_FILE} or {CHECKPOINT_FILE})")
-
-
-def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
+    there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
+    path = next((path for path in there if path.is_file()), None)
+    if path is None:
+        raise UserError(f"{run_dir} holds no training run ({BEST_FILE} or {CHECKPOINT_FILE})")
     state = load_torch(path)
     try:
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]

@@ -6,8 +6,6 @@ the car is, how fast it is and, at the end, how that came. `Adapted` makes that 
 environment; its ``outer`` and ``inner`` are the one place where actions are scaled.
 """
 
-from __future__ import annotations
-
 import copy
 import sys
 from collections.abc import Mapping
@@ -159,11 +157,8 @@ def inner(action_range: tuple[Any, Any], action: Any) -> Action:
 class Adapted:
     """Any environment in the form of the two scenarios.
 
-    Args:
-        env: with Box or flat Dict observations, and a Box of actions with finite bounds.
-        name: what it was asked for by.
-
-    Raises UserError: what `bridge.environments.describe` refuses.
+    It has Box or flat Dict observations, and a Box of actions with finite bounds; ``name`` is what
+    it was asked for by. Raises UserError: what `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")

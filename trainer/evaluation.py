@@ -1,7 +1,5 @@
 """Drive test episodes with a policy and report how well it does."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections import deque
@@ -163,14 +161,13 @@ class Drive:
     """
 
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
-        self.env, self.seed, self.noise_std = env, seed, noise_std
+        self.env, self.noise_std = env, noise_std
         self.over = False
-        self.observation, self._info = env.reset(seed=seed)
+        self.result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        """What it comes to; whole once it is over."""
+        self.observation, _ = env.reset(seed=seed)
         self._noise = np.random.default_rng([seed, 1])
-        self._actions: list[list[float]] = []
-        self._rewards: list[float] = []
-        self._lateral: list[float] = []
-        self._longitudinal: list[float] = []
+        self._lateral, self._longitudinal = list[float](), list[float]()
 
     def step(self, action: Action) -> None:
         """One control period."""
@@ -178,25 +175,17 @@ class Drive:
             disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
         self.observation, reward, terminated, truncated, info = self.env.step(action)
-        self._actions.append([float(a) for a in action])
-        self._rewards.append(reward)
+        result, self.over = self.result, terminated or truncated
+        result.actions.append([float(a) for a in action])
+        result.reward += float(reward)
         self._lateral.append(abs(info["lateral_acceleration_mps2"]))
         self._longitudinal.append(abs(info["longitudinal_acceleration_mps2"]))
-        self._info, self.over = info, terminated or truncated
-
-    def result(self) -> EpisodeResult:
-        """What it came to, once it is over."""
-        return EpisodeResult(
-            seed=self.seed,
-            outcome=self._info["outcome"],
-            distance_m=float(self._info["distance_m"]),
-            reward=float(sum(self._rewards)),
-            time_s=len(self._actions) * self.env.control_period_s,
-            lateral_acceleration_mps2=float(np.mean(self._lateral)),
-            longitudinal_acceleration_mps2=float(np.mean(self._longitudinal)),
-            steps=len(self._actions),
-            actions=self._actions,
-        )
+        if self.over:
+            result.outcome, result.distance_m = info["outcome"], float(info["distance_m"])
+            result.steps = len(result.actions)
+            result.time_s = result.steps * self.env.control_period_s
+            result.lateral_acceleration_mps2 = float(np.mean(self._lateral))
+            result.longitudinal_acceleration_mps2 = float(np.mean(self._longitudinal))
 
 
 def drive_together(
@@ -204,13 +193,8 @@ def drive_together(
 ) -> list[EpisodeResult]:
     """Drive an episode for each seed, as many at once as there are environments.
 
-    A network answers many pictures much sooner than each alone; its last bits may differ.
-
-    Args:
-        envs: of one scenario and condition.
-        act: actions [n, action size] for observations [n, ...], of a driver without memory.
-        seeds: of the episodes.
-        condition: one of ``CONDITIONS``.
+    A network answers many pictures much sooner than each alone; its last bits may differ. ``act``
+    is that of a driver without memory: actions [n, action size] for observations [n, ...].
     """
     noise_std = CONDITIONS[condition].noise_std
     results: dict[int, EpisodeResult] = {}
@@ -223,7 +207,7 @@ def drive_together(
         for drive, action in zip(under_way, actions, strict=True):
             drive.step(action)
         for drive in (drive for drive in under_way if drive.over):
-            results[drive.seed] = drive.result()
+            results[drive.result.seed] = drive.result
             free.append(drive.env)
         under_way = [drive for drive in under_way if not drive.over]
     return [results[seed] for seed in seeds]
@@ -254,6 +238,6 @@ def drive_episodes(
         while not drive.over:
             seen = drive.observation
             drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
-        results.append(drive.result())
-        on_episode(results[-1])
+        results.append(drive.result)
+        on_episode(drive.result)
     return results

@@ -1,7 +1,5 @@
 """Options that several commands share; options and their meanings from a config's own fields."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import inspect
@@ -68,10 +66,9 @@ def add_time_limit(parser: Group, what: str) -> None:
     parser.add_argument("--max-minutes", type=positive_number, metavar="MIN", help=text)
 
 
-def deadline_s(arguments: argparse.Namespace, clock: Callable[[], float] = time.monotonic) -> float:
+def deadline_s(minutes: float | None, clock: Callable[[], float] = time.monotonic) -> float:
     """When the minutes from now are over, as of ``clock``; infinity without a limit."""
-    limit = arguments.max_minutes
-    return math.inf if limit is None else clock() + 60.0 * limit
+    return math.inf if minutes is None else clock() + 60.0 * minutes
 
 
 def until(end_s: float, parts: Iterable[Part]) -> Iterator[Part]:

@@ -1,7 +1,5 @@
 """Pictures as files: learning curves (``plot``), and a moment of a drive (``picture``)."""
 
-from __future__ import annotations
-
 import argparse
 import io
 from pathlib import Path

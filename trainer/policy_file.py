@@ -102,11 +102,8 @@ def export_policy(
 ) -> Export:
     """Convert, describe, check and compare.
 
-    Args:
-        actor: the network.
-        label: ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run.
-        training: the run's whole config, for the manifest.
-        envelope: the networks in which it may drive, for the manifest.
+    ``label`` has ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run; the manifest
+    gets its whole config (``training``) and the networks in which it may drive (``envelope``).
 
     Raises UserError: the file would not do what the network does.
     """

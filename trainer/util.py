@@ -5,8 +5,6 @@ their end, and what made a result. torch takes two seconds to load, so it is imp
 function needs it: ``--help`` and the configs need none of it.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -18,8 +16,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -67,10 +66,17 @@ def random_stream(run_seed: int, purpose: Purpose) -> np.random.Generator:
     return np.random.default_rng([run_seed, purpose])
 
 
-def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
-    """Raise UserError unless every named field of ``config`` is finite and within its range."""
-    for name, (low, high) in ranges.items():
-        value = getattr(config, name)
+def check_ranges(config: Any, ranges: Mapping[Range, Sequence[str]]) -> None:
+    """Raise UserError unless every number of a dataclass is finite and within its range.
+
+    That is at least 0, but for the fields that ``ranges`` names.
+    """
+    named = {name: limits for limits, names in ranges.items() for name in names}
+    for field in fields(config):
+        if isinstance(field.default, bool) or not isinstance(field.default, int | float):
+            continue
+        name, value = field.name, getattr(config, field.name)
+        low, high = named.get(name, FROM_ZERO)
         if not (math.isfinite(value) and low <= value <= high):
             raise UserError(f"{name} = {value} is out of range: {_text(low, high)}")
 

@@ -5,8 +5,6 @@ its own draws, because calls of rerun take time. A recording of a sitting does n
 the road: driving the same seed with the same actions again gives it back.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import queue
@@ -82,23 +80,27 @@ RECENT = (
     Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s, the last 20 s"),
 )
+MEASURED = {
+    "success/validation": (draw.ORANGE, "validation_success"),
+    "loss/critic": (draw.PURPLE, "critic_loss"),
+    "loss/policy": (POLICY, "policy_loss"),
+    "loss/cloning": (HUMAN, "cloning_loss"),
+    "priority/human": (HUMAN, "human_priority"),
+    "priority/policy": (POLICY, "policy_priority"),
+    "cost/human_s": (HUMAN, "total_human_s"),
+    "cost/takeovers": (draw.ORANGE, "total_takeovers"),
+    "cost/failures": (draw.PURPLE, "total_failures"),
+}
+"""Line -> its colour, and the field of an episode's metrics."""
 LINES = {
     "return/episode": draw.GREY,
     "return/mean_of_20": draw.BLUE,
     "success/mean_of_20": draw.BLUE,
-    "success/validation": draw.ORANGE,
-    "loss/critic": draw.PURPLE,
-    "loss/policy": POLICY,
-    "loss/cloning": HUMAN,
-    "priority/human": HUMAN,
-    "priority/policy": POLICY,
     "human/share": HUMAN,
-    "cost/human_s": HUMAN,
-    "cost/takeovers": draw.ORANGE,
-    "cost/failures": draw.PURPLE,
     "action/policy": POLICY,
     "action/applied": APPLIED,
     "speed/ego": draw.BLUE,
+    **{path: colour for path, (colour, _) in MEASURED.items()},
 }
 DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
@@ -407,16 +409,8 @@ class TrainingLog:
             "return/episode": metrics.episode_return,
             "return/mean_of_20": float(np.mean(self._returns)),
             "success/mean_of_20": float(np.mean(self._successes)),
-            "success/validation": metrics.validation_success,
-            "loss/critic": metrics.critic_loss,
-            "loss/policy": metrics.policy_loss,
-            "loss/cloning": metrics.cloning_loss,
-            "priority/human": metrics.human_priority,
-            "priority/policy": metrics.policy_priority,
             "human/share": metrics.human_steps / metrics.steps,
-            "cost/human_s": metrics.total_human_s,
-            "cost/takeovers": metrics.total_takeovers,
-            "cost/failures": metrics.total_failures,
+            **{path: getattr(metrics, name) for path, (_, name) in MEASURED.items()},
         }.items():
             if not math.isnan(value):
                 self._recording.log(path, rr.Scalars(value))

@@ -62,8 +62,7 @@ UNITS = {
 }
 """Quantity -> factor, digits and unit as it is shown."""
 SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
-SAME_LEVEL = 0.05
-"""What is on one level differs by no more than this share, or by so much success."""
+SAME_LEVEL = 0.05  # What is on one level differs by no more than this share, or by so much success
 NEARLY = 0.02
 """Share of the distance that poor guidance may change where the paper says nearly 50:50."""
 RESAMPLES = 2000
@@ -75,11 +74,9 @@ too."""
 class Claim(NamedTuple):
     """A row: what the paper says, and the comparisons by which it is judged."""
 
-    source: str
-    """Experiment, and figure or table of the paper."""
+    source: str  # Experiment, and figure or table of the paper
     text: str
-    paper: str
-    """Its number or word."""
+    paper: str  # Its number or word
     test: Callable[[Results, str, Claim], Iterator[Comparison]]
     """Makes the comparisons, with curves in training or of the policy alone. All must hold."""
     places: Sequence[Place]
@@ -96,32 +93,22 @@ class Comparison(NamedTuple):
 
     text: str
     holds: Holds
-    margin: float
-    """How far on the good side it is; nan where nothing is measured."""
-    complete: bool
-    """Whether all trainings are there."""
+    margin: float  # How far on the good side it is; nan where nothing is measured
+    complete: bool  # Whether all trainings are there
 
 
-class Finding(NamedTuple):
-    """What was measured about a claim."""
-
-    holds: Holds
-    ours: str
-    """The worst of the comparisons that decide, in words."""
-
-
-def judge(results: Results, claim: Claim, kind: str) -> Finding:
-    """Hold results against a claim; it is undecided where trainings are missing."""
+def judge(results: Results, claim: Claim, kind: str) -> Comparison:
+    """The worst of a claim's comparisons that decide; undecided where trainings are missing."""
     made = list(claim.test(results, kind, claim))
     holds = all_of([one.holds for one in made])
     measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
     if not measured:
-        return Finding("undecided", "not measured")
+        return Comparison("not measured", "undecided", float("nan"), False)
     worst = min(measured, key=lambda one: one.margin)
-    return Finding(holds if all(one.complete for one in made) else "undecided", worst.text)
+    return worst if all(one.complete for one in made) else worst._replace(holds="undecided")
 
 
-def judge_both(results: Results, claim: Claim) -> tuple[Finding, Finding | None]:
+def judge_both(results: Results, claim: Claim) -> tuple[Comparison, Comparison | None]:
     """As the paper does, with training curves; and of the policy alone, where it has curves."""
     alone = judge(results, claim, ALONE) if claim.source in OF_CURVES else None
     return judge(results, claim, TRAINING), alone
@@ -163,12 +150,8 @@ def sooner(
 ) -> Iterator[Comparison]:
     """Whether each of ours gets more than so many times as soon where each of the others ends.
 
-    Args:
-        results: of the trainings.
-        kind: of the curves.
-        claim: with the times as its bar; others must be named.
-        common: the level is the lower end of the two, so that both can reach it.
-        best: only the best of the others counts.
+    The claim's bar is the times, and its others must be named. ``common``: the level is the lower
+    end of the two, so that both can reach it; ``best``: only the best of the others counts.
     """
     for place, quantity in product(claim.places, claim.quantities):
 

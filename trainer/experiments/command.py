@@ -1,27 +1,14 @@
 """Run the paper's experiments and hold their results against its claims; or compare guidance."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.util import UserError
+from trainer.experiments import plan
 from trainer.experiments.guidance import write_guidance, write_typical
-from trainer.experiments.plan import (
-    DEFAULT_SEEDS,
-    EXPERIMENTS,
-    FOREIGN,
-    GUIDANCE,
-    GUIDANCE_PLAN,
-    PLAN,
-    QUICK,
-    QUICK_GUIDANCE,
-    SCENARIOS,
-    obstacle,
-    units_of,
-)
+from trainer.experiments.plan import EXPERIMENTS, FOREIGN, GUIDANCE
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
 from trainer.options import add_time_limit, deadline_s
@@ -55,12 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--seeds",
         type=whole_number(1, MOST_SEEDS),
-        default=DEFAULT_SEEDS,
+        default=plan.DEFAULT_SEEDS,
         help="trainings of each algorithm in each setting",
     )
     what.add_argument(
         "--scenario",
-        choices=[*SCENARIOS, *FOREIGN],
+        choices=[*plan.SCENARIOS, *FOREIGN],
         help=f"compute in this one only (default: in all; {', '.join(FOREIGN)}: of {GUIDANCE})",
     )
     what.add_argument(
@@ -107,12 +94,12 @@ def run(arguments: argparse.Namespace) -> int:
         write_typical(results, Path(arguments.humans), arguments.seeds, TYPICAL_FILE)
         print(f"wrote {TYPICAL_FILE}")
         return 0
-    plan, quick, place = PLAN, QUICK, "paper"
+    work, quick, place = plan.PLAN, plan.QUICK, "paper"
     if names == [GUIDANCE]:
-        plan, quick, place = GUIDANCE_PLAN, QUICK_GUIDANCE, GUIDANCE
+        work, quick, place = plan.GUIDANCE_PLAN, plan.QUICK_GUIDANCE, GUIDANCE
     results, runs = Path(arguments.results or f"results/{place}"), arguments.runs or f"runs/{place}"
     runs, humans = Path(runs), Path(arguments.humans)
-    store = Store(plan, results, runs, humans)
+    store = Store(work, results, runs, humans)
     if arguments.quick:
         store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
     if names == [STATUS]:
@@ -121,15 +108,16 @@ def run(arguments: argparse.Namespace) -> int:
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")
         return 0
-    wanted = units_of(names, arguments.seeds, arguments.scenario)
+    wanted = plan.units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
-    possible = [unit for unit in wanted if not obstacle(unit, humans)]
-    reasons = {reason for unit in wanted if (reason := obstacle(unit, humans))}
+    possible = [unit for unit in wanted if not plan.obstacle(unit, humans)]
+    reasons = {reason for unit in wanted if (reason := plan.obstacle(unit, humans))}
     if reasons:
         say(f"{len(wanted) - len(possible)} units left out: {'; '.join(sorted(reasons))}")
     done, _ = store.find(possible)
-    stop_at_s = deadline_s(arguments, time.time)  # the clock that the processes have, too
+    # The clock that the processes have, too.
+    stop_at_s = deadline_s(arguments.max_minutes, time.time)
     left = [Task(unit, store, stop_at_s) for unit in possible if unit not in done]
     if left and arguments.ray:
         ends = run_on_ray(left, arguments.ray)

@@ -15,25 +15,14 @@ from scipy import stats
 from bridge.report import GOAL, failed
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
-from trainer.experiments.plan import (
-    FULL_PATH_M,
-    LABELS,
-    NORMAL,
-    ONE_FRAME,
-    PAPER_TESTS,
-    RANDOM,
-    SCENARIOS,
-    TESTED_ONLY,
-    Unit,
-    units_of,
-)
+from trainer.experiments import plan
+from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit
 from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
 
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
 CONFIDENCE = 0.95
-TAIL = 0.5 * (1.0 - CONFIDENCE)
-"""Outside each end of an interval."""
+TAIL = 0.5 * (1.0 - CONFIDENCE)  # Outside each end of an interval
 
 
 class Estimate(NamedTuple):
@@ -42,8 +31,7 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
-    size: int
-    """Values behind it."""
+    size: int  # Values behind it
 
     def times(self, factor: float) -> Estimate:
         """The number and its interval multiplied."""
@@ -57,11 +45,11 @@ class Estimate(NamedTuple):
         held = self._replace(low=max(self.low, 0.0), high=min(self.high, 1.0))
         return held.times(100.0).text(1)
 
-    def text(self, digits: int = 2, unit: str = "") -> str:
+    def text(self, digits: int = 2) -> str:
         """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
         if not self.size:
             return "–"
-        shown = f"{self.value:.{digits}f}{unit}"
+        shown = f"{self.value:.{digits}f}"
         if np.isinf([self.low, self.high]).all():
             return shown
         low, high = (f"{end:.{digits}f}".replace("inf", "∞") for end in (self.low, self.high))
@@ -121,12 +109,10 @@ def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
     return Estimate(point, float(ends[0]), float(ends[1]), size)
 
 
-BySeed = dict[int, float]
-"""Training seed -> a number of that training."""
+BySeed = dict[int, float]  # Training seed -> a number of that training
 GRID_STEPS = 500
 """Curves are drawn and compared at multiples of it: the distance between two validations."""
-END_STEPS = 1_500
-"""What ended within so many steps of the last one is the end of a training."""
+END_STEPS = 1_500  # What ended within so many steps of the last one is the end of a training
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
@@ -152,7 +138,7 @@ class Line(NamedTuple):
     def name(self) -> str:
         """The algorithm in words, with its setting where that is not the normal one."""
         setting = "" if self.setting == NORMAL else f" ({words(self.setting)})"
-        return LABELS[self.algorithm] + setting
+        return plan.LABELS[self.algorithm] + setting
 
 
 class Scene(NamedTuple):
@@ -168,10 +154,8 @@ class Scene(NamedTuple):
         return letter if self.condition == "nominal" else f"{letter}-{self.condition[0].upper()}"
 
 
-Place = str | Scene
-"""A scenario, for its trainings, or a scene of the tests."""
-EVERYWHERE = "mean of the scenes"
-"""A place, too: the paper's six scenes together."""
+Place = str | Scene  # A scenario, for its trainings, or a scene of the tests
+EVERYWHERE = "mean of the scenes"  # A place, too: the paper's six scenes together
 
 
 def words(place: Place) -> str:
@@ -297,7 +281,7 @@ class Result:
         return 1e4 * self.record["computed"]["training_s"] / self.record["totals"]["steps"]
 
     def _cut(self, distances_m: Numbers) -> Numbers:
-        return np.minimum(distances_m, FULL_PATH_M.get(self.unit.scenario, np.inf))
+        return np.minimum(distances_m, plan.FULL_PATH_M.get(self.unit.scenario, np.inf))
 
 
 @dataclass(frozen=True)
@@ -305,10 +289,8 @@ class Results:
     """The results of a plan."""
 
     found: Mapping[Unit, Result]
-    seeds: int
-    """How many are wanted."""
-    stale: Collection[Unit] = ()
-    """Units whose record is of other settings, and left out."""
+    seeds: int  # How many are wanted
+    stale: Collection[Unit] = ()  # Units whose record is of other settings, and left out
 
     def of(self, scenario: str, line: Line) -> list[Result]:
         """What there is of a line in a scenario, by seed; what is only tested has seed 0."""
@@ -378,7 +360,7 @@ class Results:
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
-        count = PAPER_TESTS if paper else None
+        count = plan.PAPER_TESTS if paper else None
         parts = [r.drives(scene.condition, quantity)[:count] for r in self.of(scene.scenario, line)]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -409,10 +391,9 @@ class Results:
 def load(store: Store, seeds: int, name: str = "all") -> Results:
     """What there is of an experiment, or of all the paper's.
 
-    Raises:
-        UserError: a record lacks what this project writes.
+    Raises UserError: a record lacks what this project writes.
     """
-    found, stale = store.find(units_of([name], seeds))
+    found, stale = store.find(plan.units_of([name], seeds))
     for unit, record in found.items():
         _check(unit, record, f"{store.records_file(unit.scenario)}: the record of {unit}")
     return Results({unit: Result(unit, found[unit]) for unit in found}, seeds, stale)

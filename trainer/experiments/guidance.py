@@ -3,8 +3,6 @@
 One page and one figure beside the records, made of what is there.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from itertools import chain
@@ -30,8 +28,7 @@ TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 def write_guidance(store: Store, seeds: int) -> Path:
     """Write the page and its figure; the page's path.
 
-    Raises:
-        UserError: there are no records at all.
+    Raises UserError: there are no records at all.
     """
     results = data.load(store, seeds, plan.GUIDANCE)
     if not results.found:
@@ -45,8 +42,7 @@ def write_guidance(store: Store, seeds: int) -> Path:
 def write_typical(results: Path, humans: Path, seeds: int, path: Path) -> None:
     """Write the curves that a person's coach shows, of the records in both directories of results.
 
-    Raises:
-        UserError: there is no record to make a curve of.
+    Raises UserError: there is no record to make a curve of.
     """
     curves: dict[str, dict[str, Any]] = {}
     for name, work, units, human in (  # The good human goes before the paper's model of it.

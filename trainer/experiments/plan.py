@@ -21,8 +21,7 @@ from trainer.learner.config import ALGORITHMS, Algorithm, starting_from
 from trainer.training.config import BIASED as BIASED_GUIDANCE
 from trainer.training.config import PRESETS, RunConfig
 
-FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
-"""Scenario -> distance from start to goal."""
+FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}  # Scenario -> distance from start to goal
 SCENARIOS = tuple(FULL_PATH_M)
 
 FOREIGN = {
@@ -33,8 +32,7 @@ FOREIGN = {
 EXPERT, HUMAN_MODEL, CONSTANT = "expert", "human_model", "constant"
 """In an algorithm's place: the scripted expert or the human model alone, or the best constant
 action. They are tested only, once in each scenario."""
-TESTED_ONLY = (HUMAN_MODEL, CONSTANT)
-"""Those in the paper's experiments."""
+TESTED_ONLY = (HUMAN_MODEL, CONSTANT)  # Those in the paper's experiments
 
 
 @dataclass(frozen=True)
@@ -44,16 +42,13 @@ class Setting:
     meaning: str
     run: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the run's config that it changes."""
-    preset: str = "ours"
-    """Where its settings start from."""
-    learner: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters that it changes."""
+    preset: str = "ours"  # Where its settings start from
+    learner: Mapping[str, Any] = field(default_factory=dict)  # Hyper-parameters that it changes
     human: str = ""  # Who guides: the scripted ``expert``; empty: a human model
 
 
 NORMAL, ONE_FRAME, RANDOM, BIASED, PRINTED = "normal", "one_frame", "random", "biased", "printed"
-POOR_SHARE = 1.0 / 3.0
-"""Share of the human's actions that poor guidance replaces (section VII-E)."""
+POOR_SHARE = 1.0 / 3.0  # Share of the human's actions that poor guidance replaces (section VII-E)
 GOOD, MODEL = "good", "model"
 IMPERFECT: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "third_random": ("a third of the actions is random", {"poor_guidance_share": POOR_SHARE}),
@@ -108,8 +103,7 @@ LABELS = {
     HUMAN_MODEL: "human model",
     CONSTANT: "best constant action",
 }
-FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")
-"""What the paper compares throughout."""
+FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")  # What the paper compares throughout
 GUIDED = FOUR[:3]
 PARTS = ("phil_without_cloning", "phil_without_shaping")
 PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
@@ -184,18 +178,15 @@ class Plan:
     """Scenario -> environment steps of a training, the same for every algorithm."""
     evaluate_every_steps: int = 500
     """Environment steps between two validations; the best validated actor is tested."""
-    evaluation_runs: int = 50
-    """Drives of a validation."""
+    evaluation_runs: int = 50  # Drives of a validation
     test_runs: int = 250
     """Test drives in each scene, with the seeds 0, 1, ...: the paper's 50 first, then others."""
-    together: int = 50
-    """Test drives side by side."""
+    together: int = 50  # Test drives side by side
     checkpoint_every: int = 5
     """Episodes between two checkpoints: what a kill costs, not what a run gives."""
     search_runs: int = 100
     """Validation drives of each constant action in the search for the best one."""
-    search_points: int = 21
-    """Actions on each of the two grids of that search."""
+    search_points: int = 21  # Actions on each of the two grids of that search
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
     slow: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -226,8 +217,7 @@ GUIDANCE_PLAN = Plan(
     slow={"racetrack": {"evaluate_every_steps": 500, "evaluation_runs": 10, "test_runs": 20}},
 )
 QUICK_GUIDANCE = replace(QUICK, steps=dict.fromkeys((*SCENARIOS, *FOREIGN), 250))
-UNLIMITED_EPISODES = 10**6
-"""So many that steps decide."""
+UNLIMITED_EPISODES = 10**6  # So many that steps decide
 PAPER_TESTS = 50
 """Of the test drives in a scene, the first so many have the paper's seeds (section VII-D)."""
 

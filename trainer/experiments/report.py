@@ -3,8 +3,6 @@
 A summary, a part for each experiment; figures 7 to 15, the ablation, the printed settings.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -18,43 +16,10 @@ from matplotlib.patches import Patch
 from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
-from trainer.experiments.claims import CLAIMS, Claim, Finding, first_reached, judge_both
-from trainer.experiments.data import (
-    ALONE,
-    ARRIVED_ONLY,
-    DISTANCE,
-    END_STEPS,
-    LATERAL,
-    LONGITUDINAL,
-    PAPER_SCENES,
-    REWARD,
-    SCENES,
-    SECONDS,
-    SUCCESS,
-    TIME_S,
-    TRAINING,
-    Line,
-    Place,
-    Result,
-    Results,
-    Scene,
-    load,
-    mean_estimate,
-    words,
-)
-from trainer.experiments.plan import (
-    CONSTANT,
-    EXPERIMENTS,
-    FOUR,
-    FULL_PATH_M,
-    HUMAN_MODEL,
-    LINES,
-    NORMAL,
-    PAPER_TESTS,
-    SCENARIOS,
-    SETTINGS,
-    units_of,
-)
+from trainer.experiments import data, plan
+from trainer.experiments.claims import CLAIMS, Claim, Comparison, first_reached, judge_both
+from trainer.experiments.data import Line, Place, Result, Results, Scene, words
+from trainer.experiments.plan import EXPERIMENTS, HUMAN_MODEL, NORMAL, PAPER_TESTS, SCENARIOS
 from trainer.experiments.run import Store
 from trainer.pictures import write_figure
 from trainer.training import metrics
@@ -75,21 +40,20 @@ PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 """Tables I and II of the paper: surviving distance, m, by scene."""
-PAPER_S = dict(zip(FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
+PAPER_S = dict(zip(plan.FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
 """The paper's table of time efficiency: seconds for 10,000 steps."""
-EVERY_LINE = [Line(name, setting) for _, setting, names in LINES for name in names]
+EVERY_LINE = [Line(name, setting) for _, setting, names in plan.LINES for name in names]
 """Every line that is computed, in the order of work."""
-Judged = tuple[Claim, Finding, Finding | None]
+Judged = tuple[Claim, Comparison, Comparison | None]
 """A claim with what was measured, and with the same of the policy alone."""
 
 
 def write_report(store: Store, seeds: int) -> Path:
     """Draw all figures and write the page beside the records; returns its path.
 
-    Raises:
-        UserError: there are no records at all.
+    Raises UserError: there are no records at all.
     """
-    results = load(store, seeds)
+    results = data.load(store, seeds)
     if not results.found:
         raise UserError(f"there are no results to report in {store.results}")
     for name, draw in FIGURES.items():
@@ -112,7 +76,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         elif name in MORE:
             yield from MORE[name](results)
         rows = [
-            (claim.text, claim.paper, f.ours, f.holds, *((a.ours, a.holds) if a else ("", "")))
+            (claim.text, claim.paper, f.text, f.holds, *((a.text, a.holds) if a else ("", "")))
             for claim, f, a in judged
             if claim.source == name
         ]
@@ -122,7 +86,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
 
 
 def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:
-    wanted = len(units_of(["all"], results.seeds))
+    wanted = len(plan.units_of(["all"], results.seeds))
     steps = " and ".join(f"{store.plan.steps[name]:,} in the {words(name)}" for name in SCENARIOS)
     yield from (
         "# The paper's experiments, run again",
@@ -158,8 +122,8 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
     yield from markdown_table(
         ("setting", "meaning", "algorithms"),
         (
-            (name, SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
-            for _, name, algorithms in LINES
+            (name, plan.SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
+            for _, name, algorithms in plan.LINES
             if HUMAN_MODEL not in algorithms
         ),
     )
@@ -177,7 +141,7 @@ def _times(results: Results) -> Iterator[str]:
         "machine with others; `python -m trainer bench` measures the time of a step undisturbed."
     )
     yield ""
-    ours = (results.estimate(SCENARIOS[0], Line(name), SECONDS).text(0) for name in PAPER_S)
+    ours = (results.estimate(SCENARIOS[0], Line(name), data.SECONDS).text(0) for name in PAPER_S)
     paper = (f"{seconds:.0f}" for seconds in PAPER_S.values())
     names = (Line(name).name for name in PAPER_S)
     yield from markdown_table(("", *names), [("the paper", *paper), ("ours", *ours)])
@@ -193,13 +157,13 @@ def _tests(results: Results) -> Iterator[str]:
     rows = []
     for line in EVERY_LINE:
         cells = []
-        for scene in SCENES:
-            share = results.estimate(scene, line, SUCCESS).as_share()
-            paper = results.pooled(scene, line, SUCCESS, paper=True)
+        for scene in data.SCENES:
+            share = results.estimate(scene, line, data.SUCCESS).as_share()
+            paper = results.pooled(scene, line, data.SUCCESS, paper=True)
             cells.append(f"{share} ({100 * paper.mean():.0f})" if len(paper) else "–")
         if set(cells) != {"–"}:
             rows.append((line.name, *cells))
-    yield from markdown_table(("", *(scene.label for scene in SCENES)), rows)
+    yield from markdown_table(("", *(scene.label for scene in data.SCENES)), rows)
 
 
 def _distances(results: Results, name: str) -> Iterator[str]:
@@ -210,12 +174,12 @@ def _distances(results: Results, name: str) -> Iterator[str]:
         "21 and 80 m; the paper counts what was driven beyond it."
     )
     yield ""
-    scenes = [scene for scene in PAPER_SCENES if scene.scenario in EXPERIMENTS[name].scenarios]
+    scenes = [scene for scene in data.PAPER_SCENES if scene.scenario in EXPERIMENTS[name].scenarios]
     rows = []
     for algorithm, numbers in PAPER_TABLES[name].items():
         cells = []
         for scene, number in zip(scenes, numbers, strict=True):
-            ours = results.pooled(scene, Line(algorithm), DISTANCE, paper=True)
+            ours = results.pooled(scene, Line(algorithm), data.DISTANCE, paper=True)
             shown = f"{ours.mean():.2f}±{ours.std():.2f}" if len(ours) else "–"
             cells.append(f"{shown} ({number})")
         rows.append((Line(algorithm).name, *cells))
@@ -224,7 +188,7 @@ def _distances(results: Results, name: str) -> Iterator[str]:
 
 def _floor(results: Results) -> Iterator[str]:
     for scenario in SCENARIOS:
-        for result in results.of(scenario, Line(CONSTANT)):
+        for result in results.of(scenario, Line(plan.CONSTANT)):
             action, tried = result.record["action"], len(result.record["success_of"])
             yield f"Best in the {words(scenario)}: {action:g}, of {tried} on validation drives."
             yield ""
@@ -235,7 +199,8 @@ def _cost(results: Results) -> Iterator[str]:
     yield (
         f"Means of the seeds. Steps until the policy alone reaches {LEARNED:.0%} of its validation "
         f"drives, and the seconds that the human drove until it reached {LEARNED:.0%} and "
-        f"{WELL:.0%}, of those seeds that do; late: validations of the last {END_STEPS:,} steps."
+        f"{WELL:.0%}, of those seeds that do; late: validations of the last "
+        f"{data.END_STEPS:,} steps."
     )
     yield ""
     rows = []
@@ -243,7 +208,7 @@ def _cost(results: Results) -> Iterator[str]:
         found = [result for result in results.of(scenario, line) if result.unit.trained]
         if not found:
             continue
-        steps = [first_reached(r.grid, r.curve(ALONE, SUCCESS), LEARNED) for r in found]
+        steps = [first_reached(r.grid, r.curve(data.ALONE, data.SUCCESS), LEARNED) for r in found]
         there = [step for step in steps if np.isfinite(step)]
         rows.append(
             (
@@ -257,27 +222,18 @@ def _cost(results: Results) -> Iterator[str]:
                 *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
             )
         )
-    learned = f"steps to {LEARNED:.0%}"
-    late = ("late below best, points", "at most")
-    seconds = [f"human s to {level:.0%}" for level in (LEARNED, WELL)]
     head = (
-        "",
-        "scenario",
-        learned,
-        "seeds",
-        *seconds,
-        *late,
-        "human steps",
-        "take-overs",
-        "failures",
-    )
+        "", "scenario", f"steps to {LEARNED:.0%}", "seeds",
+        *(f"human s to {level:.0%}" for level in (LEARNED, WELL)), "late below best, points",
+        "at most", "human steps", "take-overs", "failures",
+    )  # fmt: skip
     yield from markdown_table(head, rows)
 
 
 def human_seconds(found: Sequence[Result], level: float) -> str:
     """How long the human drove until a level, of those that reach it; in brackets how many do."""
     there = [cost.human_s for result in found if (cost := result.until(level))]
-    return f"{mean_estimate(there).text(0)} ({len(there)})" if there else "–"
+    return f"{data.mean_estimate(there).text(0)} ({len(there)})" if there else "–"
 
 
 LEARNED, WELL = metrics.LEARNED
@@ -289,14 +245,19 @@ MORE = {"fig9": _tests, "time": _times, "floor": _floor, "cost": _cost}
 COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", HUMAN_MODEL: "C1"}
 OTHERS = ("C4", "C5", "C6", "C8", "C9", "black")
 """For algorithms without a colour of their own, by their place in the figure."""
-CURVES = ((TRAINING, REWARD), (TRAINING, DISTANCE), (ALONE, SUCCESS), (ALONE, DISTANCE))
+CURVES = (
+    (data.TRAINING, data.REWARD),
+    (data.TRAINING, data.DISTANCE),
+    (data.ALONE, data.SUCCESS),
+    (data.ALONE, data.DISTANCE),
+)
 TITLES = {
-    REWARD: "reward",
-    DISTANCE: "surviving distance, m",
-    SUCCESS: "success",
-    TIME_S: "time to the goal, s",
-    LATERAL: "mean |lateral acceleration|, m/s²",
-    LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
+    data.REWARD: "reward",
+    data.DISTANCE: "surviving distance, m",
+    data.SUCCESS: "success",
+    data.TIME_S: "time to the goal, s",
+    data.LATERAL: "mean |lateral acceleration|, m/s²",
+    data.LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
 }
 HATCHES = {"one_frame": "//", "random": "//", "biased": "xx"}
 SCENE_KEY = "L: left turn, C: congestion, -N: command noise, -V: variant, -D: dense"
@@ -325,7 +286,7 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
         panel.set_title(f"{words(scenario)}: {TITLES[metric]}, {kind}", fontsize=10)
         for place, line in enumerate(lines):
             found = results.of(scenario, line)
-            if not found or (metric == REWARD and line.setting == "printed"):
+            if not found or (metric == data.REWARD and line.setting == "printed"):
                 continue  # the printed reward is on another scale
             curves, grid = np.stack([result.curve(kind, metric) for result in found]), found[0].grid
             mean, spread = curves.mean(axis=0), curves.std(axis=0)
@@ -333,8 +294,8 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
             panel.plot(grid, mean, **look, lw=1.8, label=f"{line.name}, seeds: {len(found)}")
             band = mean - spread, mean + spread
             panel.fill_between(grid, *band, color=look["color"], alpha=0.15, lw=0)
-        if metric != REWARD:
-            best = 1.0 if metric == SUCCESS else FULL_PATH_M[scenario]
+        if metric != data.REWARD:
+            best = 1.0 if metric == data.SUCCESS else plan.FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")
             panel.set_ylim(0.0, 1.05 * best)
         panel.grid(alpha=0.3)
@@ -362,8 +323,8 @@ def draw_groups(
         for (group, place), (side, line) in product(enumerate(places), enumerate(lines)):
             x = group + (side - 0.5 * (len(lines) - 1)) * width
             look = {"fc": colour(line, side), "hatch": HATCHES.get(line.setting), "alpha": 0.7}
-            if isinstance(place, Scene) and quantity in ARRIVED_ONLY:
-                arrived = results.pooled(place, line, SUCCESS) > 0.0
+            if isinstance(place, Scene) and quantity in data.ARRIVED_ONLY:
+                arrived = results.pooled(place, line, data.SUCCESS) > 0.0
                 values = results.pooled(place, line, quantity)[arrived]
                 if len(values):
                     axis.boxplot(
@@ -390,11 +351,11 @@ def draw_groups(
     return figure
 
 
-def _scenes(*quantities: Sequence[str], of: Iterable[Scene] = SCENES) -> list[Panel]:
+def _scenes(*quantities: Sequence[str], of: Iterable[Scene] = data.SCENES) -> list[Panel]:
     """A panel for each scenario's scenes, with a quantity for each scenario."""
     scenes = list(of)
     return [
-        ([scene for scene in scenes if scene.scenario == scenario], quantity, ALONE)
+        ([scene for scene in scenes if scene.scenario == scenario], quantity, data.ALONE)
         for pair in quantities
         for scenario, quantity in zip(SCENARIOS, pair, strict=True)
     ]
@@ -406,10 +367,10 @@ ENDS: list[Panel] = [
 """Where the curves end."""
 GROUPS: Mapping[str, tuple[list[Panel], int]] = {
     "fig8": (ENDS, 2),
-    "fig9": (_scenes((SUCCESS, SUCCESS), (DISTANCE, DISTANCE)), 2),
-    "fig10": (_scenes((TIME_S, LATERAL)), 1),
-    "fig14": (_scenes((DISTANCE, DISTANCE), of=PAPER_SCENES), 1),
-    "fig15": (_scenes((LONGITUDINAL, LATERAL), of=PAPER_SCENES), 1),
+    "fig9": (_scenes((data.SUCCESS, data.SUCCESS), (data.DISTANCE, data.DISTANCE)), 2),
+    "fig10": (_scenes((data.TIME_S, data.LATERAL)), 1),
+    "fig14": (_scenes((data.DISTANCE, data.DISTANCE), of=data.PAPER_SCENES), 1),
+    "fig15": (_scenes((data.LONGITUDINAL, data.LATERAL), of=data.PAPER_SCENES), 1),
 }
 """Figure -> its panels and their rows."""
 FIGURES: Mapping[str, Callable[[Results], Figure]] = {

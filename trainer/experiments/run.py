@@ -5,8 +5,6 @@ checkpoint and its actor lie in a directory of its own under ``runs``, which is 
 Whatever is killed goes on from its last checkpoint, to the same bits.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import multiprocessing
@@ -31,38 +29,17 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer import drivers
+from trainer import drivers, util
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together
-from trainer.experiments.plan import (
-    CONSTANT,
-    EXPERT,
-    Plan,
-    Unit,
-    deciding,
-    obstacle,
-    run_config,
-    testing,
-    training_id,
-    unit_id,
-    units_of,
-)
+from trainer.experiments import plan
+from trainer.experiments.plan import Plan, Unit
 from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import (
-    Purpose,
-    die_with_parent,
-    episode_seed,
-    held,
-    holder,
-    interrupts_blocked,
-    processor_model,
-    source_revision,
-)
 
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since
@@ -98,8 +75,7 @@ TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
 NOT_VALIDATED = ("", "nan")
 DIGITS = 5
-PATIENCE_S = 1.0
-"""How long a unit may be held before it counts as another process's work."""
+PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
 EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 """Exit status of a unit's process -> how the unit ended."""
 
@@ -108,18 +84,14 @@ EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 class Store:
     """Where the units of a plan are."""
 
-    plan: Plan
-    """What they have in common."""
-    results: Path
-    """Directory of the records, to be committed."""
-    runs: Path
-    """Directory of checkpoints and actors, which is not."""
-    humans: Path
-    """Directory with a human model for each scenario."""
+    plan: Plan  # What they have in common
+    results: Path  # Directory of the records, to be committed
+    runs: Path  # Directory of checkpoints and actors, which is not
+    humans: Path  # Directory with a human model for each scenario
 
     def id(self, unit: Unit) -> str:
         """The id of the unit's record."""
-        return unit_id(unit, self.plan, self.humans)
+        return plan.unit_id(unit, self.plan, self.humans)
 
     def records_file(self, scenario: str) -> Path:
         """The records of a scenario, a line each."""
@@ -127,7 +99,10 @@ class Store:
 
     def run_dir(self, unit: Unit) -> Path:
         """Where the unit is trained; its actor stays there."""
-        return self.runs / f"{'-'.join(map(str, unit))}-{training_id(unit, self.plan, self.humans)}"
+        return (
+            self.runs
+            / f"{'-'.join(map(str, unit))}-{plan.training_id(unit, self.plan, self.humans)}"
+        )
 
     def lock_file(self, unit: Unit) -> Path:
         """Beside the unit's directory."""
@@ -138,14 +113,13 @@ class Store:
     def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
         """Hold a unit against other processes; gives whether that was possible."""
         make_directory(self.runs)
-        with held(self.lock_file(unit), patience_s) as mine:
+        with util.held(self.lock_file(unit), patience_s) as mine:
             yield mine
 
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
         """All records of a scenario, current or not; none where there is no file.
 
-        Raises:
-            UserError: a line is not what ``put`` writes.
+        Raises UserError: a line is not what ``put`` writes.
         """
         path, found = self.records_file(scenario), {}
         text = read_bytes(path, "records").decode(errors="replace") if path.exists() else ""
@@ -168,7 +142,7 @@ class Store:
             record = records[unit.scenario].get(unit)
             if record is None:
                 continue
-            if obstacle(unit, self.humans) or record["id"] != self.id(unit):
+            if plan.obstacle(unit, self.humans) or record["id"] != self.id(unit):
                 stale.append(unit)
             else:
                 found[unit] = record
@@ -178,7 +152,7 @@ class Store:
         """Add a record, in place of an older one of the unit: whole or not at all."""
         path = self.records_file(unit.scenario)
         make_directory(path.parent)
-        with held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
+        with util.held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
             if not mine:
                 raise UserError(f"{path} is held by another process")
             records = {**self.records(unit.scenario), unit: record}
@@ -199,7 +173,7 @@ class Store:
 
     def status_lines(self, seeds: int) -> Iterator[str]:
         """A line for each algorithm and setting: how many of its units are done."""
-        units = units_of(["all"], seeds)
+        units = plan.units_of(["all"], seeds)
         found, stale = self.find(units)
         done = Counter(unit[:3] for unit in found)
         for line, count in Counter(unit[:3] for unit in units).items():
@@ -223,7 +197,7 @@ def compute(task: Task) -> str:
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
         if not free:
-            say(f"left to {holder(store.lock_file(unit))}: {unit}")
+            say(f"left to {util.holder(store.lock_file(unit))}: {unit}")
             return BUSY
         if unit in store.find([unit])[0]:
             return FINISHED
@@ -242,8 +216,8 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     began_s = time.monotonic()
     record: dict[str, Any] = {
         "id": store.id(unit),
-        **deciding(unit, store.plan, store.humans),
-        "testing": testing(unit, store.plan),
+        **plan.deciding(unit, store.plan, store.humans),
+        "testing": plan.testing(unit, store.plan),
     }
     seconds = {}
     if unit.trained:
@@ -260,10 +234,10 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
         policy = str(run_dir)
-    elif unit.algorithm == CONSTANT:
+    elif unit.algorithm == plan.CONSTANT:
         record["action"], record["success_of"] = best_constant(unit.scenario, store.plan)
         policy = f"{drivers.CONSTANT}{record['action']}"
-    elif unit.algorithm == EXPERT:
+    elif unit.algorithm == plan.EXPERT:
         policy = unit.scripted_human
     else:
         policy = str(store.humans / unit.scenario)
@@ -273,11 +247,11 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         seconds["search_s"] = round(tested_s - began_s)
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
-        "processor": processor_model(),
+        "processor": util.processor_model(),
         "bfloat16": multiplies_bfloat16("cpu"),
-        "compiled_kernel": load_kernel("trunk") is not None,
+        "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
-        "source_revision": source_revision(),
+        "source_revision": util.source_revision(),
         **seconds,
     }
     return record
@@ -293,7 +267,7 @@ def _train(task: Task, run_dir: Path) -> bool:
     Time is looked at only where a checkpoint was just written, and not through the deadline of
     ``TrainingRun.train``: that one validates once more when it stops, as no unbroken run does.
     """
-    config = run_config(task.unit, task.store.plan, task.store.humans)
+    config = plan.run_config(task.unit, task.store.plan, task.store.humans)
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
     validated = over and rows[-1]["validation_success"] not in NOT_VALIDATED
@@ -351,7 +325,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     Searched on two grids: from -1 to 1, then a step to either side of the best one.
     """
     envs = [make_environment(scenario) for _ in range(plan.together)]
-    drives = [episode_seed(0, Purpose.VALIDATION, run) for run in range(plan.search_runs)]
+    drives = [util.episode_seed(0, util.Purpose.VALIDATION, run) for run in range(plan.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
     def search(grid: Iterable[float]) -> float:
@@ -386,7 +360,7 @@ def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
                         ends[STOPPED] += 1
                         continue
                     process = context.Process(target=_work, args=(task,), daemon=True)
-                    with interrupts_blocked():
+                    with util.interrupts_blocked():
                         process.start()
                     working[process.sentinel] = process, task
                 for sentinel in wait([*working]) if working else ():
@@ -411,7 +385,7 @@ def say(line: str) -> None:
 def _work(task: Task) -> None:
     """A process's life: its exit status tells how the unit ended."""
     os.nice(5)  # a machine on which somebody works stays usable
-    threading.Thread(target=die_with_parent, daemon=True).start()
+    threading.Thread(target=util.die_with_parent, daemon=True).start()
     end, why = FAILED, ""
     try:
         end = compute(task)
@@ -426,8 +400,7 @@ def _work(task: Task) -> None:
     sys.exit(list(EXITS.values()).index(end))
 
 
-WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
-"""What a unit goes on from."""
+WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)  # What a unit goes on from
 Files = dict[str, bytes]
 Parcel = tuple[Task, Files, Files]
 """A task on its way to a node: with its human model, and with what it goes on from."""
@@ -463,8 +436,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
 
     ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
 
-    Raises:
-        UserError: Ray is not installed, or nothing answers at the address.
+    Raises UserError: Ray is not installed, or nothing answers at the address.
     """
     ray = _connected(address)
     remote = ray.remote(num_cpus=1, max_retries=3)(compute_parcel)  # for nodes that die

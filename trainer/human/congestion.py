@@ -1,7 +1,5 @@
 """The human in the congestion: the scripted expert, and when a person would take the wheel."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,8 +11,8 @@ from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
 
 
-class CongestionExpert(Driver):
-    """Heading control towards the middle between the neighbours to the left and to the right.
+class CongestionHuman(Driver):
+    """Heading control towards the middle between the neighbours; and judges the policy's action.
 
     A cascade: the offset from the middle asks for a heading, the heading error for a steering
     angle. At 5 m/s (a wheelbase of 5 m turns by v x angle / 5 m) the offset dies out with a time
@@ -29,6 +27,14 @@ class CongestionExpert(Driver):
     HEADING_RAD_PER_M = 0.15
     HEADING_LIMIT_RAD = 0.12
     STEERING_GAIN = 3.0
+
+    HORIZON_S = 0.6
+    """How far the judged steering is followed. Long enough that the human always gets out of it,
+    and no longer: a human who takes over from the first drift keeps the policy from all that it
+    could learn by. Without imitation (HI-TD3) it then learns hardly anything."""
+    MARGIN_M = 0.25  # Room to other cars within which one counts as hit
+    HEADING_RAD = 0.2
+    OFFSET_M = 1.1  # From the lane's middle
 
     def __init__(self, env: CongestionEnv) -> None:
         self.env = env
@@ -58,18 +64,6 @@ class CongestionExpert(Driver):
                 right_m = min(right_m, float(car.position[1]) - 0.5 * car.WIDTH)
         limit = self.MIDDLE_LIMIT_M
         return min(max(0.5 * (left_m + right_m), -limit), limit)
-
-
-class CongestionHuman(CongestionExpert):
-    """The expert who also judges the policy's action before it is carried out."""
-
-    HORIZON_S = 0.6
-    """How far the judged steering is followed. Long enough that the human always gets out of it,
-    and no longer: a human who takes over from the first drift keeps the policy from all that it
-    could learn by. Without imitation (HI-TD3) it then learns hardly anything."""
-    MARGIN_M = 0.25  # Room to other cars within which one counts as hit
-    HEADING_RAD = 0.2
-    OFFSET_M = 1.1  # From the lane's middle
 
     def may_return(self) -> bool:
         """Whether control can be handed back: anywhere."""

@@ -3,8 +3,6 @@
 The person is the scripted expert, or a real one in recorded sittings.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator
@@ -70,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
-    end_s = options.deadline_s(arguments)
+    end_s = options.deadline_s(arguments.max_minutes)
     about: dict[str, Any] = {"scenario": arguments.scenario, "seed": arguments.seed}
     if arguments.recordings is None:
         training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
@@ -89,7 +87,10 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         )
     with ProgressBar("human model", config.episodes) as bar:
         for episode in options.until(end_s, episodes):
-            bar.advance(episode.figures())
+            shown = {"demonstrations": str(episode.demonstrations), "loss": f"{episode.loss:.3f}"}
+            if episode.outcome:
+                shown |= {"interventions": str(episode.interventions), "outcome": episode.outcome}
+            bar.advance(shown)
     if bar.done < config.episodes:
         print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
     # In proportion: a part of the episodes has shown a part of the examples, in a part of the time.
@@ -109,18 +110,9 @@ class HumanEpisode(NamedTuple):
     """One episode of the human model's training."""
 
     loss: float
-    demonstrations: int
-    """The human's steps so far."""
+    demonstrations: int  # The human's steps so far
     interventions: int = 0
-    outcome: str = ""
-    """Empty where nobody drove: the model learned from recordings."""
-
-    def figures(self) -> dict[str, str]:
-        """What the progress bar shows."""
-        shown = {"demonstrations": f"{self.demonstrations}", "loss": f"{self.loss:.3f}"}
-        if self.outcome:
-            shown |= {"interventions": f"{self.interventions}", "outcome": self.outcome}
-        return shown
+    outcome: str = ""  # Empty where nobody drove: the model learned from recordings
 
 
 class HumanTraining:

@@ -1,7 +1,5 @@
 """The human beside the policy: watches each action, takes over, and hands control back."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -108,11 +106,8 @@ class Asking(Trigger):
 class Inattentive(Trigger):
     """A human that comes late, or not at all: what is overlooked is not looked at for a while.
 
-    Args:
-        trigger: when this human should take over.
-        late_steps: the least and the longest delay, in control periods; each is drawn anew.
-        missed_share: how often nothing is noticed at all.
-        random: what is drawn from.
+    ``trigger`` is when it should take over; ``late_steps`` the least and the longest delay, in
+    control periods, of which each is drawn anew; ``missed_share`` how often it notices nothing.
     """
 
     BLIND_STEPS = 15

@@ -3,8 +3,6 @@
 All three know the true state. The activation conditions are those that section V leaves open.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache
@@ -116,11 +114,16 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
     return (min(xs), max(xs)) if xs else (math.inf, -math.inf)
 
 
-class LeftTurnExpert(Driver):
-    """Waits at the stop line, picks a gap, and then commits.
+class LeftTurnHuman(Driver):
+    """Waits at the stop line, picks a gap, and then commits; and judges the policy's action.
 
     A driver who changes their mind with the nose in the lane is hit; one who needs a wide gap to
     start and a narrow one to go on is not, and is easier to imitate.
+
+    Beside the policy, before its action is carried out, a person lets an action pass that leaves a
+    way out and does not stop in the lane. A judge that asked only where the present pedal leads
+    would object to each brisk approach to the stop line, the expert's own, too; but theorem 1 holds
+    only where no optimal policy goes where the human takes over.
     """
 
     HORIZON_S = 6.0
@@ -136,14 +139,35 @@ class LeftTurnExpert(Driver):
     SIDE_CLEARANCE_M = 0.3  # Room to the sides of a passing car
     GO = PedalPlan(then_mps=CRUISE_MPS)
 
+    HOLD_S = 0.5  # How long the judged pedal is taken to be held: a person's reaction time
+    RESCUE_BRAKE = 0.85
+    """Share of the full brake with which the car could then still be stopped in time; the rest is
+    room for a human model."""
+    STOP_BY_M = POINT_OF_NO_RETURN_M - 0.5
+    """Path length by which it must then stand; past the point of no return a car can only be driven
+    on, and creeping up to it is not waiting."""
+    RESCUE_MARGIN_M = 1.0
+    """Room along the lane with which it could then still drive on, at full throttle."""
+    HESITATION_S = 1.0
+    """How long the judged pedal is taken to be held by a car that would then be in the lane."""
+    CRAWL_MPS = 1.5
+    """A car that would then be slower than this within the lane is stopping there: nobody's plan,
+    since the traffic does not yield."""
+    STANDING_MPS = 0.3
+    STANDING_STEPS = 15  # Steps that a car stands before anybody thinks of it as stuck
+    OPEN_STEPS = 5
+    """Steps that the way must then have been free: a person's reaction time once more."""
+    START_PEDAL = 0.2  # Least throttle that counts as driving on by oneself
+
     def __init__(self, env: LeftTurnEnv) -> None:
         self.env = env
         self.crossing = Crossing(env, self.SIDE_CLEARANCE_M)
-        self.going = False
+        self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
         self.going = False
+        self.standing_steps = self.open_steps = 0
 
     def would_go(self) -> bool:
         """Whether a driver standing here would start now."""
@@ -174,45 +198,6 @@ class LeftTurnExpert(Driver):
         if wanted_mps == 0.0:
             return -1.0
         return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)
-
-
-class LeftTurnHuman(LeftTurnExpert):
-    """The expert who also judges the policy's action before it is carried out.
-
-    A person lets an action pass that leaves a way out and does not stop in the lane. A judge that
-    asked only where the present pedal leads would object to each brisk approach to the stop line,
-    the expert's own, too; but theorem 1 holds only where no optimal policy goes where the human
-    takes over.
-    """
-
-    HOLD_S = 0.5  # How long the judged pedal is taken to be held: a person's reaction time
-    RESCUE_BRAKE = 0.85
-    """Share of the full brake with which the car could then still be stopped in time; the rest is
-    room for a human model."""
-    STOP_BY_M = LeftTurnExpert.POINT_OF_NO_RETURN_M - 0.5
-    """Path length by which it must then stand; past the point of no return a car can only be driven
-    on, and creeping up to it is not waiting."""
-    RESCUE_MARGIN_M = 1.0
-    """Room along the lane with which it could then still drive on, at full throttle."""
-    HESITATION_S = 1.0
-    """How long the judged pedal is taken to be held by a car that would then be in the lane."""
-    CRAWL_MPS = 1.5
-    """A car that would then be slower than this within the lane is stopping there: nobody's plan,
-    since the traffic does not yield."""
-    STANDING_MPS = 0.3
-    STANDING_STEPS = 15  # Steps that a car stands before anybody thinks of it as stuck
-    OPEN_STEPS = 5
-    """Steps that the way must then have been free: a person's reaction time once more."""
-    START_PEDAL = 0.2  # Least throttle that counts as driving on by oneself
-
-    def __init__(self, env: LeftTurnEnv) -> None:
-        super().__init__(env)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last episode."""
-        super().reset()
-        self.standing_steps = self.open_steps = 0
 
     def wants_control(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""

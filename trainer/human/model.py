@@ -1,7 +1,5 @@
 """The DAgger human model of section V: imitates the human from what the human did so far."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,27 +14,12 @@ from edge_runtime.util import UserError
 from trainer.environments import make_environment
 from trainer.human.guide import Driver
 from trainer.learner.networks import PICTURES, Actor, tensors
-from trainer.util import (
-    FROM_ONE,
-    FROM_ZERO,
-    Purpose,
-    check_ranges,
-    load_torch,
-    random_stream,
-    save_torch,
-)
+from trainer.util import FROM_ONE, Purpose, check_ranges, load_torch, random_stream, save_torch
 
 MODEL_FILE = "human_model.pt"
 REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is refined
-RANGES = {
-    "frames": (1, 2),
-    "learning_rate": FROM_ZERO,
-    "batch_size": FROM_ONE,
-    "episodes": FROM_ONE,
-    "updates_per_episode": FROM_ONE,
-    "demonstrated_share": FROM_ZERO,
-    "refining_updates": FROM_ZERO,
-}
+RANGES = {(1, 2): ("frames",), FROM_ONE: ("batch_size", "episodes", "updates_per_episode")}
+"""What these numbers may be; all others are at least 0."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from edge_runtime.util import UserError
-from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, SHARE, check_ranges
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,7 @@ ALGORITHMS: dict[str, Algorithm] = {
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
 and the others are what came after it."""
-PLUGIN_GROUP = "phil.algorithms"
-"""Entry points that are rows of their own."""
+PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
 
 
 def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
@@ -123,8 +122,7 @@ def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
 def find_algorithm(name: str) -> Algorithm:
     """The row of this name: of the table, of an installed package, or ``module:ROW``.
 
-    Raises:
-        UserError: no such row.
+    Raises UserError: no such row.
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]
@@ -265,37 +263,16 @@ WORDS = {
 }
 """What each word may be."""
 RANGES = {
-    "frames": (1, 2),
-    "batch_size": FROM_ONE,
-    "actor_learning_rate": FROM_ZERO,
-    "critic_learning_rate": FROM_ZERO,
-    "learning_rate_decay": SHARE,
-    "learning_rate_final": SHARE,
-    "gamma": SHARE,
-    "return_steps": FROM_ONE,
-    "tau": SHARE,
-    "policy_delay": FROM_ONE,
-    "target_noise": FROM_ZERO,
-    "target_noise_bound": FROM_ZERO,
-    "exploration_initial": FROM_ZERO,
-    "exploration_correlation": SHARE,
-    "exploration_final": FROM_ZERO,
-    "exploration_share": ABOVE_ZERO,
-    "exploration_bound": FROM_ZERO,
-    "replay_capacity": (1, 10**9),
-    "alpha": SHARE,
-    "priority_offset": ABOVE_ZERO,
-    "advantage_bound": FROM_ZERO,
-    "beta": SHARE,
-    "cloning_weight": FROM_ZERO,
-    "preference_beta": FROM_ZERO,
-    "intervention_penalty": ANY,
-    "action_bound": FROM_ZERO,
-    "picture_shift": (0, 20),
-    "warmup_steps": FROM_ONE,
-    "saturation_weight": FROM_ZERO,
-}
-"""What each number may be."""
+    FROM_ONE: ("batch_size", "return_steps", "policy_delay", "warmup_steps"),
+    SHARE: ("learning_rate_decay", "learning_rate_final", "gamma", "tau",
+            "exploration_correlation", "alpha", "beta"),
+    ABOVE_ZERO: ("exploration_share", "priority_offset"),
+    ANY: ("intervention_penalty",),
+    (1, 2): ("frames",),
+    (1, 10**9): ("replay_capacity",),
+    (0, 20): ("picture_shift",),
+}  # fmt: skip
+"""What these numbers may be; all others are at least 0."""
 
 PRINTED_LEARNER = LearnerConfig(
     exploration_initial=1.0,

@@ -4,8 +4,6 @@ Batches come as torch tensors: ``human`` is the mask Delta as bool [n], values a
 actions [n, action size].
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -13,8 +13,6 @@ picture: ``embed``. It follows the ``torch.autocast`` around it, and is computed
 all that is asked of it; the rest is small, and always in single precision.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from itertools import chain, pairwise, repeat
@@ -63,10 +61,8 @@ FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME
 
 PICTURES = Box(0, 255, (2, FRAME_ROWS, FRAME_COLUMNS), np.uint8)
 """The paper's observation: frames [t-1, t]."""
-UNBOUNDED = 1e6
-"""A bound beyond this is none: a number is not divided by it."""
-SMALL_SIDE = 8
-"""A picture is halved until it is no larger."""
+UNBOUNDED = 1e6  # A bound beyond this is none: a number is not divided by it
+SMALL_SIDE = 8  # A picture is halved until it is no larger
 
 
 def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
@@ -182,11 +178,9 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
 class Picture(nn.Module):
     """What is seen, as features, and its share of the first connected layer.
 
-    Args:
-        frames: how many of the newest frames the network sees. The input is always the
-            observation [batch, 2, 45, 80], so that every network is run and exported alike.
-        more_inputs: of that layer beside the features; they count in its initial weights.
-        space: of the observations.
+    ``frames`` is how many of the newest frames the network sees. The input is always the
+    observation [batch, 2, 45, 80], so that every network is run and exported alike.
+    ``more_inputs`` of that layer, beside the features, count in its initial weights.
     """
 
     def __init__(self, frames: int = 2, more_inputs: int = 0, space: Space[Any] = PICTURES) -> None:
@@ -206,9 +200,7 @@ class Picture(nn.Module):
 class Head(nn.Module):
     """The connected layers after the first one, which ends before its activation.
 
-    Args:
-        outputs: of the last layer.
-        normalised: whether each hidden layer is normalised before its activation.
+    ``normalised``: each hidden layer is, before its activation.
     """
 
     def __init__(self, outputs: int, normalised: bool = False) -> None:
@@ -255,13 +247,9 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """The value Q(s, a) (table A2): the action joins the picture's features.
 
-    Args:
-        action_size: length of an action.
-        frames: how many of the newest frames it sees.
-        action_bound: of the action's initial weights; 0: as one more feature among 1,792.
-        normalised: whether the picture's share of the first connected layer, and each hidden layer,
-            is normalised to mean 0 and variance 1 (layer normalisation).
-        space: of the observations.
+    ``frames`` is how many of the newest it sees, ``action_bound`` that of the action's initial
+    weights (0: as one more feature among 1,792). ``normalised``: the picture's share of the first
+    connected layer, and each hidden layer, have mean 0 and variance 1 (layer normalisation).
     """
 
     def __init__(

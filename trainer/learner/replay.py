@@ -69,8 +69,7 @@ class Layout(NamedTuple):
     """How an observation lies in an array."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    """Of several entries: a structured one."""
+    dtype: np.dtype[Any]  # Of several entries: a structured one
     stacked: bool = False
     """It is [older, newer], and its newer half is the older one of the next observation."""
 
@@ -85,9 +84,7 @@ Lost = list[int]
 class RingIndex:
     """Running numbers of pictures and transitions, the rings they are kept in, and the pictures.
 
-    Args:
-        capacity: transitions kept.
-        layout: of the observations. One that is not stacked counts as a picture.
+    ``capacity`` is in transitions. An observation that is not stacked counts as a picture.
     """
 
     def __init__(self, capacity: int, layout: Layout = PAPERS) -> None:
@@ -98,8 +95,7 @@ class RingIndex:
         self.frame_ids = np.zeros((capacity, 2 + layout.stacked), np.int64)
         """The running numbers of each transition's three (or two) pictures, oldest first."""
         self.added = self.frames_added = 0
-        self.oldest = 0
-        """Running number of the oldest transition that is not forgotten."""
+        self.oldest = 0  # Running number of the oldest transition that is not forgotten
         self._current: tuple[int, ...] | None = None
 
     def __len__(self) -> int:
@@ -130,8 +126,7 @@ class RingIndex:
     def add(self, frames: NDArray[Any]) -> tuple[int, Lost]:
         """Number a transition that led to an observation; its slot.
 
-        Raises:
-            RuntimeError: no episode has begun.
+        Raises RuntimeError: no episode has begun.
         """
         if self._current is None:
             raise RuntimeError("start_episode comes before add")
@@ -193,8 +188,7 @@ COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
 """What is kept of a transition beside its pictures."""
-AHEAD = "foreseen_"
-"""What the names of the foreseen ones' state begin with."""
+AHEAD = "foreseen_"  # What the names of the foreseen ones' state begin with
 
 
 @dataclass(frozen=True)
@@ -202,40 +196,23 @@ class Batch:
     """A minibatch of ``n`` transitions."""
 
     indices: Indices
-    frames: NDArray[Any]
-    """s, [n, 2, 45, 80], or [n, ...] of another layout."""
-    actions: NDArray[np.float32]
-    """a, the action that was carried out, [n, action size]."""
-    rewards: NDArray[np.float32]
-    """r after shaping: the discounted sum over ``spans`` steps, [n]."""
-    next_frames: NDArray[Any]
-    """s' after those steps, likewise."""
+    frames: NDArray[Any]  # s, [n, 2, 45, 80], or [n, ...] of another layout
+    actions: NDArray[np.float32]  # a, the action that was carried out, [n, action size]
+    rewards: NDArray[np.float32]  # r after shaping: the discounted sum over ``spans`` steps, [n]
+    next_frames: NDArray[Any]  # s' after those steps, likewise
     terminals: NDArray[np.float32]
     """1 where s' ends the episode for good, or the policy's action in s' is overruled and
     penalised; a timeout is not terminal, [n]."""
-    human: NDArray[np.bool_]
-    """Delta of the first step: whether the human acted, [n]."""
+    human: NDArray[np.bool_]  # Delta of the first step: whether the human acted, [n]
     probabilities: NDArray[np.float64]
     """p(i), the probability with which each was drawn (eq. 20), [n]."""
-    spans: NDArray[np.int64] | int = 1
-    """Steps from s to s', [n]; or as many in all rows."""
+    spans: NDArray[np.int64] | int = 1  # Steps from s to s', [n]; or as many in all rows
     overruled: NDArray[np.float32] | None = None
     """What the policy would have done where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_] | None = None
     """Whether the overruled action is penalised (eq. 17), [n]; None: in no row."""
     foreseen: Batch | None = None
     """Others, whose ``next_frames`` are what an overruled action would have led to, or None."""
-
-
-class _Returns(NamedTuple):
-    """n-step returns without their bootstrap, [n] each."""
-
-    rewards: NDArray[np.float32]
-    lasts: Indices
-    """The transitions that they end with."""
-    terminals: NDArray[np.float32]
-    """1 where nothing is to be bootstrapped from."""
-    spans: NDArray[np.int64]
 
 
 class ReplayBuffer:
@@ -398,23 +375,28 @@ class ReplayBuffer:
             self._foreseen.load_state_dict(own)
 
     def _gather(self, indices: Indices) -> Batch:
-        returns = self._returns(indices)
+        rewards, lasts, terminals, spans = self._returns(indices)
         return Batch(
             indices=indices,
             frames=self._ring.frames(indices, 0),
             actions=self._actions[indices],
-            rewards=returns.rewards,
-            next_frames=self._ring.frames(returns.lasts, 1),
-            terminals=returns.terminals,
+            rewards=rewards,
+            next_frames=self._ring.frames(lasts, 1),
+            terminals=terminals,
             human=self._human[indices],
             probabilities=self._probabilities(indices),
-            spans=returns.spans,
+            spans=spans,
             overruled=self._overruled[indices],
             penalised=self._penalised[indices],
         )
 
-    def _returns(self, indices: Indices) -> _Returns:
+    def _returns(
+        self, indices: Indices
+    ) -> tuple[NDArray[np.float32], Indices, NDArray[np.float32], NDArray[np.int64]]:
         """The n-step returns, without their bootstrap, that begin with these transitions.
+
+        In the order: rewards, the transitions that they end with, 1 where nothing is to be
+        bootstrapped from, and how many steps they sum up; [n] each.
 
         A sum ends early where the episode does, for good or by a timeout, and at the newest step.
         It ends for good, too, at an overruled action that is penalised: what the human did there
@@ -440,7 +422,7 @@ class ReplayBuffer:
             sums = sums + going * (discount * self._rewards[following])
             terminals = np.where(going, self._terminals[lasts], terminals)
             spans += going
-        return _Returns(sums.astype(np.float32), lasts, terminals, spans)
+        return sums.astype(np.float32), lasts, terminals, spans
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         if len(self._trees) == 1:

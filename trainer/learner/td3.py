@@ -3,8 +3,6 @@
 ``reference.py`` is the same written plainly; this one computes nothing twice.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -15,17 +13,9 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainer.learner import equations
+from trainer.learner import equations, networks
 from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
-from trainer.learner.networks import (
-    PICTURES,
-    Actor,
-    CriticPair,
-    channels_last,
-    is_picture,
-    multiplies_bfloat16,
-    tensors,
-)
+from trainer.learner.networks import PICTURES, Actor, CriticPair, tensors
 from trainer.learner.replay import Batch
 
 
@@ -48,15 +38,8 @@ class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
     Both losses are taken at the same weights, before either optimiser steps: a picture is then
-    embedded once for each network and shared by every term that needs it.
-
-    Args:
-        config: hyper-parameters.
-        algorithm: the row of the table of switches.
-        seed: of the initial weights and of the smoothing noise.
-        action_size: length of an action.
-        device: where the networks are.
-        space: of the observations.
+    embedded once for each network and shared by every term that needs it. ``seed`` is that of the
+    initial weights and of the smoothing noise.
     """
 
     def __init__(
@@ -92,7 +75,7 @@ class TD3Learner:
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
         # Numbers lose by it what a picture does not have.
-        self._reduces = isinstance(space, Box) and is_picture(space.dtype, space.shape)
+        self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
     def act(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
@@ -185,7 +168,7 @@ class TD3Learner:
     def _precision(self) -> torch.autocast:
         kind = self.device.type
         reduced = self.config.precision == "bfloat16" and self._reduces
-        enabled = reduced and multiplies_bfloat16(kind)
+        enabled = reduced and networks.multiplies_bfloat16(kind)
         return torch.autocast(kind, torch.bfloat16, enabled=enabled)
 
     def _tensor(self, column: NDArray[Any]) -> Tensor:
@@ -201,11 +184,11 @@ class TD3Learner:
             for name in frames.dtype.names:
                 moved[name] = self._shift(frames[name])
             return moved
-        if not is_picture(frames.dtype, frames.shape[1:]):
+        if not networks.is_picture(frames.dtype, frames.shape[1:]):
             return frames
         if frames.ndim == 3:
             return self._shift(frames[:, None])[:, 0]
-        if channels_last(frames.shape[1:]):
+        if networks.channels_last(frames.shape[1:]):
             return np.moveaxis(self._shift(np.moveaxis(frames, -1, 1)), 1, -1)
         most = min(self.config.picture_shift, min(frames.shape[2:]) // 8)
         if not most:

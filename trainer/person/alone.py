@@ -4,8 +4,6 @@ A thread would share Python's lock with the person's loop: on a busy machine eve
 period began late.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading
@@ -18,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from bridge.report import EpisodeResult
-from trainer.drivers import network_driver
+from trainer.drivers import TogetherDriver
 from trainer.learner.networks import Actor
 from trainer.training.config import RunConfig
 from trainer.training.metrics import Trials
@@ -101,4 +99,4 @@ def _drive(
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)
     actor.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-    return trials.drive(network_driver(actor), seeds)
+    return trials.drive(TogetherDriver(actor.eval().act), seeds)

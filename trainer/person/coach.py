@@ -4,8 +4,6 @@ It draws nothing and drives nothing: the loop tells it of episodes and of the po
 window and the page show what it says.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque
@@ -21,8 +19,7 @@ from trainer.training.metrics import LEARNED as LEVELS
 LEARNED, WELL = LEVELS
 """Success of the policy alone from which the person only watches, and from which all is done."""
 RECENT = 10  # Episodes that are listed, and that the advice looks at
-TOO_LATE_S = 2.0
-"""A failure so soon after a take-over says that it came too late."""
+TOO_LATE_S = 2.0  # A failure so soon after a take-over says that it came too late
 LATE_ONES = 3  # Recent failures without the person, or after a late take-over, to say so
 NEEDLESS_ONES, NEEDLESS_SHARE = 3, 2.0 / 3.0
 """At least so many recent episodes with take-overs, and this share of them, must be ones that the
@@ -58,13 +55,10 @@ class Coaching:
     """What is shown of the coach."""
 
     advice: str  # Empty where there is none
-    said: str
-    """What the person has given, beside the typical human where one is known."""
-    alone: str
-    """Success of the policy alone, in words; empty before the first validation."""
+    said: str  # What the person has given, beside the typical human where one is known
+    alone: str  # Success of the policy alone, in words; empty before the first validation
     curve: Curve
-    typical: Curve
-    """Of a scripted human with the same algorithm; empty where none is known."""
+    typical: Curve  # Of a scripted human with the same algorithm; empty where none is known
     human_s: float  # How far along the curves the person is
     episodes: list[Episode]  # The newest last
 
@@ -76,8 +70,7 @@ class Coach:
         self.typical, self.learning = typical or [], learning
         self.episodes: deque[Episode] = deque(maxlen=RECENT)
         self.curve: Curve = []
-        self.checking = False
-        """Whether the policy alone is being validated."""
+        self.checking = False  # Whether the policy alone is being validated
         self._mastered: Mapping[int, bool] = {}
 
     def recall(self, rows: Iterable[Mapping[str, str]], period_s: float) -> None:
@@ -125,10 +118,8 @@ class Coach:
 def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[int, bool]) -> str:
     """One line of advice: of the first rule that fits, empty where none does.
 
-    Args:
-        episodes: the recent ones.
-        alone: newest success of the policy alone, 0 to 1; None: not known.
-        mastered: episode -> whether the policy alone reaches the goal in it today.
+    ``alone`` is the newest success of the policy alone, 0 to 1, where it is known; ``mastered``:
+    episode -> whether the policy alone reaches the goal in it today.
     """
     if alone is not None and alone >= WELL:
         return f"The policy alone reaches {alone:.0%}: you may stop here."

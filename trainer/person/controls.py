@@ -5,8 +5,6 @@ left or right, pedals press up and down. An action is one number, or a tuple of 
 environment has several.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -164,6 +164,5 @@ def check_person_options(arguments: argparse.Namespace) -> None:
 def open_person(arguments: argparse.Namespace) -> Person:
     """Open the device and the display of ``--human``; raises UserError where there is none."""
     check_person_options(arguments)
-    module, _, name = HUMANS[arguments.human].partition(":")
-    opener: Callable[[argparse.Namespace], Person] = getattr(import_module(module), name)
+    opener: Callable[[argparse.Namespace], Person] = resolve_name(HUMANS[arguments.human])
     return opener(arguments)

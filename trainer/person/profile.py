@@ -1,7 +1,5 @@
 """What the axes and buttons of a wheel or gamepad mean: a TOML file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -7,8 +7,6 @@ episode's last, which says whether the person discarded it. 30 minutes are about
 ever overwritten: sittings add up.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -220,8 +218,7 @@ def store_again(
     of the environment's and what the person did; ``penalises`` tells whether that costs the policy
     the penalty. Behind a network an action answers an observation that is ``ticks_late`` ticks old.
 
-    Returns:
-        How many steps were stored, and how many of them are the person's.
+    Returns how many steps were stored, and how many of them are the person's.
     """
     stored = human = 0
     for episode in read_episodes(steps):
@@ -251,8 +248,7 @@ def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) ->
     During a hand-over the model gets the hands' action, not the blend that was applied; on the
     way back to the policy the hands have let go. Episodes that the person discarded are left out.
 
-    Returns:
-        How many take-overs the recordings hold; a whole episode driven alone is one.
+    Returns how many take-overs the recordings hold; a whole episode driven alone is one.
 
     Raises UserError: a recording of another scenario, or none in which a person drove.
     """

@@ -32,7 +32,7 @@ from trainer.person.interface import Person, open_person
 from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
-from trainer.training.delayed import Store, behind, ticks_late
+from trainer.training.delayed import DelayedPolicy, Store, ticks_late
 from trainer.training.learning import Action, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
 from trainer.training.run import TrainingRun, divergence_said
@@ -106,7 +106,7 @@ class PersonRun(TrainingRun):
         self.behind_the_scenes = BehindTheScenes(config)
         self.guide = PersonGuide(self.sitting)
         self.kept_back = KeptBack(self.learning)
-        self.policy = behind(self.network, self.kept_back, self.env)
+        self.policy = DelayedPolicy(self.kept_back, self.env, self.network)
         self.env = self.sitting
 
     def train(

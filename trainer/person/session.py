@@ -30,14 +30,7 @@ from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
 from trainer.person.controls import Amount, amount, vector
 from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
-from trainer.person.recording import (
-    DISCARDED,
-    RESTARTED,
-    STOPPED,
-    Recorder,
-    Step,
-    layout_text,
-)
+from trainer.person.recording import DISCARDED, RESTARTED, STOPPED, Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, quit_on_signals
@@ -117,12 +110,9 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
 def drive(
     sitting: Sitting, policy: Driver | None, seed_of: SeedOf, episodes: int | None
 ) -> Counter[str]:
-    """Drive until the person quits, or so many episodes (None: no end).
+    """Drive until the person quits, or so many episodes (None: no end); how often one ended how.
 
     The policy drives until the person takes over; without one, the person drives alone.
-
-    Returns:
-        How often an episode ended how.
     """
     outcomes = Counter[str]()
     number = sitting.recorder.sitting
@@ -179,8 +169,7 @@ class Sitting:
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
         and the episodes that missed the goal. A run that goes on adds what it had."""
         self.coach = Coach()
-        self._taken_over_at = math.nan
-        """The step at which the last take-over began."""
+        self._taken_over_at = math.nan  # The step at which the last take-over began
         self._paused = False
         self._last_step: Step | None = None
         """Of an episode that has ended, until it is known whether the person discards it."""

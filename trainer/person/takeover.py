@@ -4,8 +4,6 @@ Three parts, from the hands to the car: ``Seat`` says which page's hands count, 
 the person wants control, ``TakeOver`` what the car is told while that changes.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 from typing import Annotated, Literal

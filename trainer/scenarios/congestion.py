@@ -1,7 +1,5 @@
 """``phil/Congestion-v0``: a car hemmed in by others in highway congestion (section VI)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass
@@ -9,10 +7,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env.road.lane import LineType, StraightLane
+from highway_env.road.lane import StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
+from trainer.scenarios import traffic
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
@@ -23,19 +22,7 @@ from trainer.scenarios.environment import (
     Step,
 )
 from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import (
-    CAR,
-    CARS_ONLY,
-    MIXED,
-    Mix,
-    TrafficVehicle,
-    VehicleType,
-    bodies_m,
-    draw_types,
-    equip,
-    idm_acceleration,
-    queue,
-)
+from trainer.scenarios.traffic import TrafficVehicle
 
 
 @dataclass(frozen=True)
@@ -68,7 +55,7 @@ class CongestionConfig(ScenarioConfig):
     cars_behind: int = 1
     """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
     elsewhere has nothing to react to."""
-    traffic_mix: Mix = CARS_ONLY
+    traffic_mix: traffic.Mix = traffic.CARS_ONLY
     side_front_m: Range = (9.0, 13.0)
     """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
     gap_m: Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
@@ -94,7 +81,7 @@ class CongestionConfig(ScenarioConfig):
 
 SCENES: dict[Scene, CongestionConfig] = {
     "nominal": CongestionConfig(),
-    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED),
+    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=traffic.MIXED),
     # A jam in lanes as narrow as at roadworks, in which cars keep to their lane's middle, and lanes
     # to the jam's speed, about half as well as usual. The narrowest gap leaves 0.5 m to each side
     # of an ego car in mid-lane instead of 1.25, and its walls move; were it narrower, cars of two
@@ -122,9 +109,8 @@ def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
     for lane in range(LANES):
         y = (lane - EGO_LANE) * lane_width_m
         ends = (-REACH_M, y), (goal_m + REACH_M, y)
-        lines = (LineType.CONTINUOUS if lane == 0 else LineType.NONE, LineType.CONTINUOUS)
         # No speed limit: the cars' own desired speeds are what limits them.
-        road = StraightLane(*ends, lane_width_m, line_types=lines, speed_limit=None)
+        road = StraightLane(*ends, lane_width_m, speed_limit=None)
         network.add_lane("start", "end", road)
     return network
 
@@ -139,12 +125,12 @@ def spawn_traffic(
         first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
         types, x = (_own_lane if lane == EGO_LANE else _side_lane)(config, random)
         speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
-        own = queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
+        own = traffic.queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
         for car in own:
             car.target_speed = config.desired_speed_mps
         if lane == EGO_LANE and config.cars_behind:
             own[1].leader = ego
-        equip(own, types, config.time_gap_factor)
+        traffic.equip(own, types, config.time_gap_factor)
         # The first of a lane goes with the jam, the others would go faster if they could.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
@@ -155,20 +141,20 @@ def spawn_traffic(
 
 def _side_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[VehicleType], list[float]]:
+) -> tuple[list[traffic.VehicleType], list[float]]:
     """The vehicles of a neighbouring lane, and where they are."""
-    types = draw_types(config.traffic_mix, config.side_cars, random)
+    types = traffic.draw_types(config.traffic_mix, config.side_cars, random)
     x = [float(random.uniform(*config.side_front_m))]
     for ahead, behind in itertools.pairwise(types):
-        x.append(x[-1] - bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
+        x.append(x[-1] - traffic.bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
     return types, x
 
 
 def _own_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[VehicleType], list[float]]:
+) -> tuple[list[traffic.VehicleType], list[float]]:
     """One car ahead of the ego car; those behind follow the ego car as one of theirs."""
-    types = draw_types(config.traffic_mix, 1 + config.cars_behind, random)
+    types = traffic.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
     nose_m = 0.5 * EgoVehicle.LENGTH
     x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
     tail_m = -nose_m
@@ -190,16 +176,12 @@ class CongestionEnv(DrivingEnv):
     keys = MappingProxyType({"left": (-1.0,), "a": (-1.0,), "right": (1.0,), "d": (1.0,)})
     key_rate_per_s = 2.5  # A tap turns the wheel a little.
     biased_action = 0.5  # Half of the full angle.
+    expert_class = "trainer.human.congestion:CongestionHuman"
+    scenes = SCENES
     config: CongestionConfig
 
-    def __init__(
-        self,
-        config: CongestionConfig | None = None,
-        render_mode: str | None = None,
-        scene: Scene = "nominal",
-    ) -> None:
-        super().__init__(render_mode)
-        self.config = c = config or SCENES[scene]
+    def _build(self) -> None:
+        c = self.config
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
@@ -208,18 +190,12 @@ class CongestionEnv(DrivingEnv):
         )
         self._steering = 0.0
 
-    def expert(self) -> Any:
-        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        from trainer.human.congestion import CongestionHuman  # which imports this module
-
-        return CongestionHuman(self)
-
     @property
     def car(self) -> dict[str, float]:
         """Its throttle is the IDM's, which no action reaches; the action +1 turns right."""
         c = self.config
         return {
-            "throttle_mps2": CAR.acceleration_mps2,
+            "throttle_mps2": traffic.CAR.acceleration_mps2,
             "brake_mps2": c.brake_mps2,
             "max_speed_mps": c.desired_speed_mps,
             "full_steering_rad": -c.lambda_rad,
@@ -286,7 +262,9 @@ class CongestionEnv(DrivingEnv):
             gap_m -= 0.5 * (leader.LENGTH + self.ego.LENGTH)
             closing_mps = self.ego.speed - leader.speed
         speed_mps, wanted_mps = self.ego.speed, c.desired_speed_mps
-        idm = idm_acceleration(CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor)
+        idm = traffic.idm_acceleration(
+            traffic.CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor
+        )
         return max(idm, -c.brake_mps2)
 
     def _leader(self) -> TrafficVehicle | None:

@@ -1,10 +1,9 @@
 """What the scenarios share: the ego car, spaces, the two frames, and what a step reports."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import Any, ClassVar, Literal, Self
 
 import gymnasium
@@ -97,8 +96,9 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     Observation: uint8 [2, 45, 80], frames [t-1, t]. Action: float32 [1] in [-1, 1]. ``info``:
     ``distance_m``, ``speed_mps``, the accelerations of the step and, at the end, ``outcome``.
 
-    A scenario places its vehicles (``_place``), moves them in ``step`` (``_move``) and says what is
-    seen (``_frame``), whether it has ended (``_outcome``), and what a step is worth (``_reward``).
+    A scenario builds its road (``_build``), places its vehicles (``_place``), moves them in
+    ``step`` (``_move``) and says whether it has ended (``_outcome``), and what a step is worth
+    (``_reward``); ``_frame`` is what is seen.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
@@ -113,33 +113,29 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     keys: Mapping[str, tuple[float, ...]]  # Key -> the action while a person holds it
     key_rate_per_s: float  # How quickly a key presses
     biased_action: float  # What a human of biased guidance does whenever wrong
+    expert_class: str  # By its name: its module imports the scenario
+    scenes: ClassVar[Mapping[Scene, Any]]  # Their configs
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]
     network: RoadNetwork
     rasteriser: Rasteriser
 
-    def __init__(self, render_mode: str | None) -> None:
-        self.render_mode = render_mode
+    def __init__(
+        self, config: Any = None, render_mode: str | None = None, scene: Scene = "nominal"
+    ) -> None:
+        self.config, self.render_mode = config or self.scenes[scene], render_mode
         self.observation_space = spaces.Box(0, 255, (2, ROWS, COLUMNS), np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.frames = np.zeros((2, ROWS, COLUMNS), np.uint8)
         self.steps = 0
         self.distance_m = 0.0
-
-    @property
-    def control_period_s(self) -> float:
-        """T, seconds."""
-        return self.config.control_period_s
-
-    @property
-    def goal_m(self) -> float:
-        """Distance from start to goal."""
-        return self.config.goal_m
+        self.control_period_s, self.goal_m = self.config.control_period_s, self.config.goal_m
+        self._build()
 
     def expert(self) -> Any:
         """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        raise NotImplementedError
+        return resolve_name(self.expert_class)(self)
 
     def render(self) -> NDArray[np.uint8]:
         """The scene from above for a person, uint8 [height, width, 3]."""
@@ -175,13 +171,17 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.frames[:] = self._frame(*self._footprints())
         return self.frames.copy(), self._info(None)
 
+    def _build(self) -> None:
+        """Make what is the same in all episodes: network, rasteriser."""
+        raise NotImplementedError
+
     def _place(self) -> None:
         """Put the ego car and the traffic on the road, in an order that keeps what seeds mean."""
         raise NotImplementedError
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
         """What the policy sees now, uint8 [45, 80]: from the footprints of ego car and traffic."""
-        raise NotImplementedError
+        return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         """How the episode has ended, or None; from the same footprints."""

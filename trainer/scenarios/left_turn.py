@@ -1,18 +1,16 @@
 """``phil/LeftTurn-v0``: an unprotected left turn from a side road into a main road (section VI)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from highway_env.road.lane import CircularLane, LineType, StraightLane
+from highway_env.road.lane import StraightLane
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.utils import wrap_to_pi
-from numpy.typing import NDArray
 
+from trainer.scenarios import traffic
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
@@ -23,17 +21,7 @@ from trainer.scenarios.environment import (
     Step,
 )
 from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import (
-    CAR,
-    CARS_ONLY,
-    MIXED,
-    Mix,
-    TrafficVehicle,
-    bodies_m,
-    draw_types,
-    equip,
-    queue,
-)
+from trainer.scenarios.traffic import TrafficVehicle
 
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
@@ -91,20 +79,6 @@ class LeftTurnPath:
         """Signed curvature at ``s_m``, 1/m; negative is a left turn (headings are clockwise)."""
         return -1.0 / self.radius_m if 0.0 < s_m - self.straight_m <= self.arc_m else 0.0
 
-    def lanes(self, end_m: float, width_m: float) -> list[StraightLane | CircularLane]:
-        """The same path as highway-env lanes, ending at arc length ``end_m``."""
-        straight_end = (self.start_x, self.centre_y)
-        centre, quarter = (self.centre_x, self.centre_y), (0.0, -0.5 * math.pi)
-        arc = CircularLane(centre, self.radius_m, *quarter, clockwise=False, width=width_m)
-        exit_start = (self.centre_x, self.centre_y - self.radius_m)
-        exit_m = max(end_m - self.straight_m - self.arc_m, 0.1)
-        exit_end = (exit_start[0] - exit_m, exit_start[1])
-        return [
-            StraightLane((self.start_x, self.start_y), straight_end, width=width_m),
-            arc,
-            StraightLane(exit_start, exit_end, width=width_m),
-        ]
-
 
 class PathTracker:
     """PI control of the front wheels along a planned path (section VI, auxiliary functions).
@@ -141,25 +115,12 @@ class PathTracker:
         return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
 
 
-def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> RoadNetwork:
-    """Both lanes of the main road (y = 0 between them), and the ego car's path as lanes."""
-    network, half, reach = RoadNetwork(), 0.5 * lane_width_m, LANE_REACH_M
-    lines = (LineType.STRIPED, LineType.CONTINUOUS)
-    for start, end, y in (("west", "east", half), ("east", "west", -half)):
-        direction = 1.0 if start == "west" else -1.0
-        lane = StraightLane(
-            (-direction * reach, y),
-            (direction * reach, y),
-            lane_width_m,
-            line_types=lines,
-            # The cars' own desired speeds are what limits them.
-            speed_limit=None,
-        )
-        network.add_lane(start, end, lane)
-    nodes = ("south", "turn", "exit", "goal")
-    lanes = path.lanes(goal_m, lane_width_m)
-    for start, end, lane in zip(nodes[:-1], nodes[1:], lanes, strict=True):
-        network.add_lane(start, end, lane)
+def near_lane(lane_width_m: float) -> RoadNetwork:
+    """The one lane in which there is traffic, as highway-env has it; y = 0 is its left edge."""
+    network, y = RoadNetwork(), 0.5 * lane_width_m
+    # No speed limit: the cars' own desired speeds are what limits them.
+    lane = StraightLane((-LANE_REACH_M, y), (LANE_REACH_M, y), lane_width_m, speed_limit=None)
+    network.add_lane(*NEAR_LANE[:2], lane)
     return network
 
 
@@ -179,7 +140,7 @@ class LeftTurnConfig(ScenarioConfig):
     throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
     brake_mps2: float = 4.0  # Deceleration at full brake (-1)
     traffic_cars: int = 3
-    traffic_mix: Mix = CARS_ONLY
+    traffic_mix: traffic.Mix = traffic.CARS_ONLY
     traffic_speed_mps: Range = (4.0, 6.0)
     """Initial and desired speed of each car of the main road (section VI-A)."""
     first_car_m: Range = (2.0, 12.0)
@@ -204,7 +165,7 @@ class LeftTurnConfig(ScenarioConfig):
 SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
     # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
-    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300),
+    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=traffic.MIXED, max_steps=300),
     # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
     # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between
     # them the two cars' speeds decide, and a policy that only ever met gaps up to 16 m and from
@@ -226,18 +187,14 @@ class LeftTurnEnv(DrivingEnv):
     keys = MappingProxyType({"up": (1.0,), "w": (1.0,), "down": (-1.0,), "s": (-1.0,)})
     key_rate_per_s = 5.0  # A pedal is down in 0.2 s.
     biased_action = 1.0  # Full throttle.
+    expert_class = "trainer.human.left_turn:LeftTurnHuman"
+    scenes = SCENES
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
     """The action that stops the car: what a simulator applies when commands stop."""
 
-    def __init__(
-        self,
-        config: LeftTurnConfig | None = None,
-        render_mode: str | None = None,
-        scene: Scene = "nominal",
-    ) -> None:
-        super().__init__(render_mode)
-        self.config = c = config or SCENES[scene]
+    def _build(self) -> None:
+        c = self.config
         half = 0.5 * c.lane_width_m
         # Right-hand traffic: the ego car comes up the right lane of the side road, crosses the
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
@@ -249,7 +206,7 @@ class LeftTurnEnv(DrivingEnv):
             Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m),
         ]
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
-        self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
+        self.network = near_lane(c.lane_width_m)
         self._offset_m = 0.0
 
     @property
@@ -275,12 +232,6 @@ class LeftTurnEnv(DrivingEnv):
         self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
-
-    def expert(self) -> Any:
-        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
-        from trainer.human.left_turn import LeftTurnHuman  # which imports this module
-
-        return LeftTurnHuman(self)
 
     def pedal_for_speed(self, speed_mps: float) -> float:
         """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.
@@ -319,22 +270,19 @@ class LeftTurnEnv(DrivingEnv):
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random
         crossing_m = LANE_REACH_M + 0.5 * c.lane_width_m
-        types = draw_types(c.traffic_mix, c.traffic_cars, random)
+        types = traffic.draw_types(c.traffic_mix, c.traffic_cars, random)
         positions: list[float] = []
         for number in range(c.traffic_cars):
             if positions:
                 gap_m = c.long_gap_m if random.random() < c.long_gap_share else c.short_gap_m
-                longer_m = bodies_m(types[number], types[number - 1]) - CAR.length_m
+                longer_m = traffic.bodies_m(types[number], types[number - 1]) - traffic.CAR.length_m
                 positions.append(positions[-1] - float(random.uniform(*gap_m)) - longer_m)
             else:
                 positions.append(crossing_m - float(random.uniform(*c.first_car_m)))
         speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=c.traffic_cars)]
-        cars = queue(self.road, NEAR_LANE, positions, speeds)
-        equip(cars, types)
+        cars = traffic.queue(self.road, NEAR_LANE, positions, speeds)
+        traffic.equip(cars, types)
         return cars
-
-    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         if any(overlap(ego, car) for car in cars):

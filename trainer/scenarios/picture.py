@@ -5,8 +5,6 @@ mixed by the covered area: a car that moves by a tenth of a pixel changes the pi
 show speed (eq. 28 stacks two). A picture takes tens of microseconds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -172,10 +170,8 @@ def draw_scene(
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
-    ``ego`` is the ego car's colour, which tells what drives it.
-
-    Returns:
-        uint8 [height, width, 3].
+    The picture is uint8 [height, width, 3]; ``ego`` is the ego car's colour, which tells what
+    drives it.
     """
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
     image = Image.new("RGB", size, COLOURS["ground"])

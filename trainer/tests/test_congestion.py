@@ -6,7 +6,7 @@ import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.environments import make_environment
-from trainer.human.congestion import CongestionExpert, CongestionHuman
+from trainer.human.congestion import CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
 from trainer.scenarios.traffic import CAR
@@ -174,7 +174,7 @@ def environment(
 @pytest.mark.parametrize("offset_m", [0.3, -0.3])
 def test_the_expert_steers_back_and_then_straight(offset_m):
     env = environment(offset_m)
-    expert = CongestionExpert(env)
+    expert = CongestionHuman(env)
     assert expert.act(env.frames)[0] / offset_m < -1.0
     for _ in range(80):
         env.step(expert.act(env.frames))
@@ -184,7 +184,7 @@ def test_the_expert_steers_back_and_then_straight(offset_m):
 
 def test_the_expert_seeks_the_middle_of_the_gap():
     env = environment(config=replace(CENTRED, traffic_mix=((CAR, 1.0),)))
-    expert = CongestionExpert(env)
+    expert = CongestionHuman(env)
     assert expert.middle_m() == pytest.approx(0.0)
     for car in env.traffic:
         if car.position[1] < -2.0:
@@ -209,13 +209,13 @@ def test_the_expert_seeks_the_middle_of_the_gap():
     ],
 )
 def test_who_turns_or_is_aside_is_taken_over(side, offset_m, heading_rad, action, reason):
-    expert = CongestionExpert(environment(side * offset_m, side * heading_rad, ALONE))
+    expert = CongestionHuman(environment(side * offset_m, side * heading_rad, ALONE))
     assert CongestionHuman(expert.env).wants_control(side * action) == reason
 
 
 def test_who_will_touch_a_car_with_its_side_is_taken_over():
     for offset_m, action, reason in ((0.75, RIGHT, "collision"), (-0.75, STRAIGHT, None)):
-        expert = CongestionExpert(environment(offset_m, 0.1))
+        expert = CongestionHuman(environment(offset_m, 0.1))
         assert CongestionHuman(expert.env).wants_control(action) == reason
 
 

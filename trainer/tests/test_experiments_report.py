@@ -114,7 +114,7 @@ class TestClaims:
     ):
         found = finding(everything, test, ours, others, bar)
         assert found.holds == holds
-        assert ("vanilla TD3 over HI-TD3" in found.ours) == (ours is claims.PER)
+        assert ("vanilla TD3 over HI-TD3" in found.text) == (ours is claims.PER)
 
     def test_missing_trainings_leave_it_open(self):
         results = results_of([unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT], SEEDS)
@@ -162,7 +162,7 @@ class TestClaims:
             assert claim.source in EXPERIMENTS
             for found in filter(None, claims.judge_both(everything, claim)):
                 assert found.holds in ("yes", "no", "undecided")
-                assert found.ours not in ("", "not measured")
+                assert found.text not in ("", "not measured")
             assert claims.judge_both(results, claim)[0].holds == "undecided"
 
 

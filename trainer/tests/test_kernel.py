@@ -13,7 +13,7 @@ from trainer.learner.kernel import trunk_features
 from trainer.learner.networks import multiplies_bfloat16
 
 needs_kernel = pytest.mark.skipif(
-    kernel.load("trunk") is None, reason="there is no compiler here, or PHIL_KERNEL=0"
+    kernel.load() is None, reason="there is no compiler here, or PHIL_KERNEL=0"
 )
 
 
@@ -112,7 +112,7 @@ def test_threads_change_nothing_and_reduced_precision_little(frames, reduced, on
 @needs_kernel
 @pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
 def test_reduced_precision_is_bfloat16_where_processor_and_compiler_have_it(frames):
-    library = kernel.load("trunk")
+    library = kernel.load()
     if not (library and library.trunk_has_bfloat16() and multiplies_bfloat16("cpu")):
         pytest.skip("no bfloat16 instructions")
     pictures = _pictures(2)[:, frames]
@@ -137,15 +137,11 @@ def anew(tmp_path, monkeypatch):
         settings = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PHIL_KERNEL": "1", **environment}
         for name, value in settings.items():
             monkeypatch.setenv(name, value)
-        forget()
-        return kernel.load("trunk")
-
-    def forget():
         kernel.load.cache_clear()
-        kernel._library.cache_clear()
+        return kernel.load()
 
     yield load
-    forget()
+    kernel.load.cache_clear()
 
 
 @pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", None])
@@ -181,7 +177,7 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
 _PROGRAM = """
 from trainer.tests import test_kernel as tests
 tests._check(tests._pictures(5)[:, :2], tests._parameters(2))
-print("kernel" if tests.kernel.load("trunk") else "torch")
+print("kernel" if tests.kernel.load() else "torch")
 """
 
 

@@ -48,13 +48,13 @@ def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learn
         learning.finish()
     episode, after = learning.end_episode(0.0), learning.end_episode(0.0)
     found, none = (
-        (each.critic_loss, each.policy_loss, each.cloning_loss, each.value)
+        tuple(each[name] for name in ("critic_loss", "policy_loss", "cloning_loss", "value"))
         for each in (episode, after)
     )
     assert found == (2.0, 4.0, 6.0, 8.0)
-    assert 1.0 < episode.policy_priority <= 2.0
+    assert 1.0 < episode["policy_priority"] <= 2.0
     assert np.isnan(none).all()
-    assert after.learning_s == after.waiting_s == 0.0
+    assert after["learning_s"] == after["waiting_s"] == 0.0
 
 
 def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back():
@@ -89,8 +89,8 @@ def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):
     threading.Timer(0.02, let_go.set).start()
     waited_s = learning.finish()
     episode = learning.end_episode(0.0)
-    assert episode.waiting_s == waited_s > 0.0
-    assert episode.learning_s > 0.0
+    assert episode["waiting_s"] == waited_s > 0.0
+    assert episode["learning_s"] > 0.0
 
 
 def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):

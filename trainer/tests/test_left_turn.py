@@ -7,7 +7,7 @@ import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import constant_driver
 from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide
-from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnHuman, PedalPlan
+from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL, NOTHING, drive, episode
 
@@ -126,7 +126,7 @@ def test_foresight_agrees_with_what_then_happens():
 def test_a_near_car_blocks_and_a_far_one_does_not_unless_it_is_long(first_car_m, length_m, clear):
     env = environment(first_car_m=(first_car_m, first_car_m))
     env.traffic[0].LENGTH = length_m
-    assert LeftTurnExpert(env).crossing.clear(6.0, 1.5, LeftTurnExpert.GO) is clear
+    assert LeftTurnHuman(env).crossing.clear(6.0, 1.5, LeftTurnHuman.GO) is clear
 
 
 def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
@@ -173,7 +173,7 @@ def test_nobody_stops_in_the_lane_even_where_nothing_comes(place_m, speed_mps, p
 
 def test_a_plan_may_end_in_a_stop():
     env = environment(first_car_m=(60.0, 60.0))
-    crossing = LeftTurnExpert(env).crossing
+    crossing = LeftTurnHuman(env).crossing
     # 0.5 s at 4 m/s, then 2 m/s2: 2 m and 4 m, and a little for whole control periods.
     plan = PedalPlan(pedal=0.0, hold_s=0.5, then_brake=0.5)
     reached_m, speed_mps = crossing.state_after(6.0, plan)
@@ -193,7 +193,7 @@ def guided(guide: HumanGuide, action: np.ndarray):
 @pytest.mark.parametrize("pedal", [0.3, 1.0])
 def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
-    expert = LeftTurnExpert(env)
+    expert = LeftTurnHuman(env)
     for seed in range(15):
         guide = HumanGuide(expert, LeftTurnHuman(expert.env))
         _, info = drive(env, guided(guide, np.array([pedal], np.float32)), seed)

@@ -12,9 +12,7 @@ from trainer.training.delayed import (
     UNDER_WAY,
     DelayAware,
     DelayedPolicy,
-    DirectPolicy,
     VehicleEnd,
-    behind,
     ticks_late,
 )
 
@@ -149,9 +147,10 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
 
 
 def test_without_a_network_nothing_is_between():
-    for spec, kind in (("none", DirectPolicy), ("1ms", DelayedPolicy)):
-        between: Any = behind(parse_spec(spec), Kept(), Car())
-        assert type(between) is kind
+    for spec, there in (("none", False), ("1ms", True)):
+        between = DelayedPolicy(Kept(), Car(), parse_spec(spec))
+        between.start(frames(0), 0)
+        assert isinstance(between._vehicle_end, VehicleEnd) is there
 
 
 class Told:

@@ -22,7 +22,7 @@ from trainer.learner.td3 import Losses
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.tests.test_commands import refusal
 from trainer.training.config import RunConfig
-from trainer.training.delayed import behind
+from trainer.training.delayed import DelayedPolicy
 from trainer.training.run import TrainingRun
 
 POLICY, HUMAN = 0.25, -0.5
@@ -215,7 +215,7 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
 
 def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=7, human_steps=(4, 5))
-    run.policy = behind(parse_spec("up.loss=100%"), run.learning, run.env)
+    run.policy = DelayedPolicy(run.learning, run.env, parse_spec("up.loss=100%"))
     run.train()
     assert run.env.braked == [False, False, True, False, False, True, True]
 

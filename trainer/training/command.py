@@ -1,7 +1,5 @@
 """Train a policy with human guidance: options, settings, and whether a run may begin or go on."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import importlib
@@ -11,7 +9,6 @@ import os
 import re
 import sys
 import textwrap
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -52,8 +49,7 @@ DEFAULTS = RunConfig()
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
 DEVICES = ("cpu", "cuda")
-EXTENT = ("episodes", "steps")
-"""How long a run is: it may go on for longer."""
+EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 LEARNERS = tuple(field.name for field in fields(LearnerConfig))
 OWN = tuple(
     field.name for field in fields(RunConfig) if field.name not in (*OPTIONS, *EXTENT, "learner")
@@ -135,8 +131,7 @@ class Run:
     """A training run as a path: what is in its directory is all that there is of it."""
 
     directory: Path
-    interrupted: bool = False
-    """Whether it was asked to end before its time; ``resume`` goes on."""
+    interrupted: bool = False  # Whether it was asked to end before its time; ``resume`` goes on
 
     def __fspath__(self) -> str:
         return str(self.directory)
@@ -175,8 +170,8 @@ def train(
     ``settings`` what ``--set`` changes, name to value. Gives the run, for ``evaluate`` and
     ``export``.
 
-    Raises:
-        UserError: no such environment, algorithm, human or setting, or a directory that is taken.
+    Raises UserError: no such environment, algorithm, human or setting, or a directory that is
+    taken.
     """
     if device not in DEVICES:
         raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
@@ -213,8 +208,7 @@ def train(
     )  # fmt: skip
     with claimed(run_dir):
         check_directory(run_dir, config, resume)
-        end_s = math.inf if max_minutes is None else time.monotonic() + 60.0 * max_minutes
-        return _train(person, config, run_dir, rerun, end_s)
+        return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -352,8 +346,7 @@ def setting_lines() -> Iterator[str]:
 def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     """The config with one NAME=VALUE.
 
-    Raises:
-        UserError: no such setting, or no such value of it.
+    Raises UserError: no such setting, or no such value of it.
     """
     name, given, text = assignment.partition("=")
     if not given:

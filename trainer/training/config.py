@@ -1,7 +1,5 @@
 """What a training run is: everything that decides its result."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, field
@@ -9,28 +7,18 @@ from typing import Any
 
 from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
-from trainer.util import FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
 """More than a machine could use. Torch dies where the system has fewer than it asks for."""
 RANGES = {
-    "seed": (0, 2**63 - 1),
-    "episodes": FROM_ONE,
-    "steps": FROM_ZERO,
-    "guided_share": SHARE,
-    "guided_until_step": FROM_ZERO,
-    "guided_until_episode": FROM_ZERO,
-    "poor_guidance_share": SHARE,
-    "late_from_s": FROM_ZERO,
-    "late_to_s": FROM_ZERO,
-    "missed_share": SHARE,
-    "human_shift": (-2.0, 2.0),
-    "evaluate_every_steps": FROM_ZERO,
-    "evaluation_runs": FROM_ONE,
-    "checkpoint_every": FROM_ONE,
-    "threads": (0, MOST_THREADS),
+    FROM_ONE: ("episodes", "evaluation_runs", "checkpoint_every"),
+    SHARE: ("guided_share", "poor_guidance_share", "missed_share"),
+    (-2.0, 2.0): ("human_shift",),
+    (0, 2**63 - 1): ("seed",),
+    (0, MOST_THREADS): ("threads",),
 }
-"""What each number may be."""
+"""What these numbers may be; all others are at least 0."""
 CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
 """A run's settings in its directory; the first with the source's revision, the second for
 ``--config``."""

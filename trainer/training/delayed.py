@@ -13,8 +13,6 @@ only partially observed. `DelayAware` (``delay_known``) adds it to the observati
 delay constant by waiting.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -40,11 +38,7 @@ class DelayAware:
 
     With a constant delay and these actions the decision process is Markov again (Katsikopoulos and
     Engelbrecht, 2003; rtgym's action buffer). So a command that comes early waits (the conservative
-    agent). ``space`` and ``layout`` are of the larger observation.
-
-    Args:
-        env: the environment, whose actions are in [-1, 1].
-        spec: the network; it decides d.
+    agent). ``spec`` decides d; ``space`` and ``layout`` are of the larger observation.
     """
 
     def __init__(self, env: Any, spec: LatencySpec) -> None:
@@ -70,12 +64,9 @@ class DelayAware:
 class VehicleEnd:
     """One episode of a policy behind a network.
 
-    Args:
-        env: the scenario; its brake is pressed here when commands stop.
-        spec: the network, or one episode's link.
-        seed: of the network: the episode's, as in ``bridge simulate``.
-        observation: any one, for its size.
-        aware: where the policy sees what is on its way; then each command waits for its tick.
+    The brake of ``env`` is pressed here when commands stop. ``seed`` is the episode's, as in
+    ``bridge simulate``, ``observation`` any one, for its size. ``aware``: the policy sees what is
+    on its way, and each command waits for its tick.
     """
 
     def __init__(
@@ -103,13 +94,10 @@ class VehicleEnd:
         return self._link.hold.newest_step
 
     def tick(self, observation: Observation, policy: Policy) -> Action:
-        """Send the tick's observation, let the policy answer all that arrive, and decide.
+        """What the vehicle does, float32 [action size], once the policy has answered what arrives.
 
         The policy is asked for each fresh observation that reaches the edge within the tick: often
         one, but none or several where the network drops, delays or bundles them.
-
-        Returns:
-            What the vehicle does, float32 [action size].
         """
         self._link.send_state(self._step, observation)
         self._step += 1
@@ -182,41 +170,16 @@ class Store(Protocol):
         """
 
 
-class DirectPolicy:
-    """A policy as the training loop has it, without a network: it acts on what is there.
+class DelayedPolicy:
+    """The policy as the training loop has it: behind a network, in virtual time, or ``none``.
 
     Each tick goes to ``store`` as a transition.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
-
-    def start(self, observation: Observation, seed: int) -> None:
-        """Begin an episode; a network's luck depends on the seed."""
-        self._store.start_episode(observation)
-
-    def act(self, observation: Observation, policy: Policy) -> Action:
-        """What the vehicle is told in the tick of this observation."""
-        return policy(observation)
-
-    def yield_to_human(self) -> None:
-        """A human has taken over in this tick: only what they do moves the vehicle."""
-
-    def store(
-        self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
-    ) -> None:
-        """Keep the tick that led to ``observation``; arguments as ``Store.add``."""
-        self._store.add(action, reward, observation, *rest, **guidance)
-
-
-class DelayedPolicy(DirectPolicy):
-    """The policy behind a network, in virtual time."""
-
     def __init__(
         self, store: Store, env: Any, spec: LatencySpec, aware: DelayAware | None = None
     ) -> None:
-        super().__init__(store)
-        self._env, self._spec, self._aware = env, spec, aware
+        self._store, self._env, self._spec, self._aware = store, env, spec, aware
         late = aware.ticks if aware else ticks_late(spec, env.control_period_s)
         self._known: deque[Observation] = deque(maxlen=late + 1)
         """Observations of the ticks n - d to n."""
@@ -226,7 +189,9 @@ class DelayedPolicy(DirectPolicy):
 
     def start(self, observation: Observation, seed: int) -> None:
         """Begin an episode; the seed decides the network's luck."""
-        self._vehicle_end = VehicleEnd(self._env, self._spec, seed, observation, self._aware)
+        self._vehicle_end = None
+        if self._spec != LatencySpec():
+            self._vehicle_end = VehicleEnd(self._env, self._spec, seed, observation, self._aware)
         self._known.clear()
         self._carried_out.clear()
         self._storing = False
@@ -237,22 +202,27 @@ class DelayedPolicy(DirectPolicy):
         if not self._storing and len(self._known) == self._known.maxlen:
             self._store.start_episode(self._seen(self._known[0], self._carried_out))
             self._storing = True
-        return self._vehicle_end.tick(observation, policy)
+        end = self._vehicle_end
+        return end.tick(observation, policy) if end else policy(observation)
 
     def yield_to_human(self) -> None:
         """The vehicle lets go of the brake that it may have pressed for want of commands."""
-        self._vehicle_end.press_brake(False)
+        if self._vehicle_end:
+            self._vehicle_end.press_brake(False)
 
     def store(
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
-        """Keep the tick; the first d of an episode answer to nothing the policy could know."""
+        """Keep the tick that led to ``observation``; arguments as ``Store.add``.
+
+        The first d of an episode answer to nothing that the policy could know.
+        """
         if ahead := guidance.get("foreseen"):
             guidance["foreseen"] = self._foreseen(ahead, guidance["overruled"])
         self._carried_out.append(action)
         if self._storing:
             known = self._seen([*self._known, observation][1], self._carried_out)
-            super().store(action, reward, known, *rest, **guidance)
+            self._store.add(action, reward, known, *rest, **guidance)
 
     def _foreseen(self, ahead: Sequence[Observation], held: Action) -> list[Observation]:
         """The same, each as late as all that the policy sees."""
@@ -274,10 +244,3 @@ def ticks_late(spec: LatencySpec, period_s: float, jitters: float = 0.0) -> int:
     round_trip_s = (spec.up.delay_ms + spec.down.delay_ms + jitters * jitter_ms) * 1e-3
     beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW * period_s - ROUNDING_S)
     return math.ceil(beyond_window_s / period_s)
-
-
-def behind(
-    spec: LatencySpec, store: Store, env: Any, aware: DelayAware | None = None
-) -> DirectPolicy:
-    """The policy behind a network; ``none`` is no network."""
-    return DirectPolicy(store) if spec == LatencySpec() else DelayedPolicy(store, env, spec, aware)

@@ -5,13 +5,10 @@ an update on what was stored before is begun, the environment takes its step, th
 finished, and only then the step is stored.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,22 +23,8 @@ from trainer.learner.replay import PAPERS, Batch, Layout, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.util import Purpose, random_stream
 
-
-@dataclass(frozen=True)
-class EpisodeLearning:
-    """What the updates of an episode amount to; losses are means, nan where there was no update."""
-
-    learning_s: float
-    waiting_s: float
-    critic_loss: float
-    policy_loss: float
-    cloning_loss: float
-    value: float
-    policy_priority: float
-    human_priority: float
-
-
-NO_LOSSES = (math.nan,) * 4
+LOSSES = ("critic_loss", "policy_loss", "cloning_loss", "value")
+"""The means of an episode, in the order of ``Losses``."""
 
 
 class LearningThread:
@@ -51,17 +34,9 @@ class LearningThread:
     of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
     loop's thread, beside the update: a batch of one needs no other thread.
 
-    Args:
-        config: hyper-parameters.
-        algorithm: the row of the table of switches.
-        seed: of weights, noise and draws.
-        action_size: length of an action.
-        device: where the networks are; the replay buffer is in the processor's memory.
-        space: of the observations.
-        layout: how they lie in an array.
+    The networks are on ``device``, the replay buffer is in the processor's memory.
 
-    Raises:
-        UserError: there is no memory for the replay buffer.
+    Raises UserError: there is no memory for the replay buffer.
     """
 
     def __init__(
@@ -166,15 +141,21 @@ class LearningThread:
             self.replay.update_priorities(batch.indices, losses.priorities)
         return waited_s
 
-    def end_episode(self, progress: float) -> EpisodeLearning:
-        """What was learned since the last call; learning rates fall."""
+    def end_episode(self, progress: float) -> dict[str, Any]:
+        """What was learned since the last call, as fields of `EpisodeMetrics`; rates fall.
+
+        Losses are nan where there was no update.
+        """
         self.learner.decay_learning_rates(progress)
-        mean_losses = np.mean(self._losses, axis=0) if self._losses else NO_LOSSES
-        learned = EpisodeLearning(
-            self._learning_s,
-            self._waiting_s,
-            *map(float, [*mean_losses, *self.replay.mean_priorities()]),
-        )
+        means = np.mean(self._losses, axis=0) if self._losses else [math.nan] * len(LOSSES)
+        policy_priority, human_priority = self.replay.mean_priorities()
+        learned = {
+            **dict(zip(LOSSES, map(float, means), strict=True)),
+            "policy_priority": policy_priority,
+            "human_priority": human_priority,
+            "learning_s": self._learning_s,
+            "waiting_s": self._waiting_s,
+        }
         self._forget_episode()
         return learned
 

@@ -3,8 +3,6 @@
 Validation drives on seeds of their own, without help; the best actor is kept.
 """
 
-from __future__ import annotations
-
 import copy
 import csv
 import io
@@ -34,8 +32,7 @@ from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
-MOST_ENVIRONMENTS = 8
-"""Driven at once in validation: another environment than our two may be large."""
+MOST_ENVIRONMENTS = 8  # Driven at once in validation: another environment than our two may be large
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (
     "episode",
@@ -55,15 +52,11 @@ class EpisodeMetrics:
     """One training episode; a mean over its steps or updates where not said otherwise."""
 
     episode: int
-    total_steps: int = 0
-    """Environment steps since the run began."""
-    updates: int = 0
-    """Updates since the run began."""
+    total_steps: int = 0  # Environment steps since the run began
+    updates: int = 0  # Updates since the run began
     steps: int = 0
-    episode_return: float = 0.0
-    """Sum of the rewards, without the shaping of eq. 17."""
-    distance_m: float = 0.0
-    """Surviving distance."""
+    episode_return: float = 0.0  # Sum of the rewards, without the shaping of eq. 17
+    distance_m: float = 0.0  # Surviving distance
     outcome: str = ""
     interventions: int = 0
     human_steps: int = 0
@@ -74,19 +67,14 @@ class EpisodeMetrics:
     critic_loss: float = NAN
     policy_loss: float = NAN
     cloning_loss: float = NAN
-    value: float = NAN
-    """Mean Q_1 of the batches."""
-    policy_priority: float = NAN
-    """Mean priority of the policy's transitions at the episode's end."""
+    value: float = NAN  # Mean Q_1 of the batches
+    policy_priority: float = NAN  # Mean priority of the policy's transitions at the episode's end
     human_priority: float = NAN
     environment_s: float = 0.0
     """Time spent in the environment and with the human, while the learner updates."""
-    acting_s: float = 0.0
-    """Time of the policy's actions."""
-    storing_s: float = 0.0
-    """Time of drawing minibatches, storing steps and their new priorities."""
-    learning_s: float = 0.0
-    """Time of the updates themselves, beside the parts above."""
+    acting_s: float = 0.0  # Time of the policy's actions
+    storing_s: float = 0.0  # Time of drawing minibatches, storing steps and their new priorities
+    learning_s: float = 0.0  # Time of the updates themselves, beside the parts above
     waiting_s: float = 0.0
     """How long the loop waited for an update after the environment's step was done."""
     validation_success: float = NAN
@@ -150,8 +138,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
     A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
 
-    Raises:
-        UserError: the file is damaged, or not of this project.
+    Raises UserError: the file is damaged, or not of this project.
     """
     path = run_dir / METRICS_FILE
     if not path.exists():
@@ -268,8 +255,7 @@ class Validation(Trials):
         self.run_dir, self.learning, self.aware = run_dir, learning, aware
         self.best = (-1.0, -1.0)
         """Success and return of the best actor of those validated when it was due."""
-        self._best_actor: dict[str, Any] | None = None
-        """As in its file; None before the first one."""
+        self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
 
     def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
         """Add to ``metrics`` how the policy drives after ``episode`` episodes.

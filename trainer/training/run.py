@@ -1,7 +1,5 @@
 """One training run: algorithm 1 around an environment, a human and a learner."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from bridge.network import parse_spec
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
+from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
 from trainer.human.guide import STUCK, Asking, Guide, HumanGuide, Inattentive, Intervention, Trigger
@@ -23,7 +22,7 @@ from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
-from trainer.training.delayed import DelayAware, behind
+from trainer.training.delayed import DelayAware, DelayedPolicy
 from trainer.training.learning import Action, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -33,14 +32,6 @@ from trainer.training.metrics import (
     read_metrics,
     totals,
 )
-from trainer.util import (
-    Purpose,
-    episode_seed,
-    load_torch,
-    random_stream,
-    save_torch,
-    source_revision,
-)
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 
@@ -49,8 +40,7 @@ NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 def divergence_said(episode: int) -> Iterator[None]:
     """Turn the FloatingPointError of learning that diverged into a UserError.
 
-    Args:
-        episode: the one under way, from 0; people count from 1.
+    The episode under way counts from 0; people count from 1.
     """
     try:
         yield
@@ -80,15 +70,12 @@ def check_weights(learner: TD3Learner) -> None:
 class Seen:
     """One control period, once it is stored; nothing in it changes afterwards."""
 
-    observation: NDArray[Any]
-    """s."""
+    observation: NDArray[Any]  # s
     policy_action: NDArray[np.float32]
     """With the exploration's noise, as the vehicle would have had it."""
     intervention: Intervention | None
-    action: NDArray[np.float32]
-    """What was carried out."""
-    speed_mps: float
-    """After the step."""
+    action: NDArray[np.float32]  # What was carried out
+    speed_mps: float  # After the step
 
 
 OnStep = Callable[[Seen], None]
@@ -115,17 +102,15 @@ class TrainingRun:
             LearningThread(*switches, config.seed, action_size, config.device, *seen)
         )
         self.validation = Validation(config, run_dir, self.learning, aware)
-        self.policy = behind(self.network, self.learning, self.env, aware)
-        self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
-        self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
-        self.gate: Asking | None = None
-        """Where the robot asks for help."""
+        self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
+        self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
+        self.guidance = util.random_stream(config.seed, util.Purpose.GUIDANCE)
+        self.gate: Asking | None = None  # Where the robot asks for help
         self.guide = self._make_guide()
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, where the run is watched."""
-        self.quitting = False
-        """The episode under way is to be the last of this call."""
+        self.quitting = False  # The episode under way is to be the last of this call
         if resume:
             self._load()
 
@@ -139,7 +124,7 @@ class TrainingRun:
         Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
         ``resume`` goes on.
         """
-        about = {**self.config.as_dict(), "source_revision": source_revision()}
+        about = {**self.config.as_dict(), "source_revision": util.source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
         write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
         period_s = self.env.control_period_s
@@ -190,7 +175,7 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        save_torch(
+        util.save_torch(
             self.run_dir / CHECKPOINT_FILE,
             {
                 **self.config.label(self.episode),
@@ -212,7 +197,7 @@ class TrainingRun:
     def _load(self) -> None:
         path = self.run_dir / CHECKPOINT_FILE
         try:
-            self._restore(load_torch(path))
+            self._restore(util.load_torch(path))
         except (KeyError, TypeError, RuntimeError) as error:
             raise UserError(f"{path} does not fit this run") from error
 
@@ -253,7 +238,7 @@ class TrainingRun:
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
-        seed = episode_seed(config.seed, Purpose.TRAINING, self.episode)
+        seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.policy.start(observation, seed)
         self._drawn = np.zeros(self.env.action_space.shape)
@@ -271,7 +256,7 @@ class TrainingRun:
             distance_m=float(info["distance_m"]),
             outcome=info["outcome"],
             exploration_std=self._exploration_std(),
-            **vars(self.learning.end_episode(self.progress)),
+            **self.learning.end_episode(self.progress),
         )
 
     def _step(

@@ -5,8 +5,6 @@ package needs no compiler to be installed; without one, callers take their torch
 ``PHIL_KERNEL=0`` in the environment does the same on purpose.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib
@@ -28,8 +26,7 @@ from torch.autograd.function import once_differentiable
 _LOGGER = logging.getLogger(__name__)
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared")
 _OPENMP = "-fopenmp"
-_TIMEOUT_S = 120.0
-"""For a build; it takes a few."""
+_TIMEOUT_S = 120.0  # For a build; it takes a few
 
 
 class _BuildError(Exception):
@@ -37,8 +34,8 @@ class _BuildError(Exception):
 
 
 @functools.cache
-def load(name: str) -> ctypes.CDLL | None:
-    """The library built from ``<name>.cpp``, or None, with one warning, if there can be none.
+def load() -> ctypes.CDLL | None:
+    """The library built from ``trunk.cpp``, or None, with one warning, if there can be none.
 
     Import torch first: on Linux the kernel then shares the OpenMP threads that torch brought along.
     Two pools of threads would fight for the same cores.
@@ -46,15 +43,20 @@ def load(name: str) -> ctypes.CDLL | None:
     if os.environ.get("PHIL_KERNEL") == "0":
         return None
     try:
-        return _built(Path(__file__).with_name(f"{name}.cpp"))
+        library = _built(Path(__file__).with_name("trunk.cpp"))
     except (_BuildError, OSError, RuntimeError) as error:
         # RuntimeError: there is no home directory, hence no cache.
         _LOGGER.warning(
-            "no compiled %s kernel (%s): torch does its work, several times slower",
-            name,
+            "no compiled trunk kernel (%s): torch does its work, several times slower",
             " ".join(str(error).split()),
         )
         return None
+    pointer, threads = ctypes.c_void_p, ctypes.c_int
+    pictures = (pointer, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
+    library.trunk_forward.argtypes = (*pictures, *(pointer,) * 8, ctypes.c_int, threads)
+    library.trunk_backward.argtypes = (*pictures, *(pointer,) * 9, threads)
+    library.trunk_forward.restype = library.trunk_backward.restype = None
+    return library
 
 
 def _built(source: Path) -> ctypes.CDLL:
@@ -182,20 +184,8 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
         (frames.dtype, frames.device.type) == (torch.uint8, "cpu")
         and frames.shape[1:] in ((1, *_FRAME), (2, *_FRAME))
         and found == [(torch.float32, "cpu", shape) for shape in shapes]
-        and _library() is not None
+        and load() is not None
     )
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    library = load("trunk")
-    if library is not None:
-        pointer, threads = ctypes.c_void_p, ctypes.c_int
-        pictures = (pointer, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
-        library.trunk_forward.argtypes = (*pictures, *(pointer,) * 8, ctypes.c_int, threads)
-        library.trunk_backward.argtypes = (*pictures, *(pointer,) * 9, threads)
-        library.trunk_forward.restype = library.trunk_backward.restype = None
-    return library
 
 
 def _in_place(frames: Tensor) -> Tensor:
@@ -217,7 +207,7 @@ def _forward(
     frames: Tensor, parameters: tuple[Tensor, ...], saved: tuple[Tensor | None, ...]
 ) -> Tensor:
     """The features; ``saved`` (hidden, winners1, winners2) is filled unless it is of None."""
-    library = _library()
+    library = load()
     assert library is not None
     weight1, bias1, weight2, bias2 = parameters
     # Named, so that copies live until the kernel is done.
@@ -244,7 +234,7 @@ class _Trunk(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, frames: Tensor, *parameters: Tensor) -> Tensor:
-        library = _library()
+        library = load()
         assert library is not None
         frames = _in_place(frames)
         images = frames.shape[0]
@@ -257,7 +247,7 @@ class _Trunk(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        library = _library()
+        library = load()
         assert library is not None
         frames, weight2, *saved = ctx.saved_tensors
         given = (_channels_innermost(weight2), *saved, gradients[0].contiguous())
