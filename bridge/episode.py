@@ -17,7 +17,7 @@ import numpy as np
 from bridge.clocks import Clock
 from bridge.environments import Environment, entry_name
 from bridge.inbound import VehicleDecision
-from bridge.messages import Origin, Stamps
+from bridge.messages import Origin, Scene
 from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
 from edge_runtime.manifest import Layout, Task
@@ -104,8 +104,8 @@ def vehicle_action(
     return apply
 
 
-PublishScene = Callable[[Any, Stamps], None]
-"""Called with the environment and what is to stand beside its scene."""
+PublishScene = Callable[[Any, Scene], None]
+"""Called with the environment and what is to stand beside its own scene."""
 OnTick = Callable[[int, int, Decision], None]
 """Called with episode, step, decision after every tick."""
 
@@ -228,19 +228,13 @@ class EpisodeRunner:
 
     def _show(self, state: State) -> None:
         step, round_trip_ms = self.clock.newest_answer() or (None, None)
-        stamps = Stamps(
-            state.episode,
-            state.step,
-            state.sim_time_s,
-            round_trip_ms,
-            step,
-            self.rejected(),
-            self.task,
-            b"",
-            self.origin,
-            *self._applied,
+        applied, braked = self._applied
+        stamps = Scene(
+            episode=state.episode, step=state.step, sim_time_s=state.sim_time_s,
+            round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.rejected()),
+            task=self.task, origin=self.origin, applied=applied, braked=braked,
             ridden=self._ridden,
-        )
+        )  # fmt: skip
         self.publish_scene(self.environment, stamps)
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:

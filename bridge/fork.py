@@ -30,7 +30,7 @@ import numpy as np
 from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, InProcessClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
-from bridge.messages import DECODERS, Heard, Origin, Scene, Stamps, encode_scene
+from bridge.messages import DECODERS, STAMPS, Heard, Origin, Scene, encode_scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.record import RecordingWriter, new_recording
@@ -45,13 +45,13 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
 
-NOWHERE = Stamps(0, 0, 0.0)
+NOWHERE = Scene(episode=0, step=0, sim_time_s=0.0)
 
 
 def _told(payload: bytes) -> bytes:
     """What the environment itself tells in a scene, encoded."""
     fields = msgspec.msgpack.decode(payload)
-    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in NOWHERE._fields})
+    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in STAMPS})
 
 
 @dataclass
@@ -335,7 +335,7 @@ class ForkedDrive(InProcessClock):
             self._write("command", told, arrival.arrived_s)
         return command
 
-    def _show(self, environment: Environment, stamps: Stamps) -> None:
+    def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:
             self._write("scene", scene_payload(environment, stamps), stamps.sim_time_s)
 
