@@ -16,7 +16,6 @@ import numpy as np
 
 from bridge.clocks import Clock
 from bridge.environments import Environment, entry_name
-from bridge.inbound import VehicleDecision
 from bridge.messages import Origin, Scene
 from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
@@ -91,7 +90,6 @@ def vehicle_action(
     place = list(action_names).index(PEDAL) if PEDAL in action_names else None
 
     def apply(actuators: Actuators, decision: Decision) -> np.ndarray:
-        assert isinstance(decision, VehicleDecision)
         actuators.brake(bool(decision.brake_reason))
         if decision.feedback is None:
             return actuators.stop()
