@@ -114,15 +114,13 @@ class EpisodeRunner:
 
     environment: Environment
     clock: Clock
-    session: str
     publish_scene: PublishScene
     on_tick: OnTick
     task: Task
-    apply: Apply = policy_action
-    standing: bool = False
-    rejected: Callable[[], Mapping[str, int]] = dict
-    origin: Origin | None = None
+    origin: Origin
     """Of the drive, to be told with every scene; each episode has a seed of its own."""
+    apply: Apply = policy_action
+    rejected: Callable[[], Mapping[str, int]] = dict
 
     def __post_init__(self) -> None:
         self._layout, self._period_s = Layout(self.task), self.task.control_period_s
@@ -136,7 +134,7 @@ class EpisodeRunner:
         self._ridden = 0  # In the tick before: of the plan
         self._under_way: State | None = None
         self._applied: tuple[list[float] | None, bool] = (None, False)
-        self._options = {"standing": True} if self.standing else None
+        self._options = {"standing": True} if self.origin.standing else None
 
     def show_task(self, seed: int) -> None:
         """Send one state, the final one already, so that the edge runtime compares it as well.
@@ -164,8 +162,7 @@ class EpisodeRunner:
         observation, info = self.environment.reset(seed=seed, options=self._options)
         self.clock.begin(episode, seed)
         self._ridden = 0
-        if self.origin is not None:
-            self.origin = msgspec.structs.replace(self.origin, seed=seed)
+        self.origin = msgspec.structs.replace(self.origin, seed=seed)
         self._applied = (None, False)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
         lateral_mps2: list[float] = []
@@ -208,7 +205,7 @@ class EpisodeRunner:
         self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
     ) -> State:
         return State(
-            session=self.session,
+            session=self.origin.session,
             episode=episode,
             step=step,
             sim_time_s=round(step * self._period_s, 6),

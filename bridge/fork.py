@@ -278,9 +278,8 @@ class ForkedDrive(InProcessClock):
             self._drive.origin, session="fork", latency=str(self.network)
         )
         runner = EpisodeRunner(
-            self._environment, self, origin.session, self._show, lambda *_: None, self._task,
-            self._apply, origin.standing, origin=origin,
-        )  # fmt: skip
+            self._environment, self, self._show, lambda *_: None, self._task, origin, self._apply
+        )
         return runner.run(0, origin.seed)
 
     def exchange(self, state: State) -> Decision:

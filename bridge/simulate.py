@@ -142,13 +142,11 @@ def _drive(
     runner = EpisodeRunner(
         environment,
         clock,
-        port.session,
         port.publish_scene,
         on_tick,
         task,
+        Origin(session=port.session, environment=asked.env, latency=network, **how),
         apply=vehicle_action(action_names, pedal_for_speed) if vehicle else policy_action,
-        standing=asked.standing,
-        origin=Origin(session=port.session, environment=asked.env, latency=network, **how),
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
