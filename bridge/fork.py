@@ -38,6 +38,7 @@ from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
+from edge_runtime.config import add_trust
 from edge_runtime.controller import Controller, Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
@@ -379,12 +380,10 @@ def add_common(parser: Any) -> None:
 def _add_fork_arguments(parser: Any) -> None:
     add_common(parser)
     policy = "who drives on (default: the recorded commands, while all is as recorded)"
-    unsigned = "also take a policy whose origin cannot be verified"
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     record = "record the fork, as `bridge record` does; of a person's, the directory"
     parser.add_argument("--policy", metavar="POLICY.onnx", help=policy)
-    cli.add_public_key(parser)
-    parser.add_argument("--allow-unsigned", action="store_true", help=unsigned)
+    add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
     parser.add_argument("--human", metavar="keyboard|gamepad|wheel|web", help=human)
     parser.add_argument("--record", metavar="G.mcap", help=record)
