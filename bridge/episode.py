@@ -204,22 +204,20 @@ class EpisodeRunner:
     def _state(
         self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
     ) -> State:
+        packed = {}
+        if observation is not None:
+            packed = pack(self._layout, self.environment, observation)
         return State(
             session=self.origin.session,
             episode=episode,
             step=step,
             sim_time_s=round(step * self._period_s, 6),
             sent_ns=0,  # The clock stamps it when it sends it.
-            observation=self._pack(observation),
+            observation=packed,
             speed_mps=_speed_mps(info),
             final=final,
             task=self.task.text,
         )
-
-    def _pack(self, observation: Any) -> dict[str, bytes]:
-        if observation is None:
-            return {}
-        return pack(self._layout, self.environment, observation)
 
     def _show(self, state: State) -> None:
         step, round_trip_ms = self.clock.newest_answer() or (None, None)

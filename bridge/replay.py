@@ -203,7 +203,8 @@ class RecordedDrive:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
         if heard.topic == "state" and not self.period_s:
-            self._take_period(heard)
+            state = DECODERS["state"](heard.payload)
+            self.period_s = period_of(state) if isinstance(state, State) else 0.0
         if heard.topic == "scene" and self.task is None:
             self.task = getattr(DECODERS["scene"](heard.payload), "task", None)
         if heard.topic not in ("command", "health"):
@@ -217,10 +218,6 @@ class RecordedDrive:
             start_s = heard_s - message.uptime_s
             if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
                 self.runtime_starts_s.append(start_s)
-
-    def _take_period(self, heard: Heard) -> None:
-        state = DECODERS["state"](heard.payload)
-        self.period_s = period_of(state) if isinstance(state, State) else 0.0
 
     def _take_command(self, command: Command, heard_s: float) -> None:
         if command.policy_id not in self.policy_ids:
