@@ -317,7 +317,7 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     # A silent vehicle may still speak between the mark and the switch, and what it says counts.
     # What another says after the switch is no good any more.
     end_s = stop.seen_s if word == "silent" else begin_s
-    last_s = max(s for s in rig.timeline.feedback_s if s < end_s)
+    last_s = max(s for s, _ in rig.timeline.feedback if s < end_s)
     sleep_until(begin_s + LASTS_S)
     said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(VEHICLE, None)
