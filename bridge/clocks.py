@@ -23,7 +23,7 @@ from typing import Any
 
 import msgspec
 
-from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold, VehicleDecision
+from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold
 from bridge.network import Direction, EventHeap, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
@@ -50,10 +50,8 @@ class _Clock:
     def __init__(
         self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
     ) -> None:
-        self._period_s, self._silence_s = (
-            task.control_period_s,
-            SILENCE_PERIODS * task.control_period_s,
-        )
+        self._period_s = task.control_period_s
+        self._silence_s = SILENCE_PERIODS * self._period_s
         self._window_s = COMMAND_WINDOW * task.control_period_s
         self._observation_bytes = Layout(task).size
         self.latencies_ms: list[float] = []
@@ -366,7 +364,7 @@ class VehicleClock(RealTimeClock):
             "moving_starts": self.moving_starts,
         }
 
-    def exchange(self, state: State) -> VehicleDecision:
+    def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and at the next tick say what the vehicle has done."""
         end_s = self._send_state(state) + self._period_s
         time.sleep(max(0.0, end_s - time.monotonic()))

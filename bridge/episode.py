@@ -16,8 +16,7 @@ import numpy as np
 
 from bridge.clocks import Clock
 from bridge.environments import Environment, entry_name
-from bridge.inbound import VehicleDecision
-from bridge.messages import Origin, Stamps
+from bridge.messages import Origin, Scene
 from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
 from edge_runtime.manifest import Layout, Task
@@ -91,7 +90,6 @@ def vehicle_action(
     place = list(action_names).index(PEDAL) if PEDAL in action_names else None
 
     def apply(actuators: Actuators, decision: Decision) -> np.ndarray:
-        assert isinstance(decision, VehicleDecision)
         actuators.brake(bool(decision.brake_reason))
         if decision.feedback is None:
             return actuators.stop()
@@ -104,8 +102,8 @@ def vehicle_action(
     return apply
 
 
-PublishScene = Callable[[Any, Stamps], None]
-"""Called with the environment and what is to stand beside its scene."""
+PublishScene = Callable[[Any, Scene], None]
+"""Called with the environment and what is to stand beside its own scene."""
 OnTick = Callable[[int, int, Decision], None]
 """Called with episode, step, decision after every tick."""
 
@@ -116,15 +114,13 @@ class EpisodeRunner:
 
     environment: Environment
     clock: Clock
-    session: str
     publish_scene: PublishScene
     on_tick: OnTick
     task: Task
-    apply: Apply = policy_action
-    standing: bool = False
-    rejected: Callable[[], Mapping[str, int]] = dict
-    origin: Origin | None = None
+    origin: Origin
     """Of the drive, to be told with every scene; each episode has a seed of its own."""
+    apply: Apply = policy_action
+    rejected: Callable[[], Mapping[str, int]] = dict
 
     def __post_init__(self) -> None:
         self._layout, self._period_s = Layout(self.task), self.task.control_period_s
@@ -138,7 +134,7 @@ class EpisodeRunner:
         self._ridden = 0  # In the tick before: of the plan
         self._under_way: State | None = None
         self._applied: tuple[list[float] | None, bool] = (None, False)
-        self._options = {"standing": True} if self.standing else None
+        self._options = {"standing": True} if self.origin.standing else None
 
     def show_task(self, seed: int) -> None:
         """Send one state, the final one already, so that the edge runtime compares it as well.
@@ -166,8 +162,7 @@ class EpisodeRunner:
         observation, info = self.environment.reset(seed=seed, options=self._options)
         self.clock.begin(episode, seed)
         self._ridden = 0
-        if self.origin is not None:
-            self.origin = msgspec.structs.replace(self.origin, seed=seed)
+        self.origin = msgspec.structs.replace(self.origin, seed=seed)
         self._applied = (None, False)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
         lateral_mps2: list[float] = []
@@ -209,38 +204,30 @@ class EpisodeRunner:
     def _state(
         self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
     ) -> State:
+        packed = {}
+        if observation is not None:
+            packed = pack(self._layout, self.environment, observation)
         return State(
-            session=self.session,
+            session=self.origin.session,
             episode=episode,
             step=step,
             sim_time_s=round(step * self._period_s, 6),
             sent_ns=0,  # The clock stamps it when it sends it.
-            observation=self._pack(observation),
+            observation=packed,
             speed_mps=_speed_mps(info),
             final=final,
             task=self.task.text,
         )
 
-    def _pack(self, observation: Any) -> dict[str, bytes]:
-        if observation is None:
-            return {}
-        return pack(self._layout, self.environment, observation)
-
     def _show(self, state: State) -> None:
         step, round_trip_ms = self.clock.newest_answer() or (None, None)
-        stamps = Stamps(
-            state.episode,
-            state.step,
-            state.sim_time_s,
-            round_trip_ms,
-            step,
-            self.rejected(),
-            self.task,
-            b"",
-            self.origin,
-            *self._applied,
+        applied, braked = self._applied
+        stamps = Scene(
+            episode=state.episode, step=state.step, sim_time_s=state.sim_time_s,
+            round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.rejected()),
+            task=self.task, origin=self.origin, applied=applied, braked=braked,
             ridden=self._ridden,
-        )
+        )  # fmt: skip
         self.publish_scene(self.environment, stamps)
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:

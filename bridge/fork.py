@@ -30,7 +30,7 @@ import numpy as np
 from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, InProcessClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
-from bridge.messages import DECODERS, Heard, Origin, Scene, Stamps, encode_scene
+from bridge.messages import DECODERS, STAMPS, Heard, Origin, Scene, encode_scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.record import RecordingWriter, new_recording
@@ -38,6 +38,7 @@ from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
+from edge_runtime.config import add_trust
 from edge_runtime.controller import Controller, Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
@@ -45,13 +46,13 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
 
-NOWHERE = Stamps(0, 0, 0.0)
+NOWHERE = Scene(episode=0, step=0, sim_time_s=0.0)
 
 
 def _told(payload: bytes) -> bytes:
     """What the environment itself tells in a scene, encoded."""
     fields = msgspec.msgpack.decode(payload)
-    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in NOWHERE._fields})
+    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in STAMPS})
 
 
 @dataclass
@@ -278,9 +279,8 @@ class ForkedDrive(InProcessClock):
             self._drive.origin, session="fork", latency=str(self.network)
         )
         runner = EpisodeRunner(
-            self._environment, self, origin.session, self._show, lambda *_: None, self._task,
-            self._apply, origin.standing, origin=origin,
-        )  # fmt: skip
+            self._environment, self, self._show, lambda *_: None, self._task, origin, self._apply
+        )
         return runner.run(0, origin.seed)
 
     def exchange(self, state: State) -> Decision:
@@ -335,7 +335,7 @@ class ForkedDrive(InProcessClock):
             self._write("command", told, arrival.arrived_s)
         return command
 
-    def _show(self, environment: Environment, stamps: Stamps) -> None:
+    def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:
             self._write("scene", scene_payload(environment, stamps), stamps.sim_time_s)
 
@@ -380,12 +380,10 @@ def add_common(parser: Any) -> None:
 def _add_fork_arguments(parser: Any) -> None:
     add_common(parser)
     policy = "who drives on (default: the recorded commands, while all is as recorded)"
-    unsigned = "also take a policy whose origin cannot be verified"
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     record = "record the fork, as `bridge record` does; of a person's, the directory"
     parser.add_argument("--policy", metavar="POLICY.onnx", help=policy)
-    cli.add_public_key(parser)
-    parser.add_argument("--allow-unsigned", action="store_true", help=unsigned)
+    add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
     parser.add_argument("--human", metavar="keyboard|gamepad|wheel|web", help=human)
     parser.add_argument("--record", metavar="G.mcap", help=record)

@@ -10,7 +10,7 @@ import contextlib
 import threading
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import msgspec
 
@@ -202,15 +202,6 @@ NO_FEEDBACK = "no_feedback"
 SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
 
 
-@dataclass(frozen=True)
-class VehicleDecision(Decision):
-    """What the vehicle did in one tick; without feedback, that is unknown."""
-
-    feedback: Feedback | None = None
-    feedback_age_s: float | None = None
-    """From its arrival here, before any injected delay; None without feedback."""
-
-
 class FeedbackHold:
     """The newest feedback, and how long ago it arrived. Times are monotonic seconds."""
 
@@ -228,7 +219,7 @@ class FeedbackHold:
         silent = now_s - self._heard_s > self._silence_s + ROUNDING_S
         return None if silent else self._newest
 
-    def decide(self, heard: Decision, episode: int, now_s: float) -> VehicleDecision:
+    def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
         """Say what the vehicle did in the tick that ends now.
 
         ``heard`` is what its commands would have it do: the simulator hears those, too. They give
@@ -245,11 +236,9 @@ class FeedbackHold:
             reason = heard.brake_reason or UNKNOWN_SAFE_STOP
         elif feedback.self_braking:
             reason = SELF_BRAKING
-        return VehicleDecision(
-            command=heard.command,
-            fresh=heard.fresh,
+        return replace(
+            heard,
             brake_reason=reason,
-            undriven_s=heard.undriven_s,
             command_age_s=None if reason else heard.command_age_s,
             ridden=0 if reason else heard.ridden,
             feedback=feedback,

@@ -106,23 +106,8 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     ridden: int = 0
 
 
-class Stamps(NamedTuple):
-    """What the simulator adds to an environment's ``scene()``: the fields of ``Scene``."""
-
-    episode: int
-    step: int
-    sim_time_s: float
-    round_trip_ms: float | None = None
-    answered_step: int | None = None
-    rejected: Mapping[str, int] = {}
-    task: Task | None = None
-    picture: bytes = b""
-    origin: Origin | None = None
-    applied: Sequence[float] | None = None
-    braked: bool = False
-    ridden: int = 0
-
-
+STAMPS = tuple(n for n in Scene.__struct_fields__ if n not in SeenScene.__struct_fields__)
+"""What of a scene the simulator adds to the environment's own ``scene()``."""
 _ENCODER = msgspec.msgpack.Encoder(
     enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 )
@@ -134,9 +119,9 @@ def scene_key(vehicle_id: str) -> str:
     return f"phil/{check_vehicle_id(vehicle_id)}/scene"
 
 
-def encode_scene(scene: dict[str, Any], stamps: Stamps) -> bytes:
-    """Encode an environment's ``scene()`` with its place in time as a MessagePack map."""
-    return _ENCODER.encode({**scene, **stamps._asdict()})
+def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
+    """Encode an environment's ``scene()`` with the STAMPS of another as a MessagePack map."""
+    return _ENCODER.encode({**scene, **{name: getattr(stamps, name) for name in STAMPS}})
 
 
 def read_scene(scene: Mapping[str, Any]) -> SeenScene:

@@ -23,7 +23,7 @@ import zenoh
 
 from bridge.environments import picture_of, scene_of
 from bridge.inbound import EdgeCounts
-from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
+from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Scene, encode_scene, scene_key
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
 from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
@@ -49,11 +49,11 @@ def simulator_key(vehicle_id: str) -> str:
     return f"phil/{vehicle_id}/simulator"
 
 
-def scene_payload(environment: Any, stamps: Stamps) -> bytes:
+def scene_payload(environment: Any, stamps: Scene) -> bytes:
     """The scene as it is sent, or else the environment's picture."""
     scene = scene_of(environment)
     if scene is None:
-        stamps = stamps._replace(picture=picture_of(environment))
+        stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
     return encode_scene(scene or {}, stamps)
 
 
@@ -87,7 +87,7 @@ class SimulatorPort:
         """Send an encoded state to the edge runtime (and to viewers)."""
         self._states.put(payload)
 
-    def publish_scene(self, environment: Any, stamps: Stamps) -> None:
+    def publish_scene(self, environment: Any, stamps: Scene) -> None:
         """Send the scene, or else the environment's picture, if anybody is listening."""
         somebody: Any = self._scenes.matching_status
         if not somebody.matching:

@@ -326,17 +326,11 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
     return vehicle_id or there.pop()
 
 
-def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
+def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
     """The wire's messages of one vehicle as a listener would have heard them, in their order.
 
-    The recording may be cut off or damaged, and says so afterwards. ``vehicle_id`` None: the only
-    one in it. UserError: no recording, no such vehicle in it, or several and none is named.
+    The recording may be cut off or damaged, and says so afterwards.
     """
-    return heard_of(recording, choose_vehicle(recording, vehicle_id))
-
-
-def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
-    """As `read_heard`, of a vehicle that is known to be there."""
     for stored in recording.messages():
         vehicle, topic = _wire_topic(stored)
         if vehicle == vehicle_id:

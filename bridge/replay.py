@@ -24,8 +24,8 @@ from bridge.messages import DECODERS, Heard, period_of
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of
-from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
-from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.cli import ArgumentParser, examples, not_negative_number
+from edge_runtime.config import NONE, Config, add_trust, load_config
 from edge_runtime.controller import Controller, Limits, Order, Received, shared_limits
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
@@ -65,9 +65,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_options(through, "--listen", help=f"{live} that connects here")
     add_options(through, "--connect", default=None, help=f"{live} behind this router")
     add_options(parser, "--tls", "--wait-edge-s", "--out")
-    add_public_key(parser)
-    unsigned = "also take a policy whose origin cannot be verified"
-    parser.add_argument("--allow-unsigned", action="store_true", help=unsigned)
+    add_trust(parser)
     config = "with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
     config += " model or scale was not the default"
     parser.add_argument("--config", metavar="FILE.toml", help=config)
@@ -205,7 +203,8 @@ class RecordedDrive:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
         if heard.topic == "state" and not self.period_s:
-            self._take_period(heard)
+            state = DECODERS["state"](heard.payload)
+            self.period_s = period_of(state) if isinstance(state, State) else 0.0
         if heard.topic == "scene" and self.task is None:
             self.task = getattr(DECODERS["scene"](heard.payload), "task", None)
         if heard.topic not in ("command", "health"):
@@ -219,10 +218,6 @@ class RecordedDrive:
             start_s = heard_s - message.uptime_s
             if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
                 self.runtime_starts_s.append(start_s)
-
-    def _take_period(self, heard: Heard) -> None:
-        state = DECODERS["state"](heard.payload)
-        self.period_s = period_of(state) if isinstance(state, State) else 0.0
 
     def _take_command(self, command: Command, heard_s: float) -> None:
         if command.policy_id not in self.policy_ids:

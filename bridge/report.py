@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -296,10 +296,9 @@ def lag_ms(series: Sequence[Series]) -> float | None:
     return None if best_s[-1] == delays_s[-1] else round(float(best_s.mean()) * 1e3, 3)
 
 
-@dataclass
-class _Episode:
-    commands: list[Command] = field(default_factory=list)
-    feedback: list[Feedback] = field(default_factory=list)
+class _Episode(NamedTuple):
+    commands: list[Command]
+    feedback: list[Feedback]
 
 
 class TrackingLog:
@@ -322,7 +321,7 @@ class TrackingLog:
 
     def begin(self) -> None:
         """Note that an episode begins."""
-        self._open = _Episode()
+        self._open = _Episode([], [])
         self._episodes.append(self._open)
 
     def end(self) -> None:

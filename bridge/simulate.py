@@ -19,7 +19,7 @@ from bridge.environments import (
     make_environment,
     scenarios,
 )
-from bridge.episode import Apply, EpisodeRunner, policy_action, vehicle_action
+from bridge.episode import EpisodeRunner, policy_action, vehicle_action
 from bridge.inbound import CommandCheck, FeedbackCheck
 from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
@@ -127,6 +127,9 @@ def _drive(
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     action_names = [action.name for action in task.action]
+    pedal_for_speed = getattr(environment.unwrapped, "pedal_for_speed", None)
+    how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
+    network = str(asked.latency)
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
     rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
@@ -139,13 +142,11 @@ def _drive(
     runner = EpisodeRunner(
         environment,
         clock,
-        port.session,
         port.publish_scene,
         on_tick,
         task,
-        apply=_vehicle_action(environment, action_names) if vehicle else policy_action,
-        standing=asked.standing,
-        origin=_origin(asked, port.session),
+        Origin(session=port.session, environment=asked.env, latency=network, **how),
+        apply=vehicle_action(action_names, pedal_for_speed) if vehicle else policy_action,
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
@@ -173,9 +174,8 @@ def _drive(
         runner.command_ages_ms,
         facts={
             "scenario": task.task,
-            **{name: getattr(asked, name) for name in ("condition", "seed", "clock", "loop")},
-            "standing": asked.standing,
-            "latency_spec": str(asked.latency),
+            **how,
+            "latency_spec": network,
             "policy_ids": check.policy_ids,
             "deadline_misses": runner.deadline_misses,
             "ridden_steps": runner.ridden_steps,
@@ -188,17 +188,6 @@ def _drive(
             "vehicle": vehicle.report(action_names) if vehicle else None,
         },
     )
-
-
-def _origin(asked: Namespace, session: str) -> Origin:
-    """What is told of the drive, so that it can be driven again."""
-    names = ("condition", "seed", "standing", "clock", "loop")
-    told = {name: getattr(asked, name) for name in names}
-    return Origin(session=session, environment=asked.env, latency=str(asked.latency), **told)
-
-
-def _vehicle_action(environment: Environment, action_names: list[str]) -> Apply:
-    return vehicle_action(action_names, getattr(environment.unwrapped, "pedal_for_speed", None))
 
 
 def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str) -> None:

@@ -33,7 +33,7 @@ from edge_runtime.safety import (
     classify_fresh,
     note_arrival,
 )
-from edge_runtime.wire import DRIVE, SAFE_STOP, Command
+from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Feedback
 
 SILENCE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
 COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
@@ -58,6 +58,10 @@ class Decision:
     """From the sending of the state that the obeyed command answers; None where none is obeyed."""
     ridden: int = 0
     """Which action of its plan ``command`` has in the place of its own; 0: its own."""
+    feedback: Feedback | None = None
+    """What the vehicle in the loop says of the tick; None without one, or where it is silent."""
+    feedback_age_s: float | None = None
+    """From its arrival here, before any injected delay."""
 
 
 class CommandHold:

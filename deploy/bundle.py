@@ -310,8 +310,9 @@ def build_installer() -> bytes:
     """The bytes of `install.pyz`."""
     folder = Path(deploy.installer.__file__).parent
     members = {"__main__.py": _MAIN, "deploy/__init__.py": ""}
-    for path in sorted(folder.glob("*.py")):
-        members[f"deploy/installer/{path.name}"] = path.read_text()
+    shared = (ROOT / "edge_runtime" / f"{name}.py" for name in ("__init__", "cli", "util"))
+    for path in (*sorted(folder.glob("*.py")), *shared):
+        members[path.relative_to(ROOT).as_posix()] = path.read_text()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
         for name, text in members.items():

@@ -138,7 +138,7 @@ def run_latency(
     """Drive every network of the axes; the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
     keep = out.with_name(f"{out.stem}_rows")
-    found = sweep.drive_all(task, specs, PART_EPISODES, sweep.drive_network, jobs, keep)
+    found = sweep.drive_all(task, specs, PART_EPISODES, jobs, keep)
     rows = {spec: sweep.make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
     told = ("name", "title", "unit", "values", "specs")

@@ -11,7 +11,7 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -162,15 +162,13 @@ def drive_all(
     task: Task,
     points: Sequence[str],
     size: int,
-    drive: Callable[[Task, Part], list[dict[str, Any]]],
     jobs: int,
     keep: Path,
 ) -> dict[str, list[dict[str, Any]]]:
     """Drive the task's episodes at every point, ``jobs`` parts at a time; the results by point.
 
-    A part has ``size`` episodes at most. What ``drive`` gives for it is kept in the directory
-    ``keep``, in a file named by a hash of all that decides it, and not driven again. ``drive`` is
-    called in threads.
+    A part has ``size`` episodes at most. What `drive_network` gives for it is kept in the directory
+    ``keep``, in a file named by a hash of all that decides it, and not driven again.
 
     Raises:
         UserError: there can be no such directory, a kept result is no JSON, or a drive failed.
@@ -178,7 +176,7 @@ def drive_all(
     ours = task.scenario in SCENARIOS
     environment = asdict(make_environment(task.scenario, task.condition).config) if ours else None
     deciding = {
-        "format": FORMAT, "drive": drive.__name__, "policy": task.policy_id,
+        "format": FORMAT, "drive": "drive_network", "policy": task.policy_id,
         "scenario": task.scenario, "condition": task.condition, "environment": environment,
     }  # fmt: skip
     make_directory(keep)
@@ -198,18 +196,17 @@ def drive_all(
             bar.advance({"of": one.point})
 
         missing = [one for one in parts if one not in found]
-        in_parallel(partial(drive, task), missing, jobs, on_done)
+        in_parallel(partial(drive_network, task), missing, jobs, on_done)
     return {
         point: [result for one in parts if one.point == point for result in found[one]]
         for point in points
     }
 
 
-def run_rig(task: Task, part: Part, limit_s: float, *options: str) -> Any:
+def run_rig(task: Task, part: Part) -> Any:
     """Drive a part through processes of its own; the simulator's report, with its command.
 
-    The simulator gets further ``options`` and ends within ``limit_s``. Raises UserError where a
-    command failed, or did not end (CommandTimeoutError).
+    Raises UserError where a command failed, or did not end (CommandTimeoutError).
     """
     endpoint = free_endpoint()
     common = ("--vehicle-id", VEHICLE_ID)
@@ -219,9 +216,9 @@ def run_rig(task: Task, part: Part, limit_s: float, *options: str) -> Any:
         Process(*edge, "--connect", endpoint, ready="ready"),
     ):
         return simulate(
-            endpoint, Path(folder) / "report.json", limit_s, *common, "--env", task.scenario,
+            endpoint, Path(folder) / "report.json", PART_LIMIT_S, *common, "--env", task.scenario,
             "--condition", task.condition, "--episodes", str(part.runs), "--seed", str(part.seed),
-            *options,
+            "--clock", "lockstep", "--latency", part.point,
         )  # fmt: skip
 
 
@@ -245,8 +242,7 @@ def drive_network(task: Task, part: Part, attempts: int = ATTEMPTS) -> list[dict
     virtual time knows nothing of that.
     """
     try:
-        network = ("--clock", "lockstep", "--latency", part.point)
-        report = run_rig(task, part, PART_LIMIT_S, *network)
+        report = run_rig(task, part)
     except UserError as error:
         # Any process of the machine may take the port before we do. And lock-step crawls beside an
         # edge runtime that has lost its wire: each step waits.

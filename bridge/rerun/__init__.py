@@ -23,6 +23,7 @@ from urllib.parse import quote
 
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import behind_link, check_writable, make_directory
+from edge_runtime.reach import check_port_is_free, free_endpoint
 from edge_runtime.util import UserError
 
 if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without it
@@ -117,12 +118,10 @@ def check_sink(sink: Sink | None) -> Sink:
         check_writable(sink.path)
     elif sink.kind == SERVE:
         for port in (GRPC_PORT, WEB_PORT):  # a view of somebody else may be there
-            with socket.socket() as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                try:
-                    probe.bind((LOOPBACK, port))
-                except OSError:
-                    raise UserError(f"port {port} is in use; end the other rerun first") from None
+            try:
+                check_port_is_free(f"tcp/{LOOPBACK}:{port}")
+            except UserError:
+                raise UserError(f"port {port} is in use; end the other rerun first") from None
     elif sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
@@ -250,9 +249,7 @@ class Viewer:
 
 def free_port() -> int:
     """A port that is not in use."""
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
+    return int(free_endpoint().rpartition(":")[2])
 
 
 def _answers(port: int) -> bool:

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from bridge.messages import DECODERS, Heard, Pace, Scene, images_of, is_picture, period_of
 from bridge.ports import add_options, open_listener, wait_to_be_told
-from bridge.recording import Recording, read_heard
+from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.rerun import APPLIED, POLICY, SERVE, Sink, add_sink, check_sink, draw, flush, open_sink
 from bridge.rerun.draw import Plot
 from bridge.virtual_link import SILENCE_PERIODS
@@ -76,7 +76,7 @@ def run(arguments: Any) -> int:
 def _show_recording(arguments: Any, sink: Sink) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
     file = Recording(Path(arguments.recording))
-    heard = read_heard(file, arguments.vehicle_id)
+    heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
     first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,

@@ -22,7 +22,7 @@ from bridge.fork import ForkedDrive, RecordedEpisode
 from bridge.messages import Origin
 from bridge.policy_file import make_policy as make_any_policy
 from bridge.record import RecordingWriter
-from bridge.recording import Recording, read_heard
+from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.tests.harness import (
     LEFT_TURN,
     TOY,
@@ -164,7 +164,8 @@ def test_a_fork_that_nobody_can_drive_says_so(refusal):
 def rewritten(path: Path, out: Path, change) -> Path:
     """The recording with ``change(topic, message)`` in the place of each message, None: without."""
     with contextlib.closing(RecordingWriter(out)) as writer:
-        for heard in read_heard(Recording(path), None):
+        recording = Recording(path)
+        for heard in heard_of(recording, choose_vehicle(recording, None)):
             message = msgspec.msgpack.decode(heard.payload)
             if (message := change(heard.topic, message)) is not None:
                 payload = msgspec.msgpack.encode(message)

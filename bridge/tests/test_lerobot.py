@@ -12,7 +12,7 @@ import pandas as pd  # type: ignore[import-untyped]
 import pytest
 from pyarrow import parquet
 
-from bridge.messages import Stamps, encode_scene
+from bridge.messages import Scene, encode_scene
 from bridge.record import RawImage, describe
 from bridge.rerun import free_port
 from bridge.tests import harness
@@ -38,7 +38,8 @@ FILE = "chunk-000/file-000"
 
 def recorded(path, task):
     with writing(path) as writer:
-        writer.write(heard("scene", encode_scene({}, Stamps(0, 0, 0.0, task=task))))
+        scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
+        writer.write(heard("scene", encode_scene({}, scene)))
         for (episode, step), mode in STEPS.items():
             place = {"session": "here", "episode": episode}
             seen = {"a": bytes([20 * step, 90, 10 * episode] * 48)}

@@ -24,7 +24,7 @@ from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
 from bridge import recording as records
-from bridge.messages import WIRE_TOPICS, Heard, Stamps, encode_scene
+from bridge.messages import WIRE_TOPICS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import RawImage, RecordingWriter, _listen, describe
 from bridge.recording import Recording, Stored
@@ -83,7 +83,7 @@ def test_the_picture_is_what_the_policy_saw(tmp_path):
     frames = bytes(range(256)) * (SIZE // 256) + bytes(SIZE % 256)
     path = tmp_path / "runs" / "a.mcap"
     with writing(path) as writer:
-        told = encode_scene({}, Stamps(0, 3, 0.3, task=TASK))
+        told = encode_scene({}, Scene(episode=0, step=3, sim_time_s=0.3, task=TASK))
         writer.write(heard("scene", told))  # it says how to read the states
         state = encode(make_state(3, observation={"frames": frames}))
         writer.write(heard("state", state, arrived_ns=5 * 10**9 + 7))
@@ -113,8 +113,9 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     random = np.random.default_rng(1)
     good = [
         encode(make_state(1, episode=2**63)), encode(make_state(1)), encode(make_command(1)),
-        encode(health(1, 2.0, stale=2**63)), encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
-        encode_scene({}, Stamps(1, 1, 0.1, task=ODD)),
+        encode(health(1, 2.0, stale=2**63)),
+        encode_scene({"vehicles": []}, Scene(episode=1, step=1, sim_time_s=0.1)),
+        encode_scene({}, Scene(episode=1, step=1, sim_time_s=0.1, task=ODD)),
     ]  # fmt: skip
     with writing(tmp_path / "a.mcap") as writer:
         for number in range(3000):

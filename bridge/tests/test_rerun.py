@@ -312,7 +312,8 @@ def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
     for interval_s, expected in ((0.1, 2 * 11), (0.0, 2 * 101)):
         drawn.clear()
         log = WireLog(rr.RecordingStream("test"), interval_s)
-        told = messages.encode_scene({}, messages.Stamps(0, 0, 0.0, task=TASK))
+        scene = messages.Scene(episode=0, step=0, sim_time_s=0.0, task=TASK)
+        told = messages.encode_scene({}, scene)
         log.write_scene(messages.DECODERS["scene"](told), 10**18)  # says how to read the states
         for step in range(101):  # A lock-step drive at ten times real time.
             log.write_state(make_state(step), 10**18 + step * 10**7)
@@ -322,7 +323,7 @@ def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
 def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is_none():
     environment = ToyEnv()
     environment.reset(seed=1)
-    stamps = messages.Stamps(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
+    stamps = messages.Scene(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
     scene = messages.decode_scene(messages.encode_scene(environment.scene(), stamps))
     assert scene is not None
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)

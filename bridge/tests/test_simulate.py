@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from bridge.environments import describe, make_environment
 from bridge.episode import EpisodeRunner
+from bridge.messages import Origin
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
@@ -273,9 +274,13 @@ def environment():
     environment.close()
 
 
-def run(environment, clock, **options):
+def run(environment, clock, standing=False):
     told, task = (lambda *_: None), describe(environment)
-    runner = EpisodeRunner(environment, clock, "here", told, told, task, **options)
+    origin = Origin(
+        session="here", environment="congestion", condition="nominal", seed=3, standing=standing,
+        clock="lockstep", loop="policy", latency="none",
+    )  # fmt: skip
+    runner = EpisodeRunner(environment, clock, told, told, task, origin)
     return runner, runner.run(0, seed=3)
 
 

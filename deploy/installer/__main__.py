@@ -11,13 +11,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from typing import Any, NoReturn
+from typing import Any
 
 from deploy.installer.layout import (
     DEFAULT_ROOT,
@@ -35,7 +34,6 @@ from deploy.installer.verify import (
     Bundle,
     Manifest,
     UnhealthyError,
-    UserError,
     check_fits,
     key_name,
     parse_manifest,
@@ -43,6 +41,8 @@ from deploy.installer.verify import (
     read_public_key,
     ssh_key,
 )
+from edge_runtime.cli import BAD_INPUT, INTERRUPTED, ArgumentParser, number
+from edge_runtime.util import UserError
 
 COMMANDS = {
     "install": (
@@ -54,21 +54,8 @@ COMMANDS = {
     "uninstall": ("stop the service and remove everything", "uninstall"),
 }
 LIMITS = Limits()
-UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
+UNHEALTHY = 1
 _CHECK_LIMIT_S = 120.0
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse with an error of one line, and no empty value: as a root, it is where one stands."""
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        for value in sys.argv[1:] if args is None else args:
-            if not value or (value.startswith("--") and value.find("=") == len(value) - 1):
-                self.error("an empty value")
-        return super().parse_known_args(args, namespace)
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
 def main(argv: list[str]) -> int:
@@ -79,9 +66,9 @@ def main(argv: list[str]) -> int:
             return _dispatch(_parser().parse_args(argv))
         finally:
             sys.stdout.flush()  # at the exit nobody could say what is wrong
-    except (UserError, UnhealthyError) as error:
+    except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT if isinstance(error, UserError) else UNHEALTHY
+        return UNHEALTHY if isinstance(error, UnhealthyError) else BAD_INPUT
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # it may be stdout that takes no more
         print(f"error: {error.filename or 'the disk'}: {error.strerror}", file=sys.stderr)
@@ -93,17 +80,18 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     example = "example: sudo python3 install.pyz "
-    parser = _Parser(
+    seconds = number("a number of seconds, above 0", lambda value: value > 0)  # systemd: 0 is none
+    parser = ArgumentParser(
         prog="install.pyz",
         description="Installs, upgrades and undoes a release of the edge runtime on this board.",
         epilog=example + COMMANDS["install"][1],
     )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.required = True
     for name, (text, words) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text, epilog=example + words)
         add, who = command.add_argument, "systemd where it runs this computer, else none"
-        add("--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}")
+        add("--root", metavar="DIR", default=DEFAULT_ROOT, help="where all of it is")
         ways = "|".join(WAYS)
         add("--service", metavar=ways, choices=WAYS, help=f"who runs it (default: {who})")
         if name in ("install", "rollback"):
@@ -111,8 +99,7 @@ def _parser() -> argparse.ArgumentParser:
                 ("--health-limit", LIMITS.within_s, "healthy by then, or back"),
                 ("--settle", LIMITS.settle_s, "and for so long after that"),
             ):
-                text = f"{text}, s (default: {default:g})"
-                add(option, metavar="S", type=_seconds, default=default, help=text)
+                add(option, metavar="S", type=seconds, default=default, help=f"{text}, s")
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
             trust = "first install: the public key to trust from now"
@@ -120,17 +107,6 @@ def _parser() -> argparse.ArgumentParser:
         if name == "status":
             add("--json", action="store_true", help="print JSON")
     return parser
-
-
-def _seconds(text: str) -> float:
-    """A finite number of seconds above 0: systemd would take a watchdog of 0 s for none."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, above 0")
-    return value
 
 
 def _dispatch(arguments: argparse.Namespace) -> int:
@@ -144,8 +120,8 @@ def _dispatch(arguments: argparse.Namespace) -> int:
         return 0
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.default_int_handler)
+    for one in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(one, signal.default_int_handler)
     installer = Installer(layout, service, Limits(arguments.health_limit, arguments.settle))
     if command == "install":
         version = installer.install(arguments.bundle, arguments.trust)
@@ -302,7 +278,7 @@ class Installer:
             layout.link("current", version)
             self._start(version)
         # The old service is stopped: whatever goes wrong, somebody must start it again.
-        except (UnhealthyError, UserError, OSError, KeyboardInterrupt) as error:
+        except (UserError, OSError, KeyboardInterrupt) as error:
             why = str(error) or "interrupted"
             _say(f"{version} is not healthy: {why}")
             # Cut off between the rename and here, `current` is this very release already.

@@ -33,7 +33,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 from typing import Iterator, TextIO
 
-from deploy.installer.verify import Bundle, UserError
+from deploy.installer.verify import Bundle
+from edge_runtime.util import UserError
 
 DEFAULT_ROOT = "/opt/phil"
 SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"

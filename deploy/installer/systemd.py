@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Callable, NamedTuple
 
 from deploy.installer.layout import CONFIG, DEFAULT_ROOT, LAUNCHER, TLS, write_whole
-from deploy.installer.verify import UnhealthyError, UserError
+from deploy.installer.verify import UnhealthyError
+from edge_runtime.util import UserError
 
 MAIN_UNIT, TRIAL_UNIT = "phil-edge.service", "phil-trial.service"
 USER = "phil"

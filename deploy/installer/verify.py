@@ -15,12 +15,13 @@ import json
 import os
 import platform
 import re
-import stat
 import subprocess
 import sys
 import tarfile
 import tempfile
 from typing import Any, NamedTuple
+
+from edge_runtime.util import UserError, open_regular
 
 MANIFEST = "manifest.json"
 FORMAT = 1
@@ -38,19 +39,7 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+-]*(/[A-Za-z0-9_][A-Za-z0-9._+-]*)
 _VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
 
 
-class _OneLineError(Exception):
-    def __str__(self) -> str:
-        """The text on one line, whatever a file name or the system put into it."""
-        line = " ".join(super().__str__().split())
-        # What a terminal would act upon is written as its escape.
-        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-
-
-class UserError(_OneLineError):
-    """Bad input. Its text is one line: what is wrong, and what would be right."""
-
-
-class UnhealthyError(_OneLineError):
+class UnhealthyError(UserError):
     """A release that may not run here. Its text says why, on one line."""
 
 
@@ -114,12 +103,8 @@ def key_name(pem: bytes) -> str:
 def read_file(path: str, what: str, most: int) -> bytes:
     """The bytes of a regular file of at most `most` bytes. UserError for all else."""
     try:
-        # Not to wait for the other end of a pipe.
-        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)) as stream:
-            found = os.fstat(stream.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise UserError(f"{what} {path} is not a file")
-            if found.st_size > most:
+        with open_regular(path) as stream:
+            if os.fstat(stream.fileno()).st_size > most:
                 raise UserError(f"{what} {path} is larger than {most} bytes")
             return stream.read()
     except OSError as error:

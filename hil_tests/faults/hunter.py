@@ -151,7 +151,8 @@ def _kept_to_its_own(monitor: CanMonitor) -> list[str]:
 def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     if not any(health.vehicle_fault for health in rig.probe.health[-2:]):
         return ["health names no fault of the vehicle"]
-    said = [text for seen_s, text in rig.timeline.named if seen_s > since_s]
+    told = (feedback for seen_s, feedback in rig.timeline.feedback if seen_s > since_s)
+    said = [text for feedback in told for text in feedback.faults]
     if any(one in text for one in expect.says.split("|") for text in said):
         return []
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]

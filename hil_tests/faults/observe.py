@@ -62,11 +62,7 @@ class Timeline:
     """When the states of the drive itself came: gaps in it are the machine's, or the fault's."""
     commands: list[CommandSeen] = field(default_factory=list)
     modes: list[ModeSeen] = field(default_factory=list)
-    feedback_s: list[float] = field(default_factory=list)
-    named: list[tuple[float, str]] = field(default_factory=list)
-    """When the feedback said what was wrong with the vehicle."""
-    self_braking_s: list[float] = field(default_factory=list)
-    """When the feedback said that the vehicle brakes by itself."""
+    feedback: list[tuple[float, wire.Feedback]] = field(default_factory=list)
     unreadable: int = 0
     """Commands that no receiver would take: outside their limits, or no commands at all."""
 
@@ -191,11 +187,9 @@ class Probe:
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         seen_s = time.monotonic()
-        self.timeline.feedback_s.append(seen_s)
         feedback = wire.decode_feedback(bytes(sample.payload))
         if isinstance(feedback, wire.Feedback):
-            self.timeline.named += [(seen_s, words) for words in feedback.faults]
-            self.timeline.self_braking_s += [seen_s] * feedback.self_braking
+            self.timeline.feedback.append((seen_s, feedback))
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         health = wire.decode_health(bytes(sample.payload))

@@ -73,7 +73,8 @@ def _rode(rig: Rig, begin_s: float) -> Try:
     recovered_s = rig.recovered_after_s(time.monotonic())
     end_s = time.monotonic() + SETTLED_S
     sleep_until(end_s)
-    braked_s = [*rig.timeline.self_braking_s, *(at_s for at_s, on in rig.brakes() if on)]
+    braked_s = [at_s for at_s, on in rig.brakes() if on]
+    braked_s += [at_s for at_s, feedback in rig.timeline.feedback if feedback.self_braking]
     wrong = stops_between(rig.timeline.commands, begin_s, end_s)
     wrong += ["braked by itself"] * any(begin_s < at_s < end_s for at_s in braked_s)
     return Try(rig.longest_gap(begin_s, end_s), recovered_s, wrong=wrong)

@@ -23,12 +23,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bridge.recording import Recording
+from bridge.recording import Recording, heard_of
 from edge_runtime.tests.policies import T
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, stops_between
-from hil_tests.faults.rig import Rig, address
+from hil_tests.faults.rig import VEHICLE_ID, Rig, address
 from hil_tests.processes import Process, wait_until
 
 GAP = "longest gap between commands"
@@ -317,7 +317,7 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     # A silent vehicle may still speak between the mark and the switch, and what it says counts.
     # What another says after the switch is no good any more.
     end_s = stop.seen_s if word == "silent" else begin_s
-    last_s = max(s for s in rig.timeline.feedback_s if s < end_s)
+    last_s = max(s for s, _ in rig.timeline.feedback if s < end_s)
     sleep_until(begin_s + LASTS_S)
     said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(VEHICLE, None)
@@ -377,12 +377,9 @@ def recorder_killed(rig: Rig, number: int) -> Try:
 
 def states_in(path: Path) -> list[State]:
     """The states that can be read from a recording, whole or torn."""
-    stored = (
-        decode_state(each.message.data)
-        for each in Recording(path).messages()
-        if each.channel.topic.endswith("/state") and each.channel.message_encoding == "msgpack"
-    )
-    return [state for state in stored if isinstance(state, State)]
+    wire = heard_of(Recording(path), VEHICLE_ID)
+    states = (decode_state(heard.payload) for heard in wire if heard.topic == "state")
+    return [state for state in states if isinstance(state, State)]
 
 
 def _too_few(states: list[State]) -> list[str]:

@@ -111,7 +111,7 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
     assert first["budget"]["sentence"] in out.with_suffix(".md").read_text()
 
     no_drive = UserError("drives nothing")
-    drive_network = mock.Mock(side_effect=no_drive, __name__="drive_network")  # rows are kept by it
+    drive_network = mock.Mock(side_effect=no_drive)
     monkeypatch.setattr(sweep, "drive_network", drive_network)
     assert run_cli(main, arguments) == 0
     assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
@@ -141,7 +141,7 @@ def test_an_environment_that_knows_no_success_has_no_campaign(monkeypatch, tmp_p
     monkeypatch.setattr(sweep, "run_rig", lambda *_, **__: {"success_rate": None})
     task = sweep.Task(POLICY, "any", "Pendulum-v1", "nominal", 1, 1)
     with pytest.raises(UserError, match="Pendulum-v1 says of no episode whether it succeeded"):
-        sweep.drive_all(task, ["none"], 1, sweep.drive_network, 1, tmp_path / "kept")
+        sweep.drive_all(task, ["none"], 1, 1, tmp_path / "kept")
 
 
 def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):
