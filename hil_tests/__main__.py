@@ -15,7 +15,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "mock_hunter": ("hil_tests.mock_hunter.process", "a Hunter on a CAN bus, with all its faults"),
     "conformance": ("hil_tests.conformance", "a vehicle's driver against the rules that stop it"),
     "bench": ("hil_tests.bench_loop", "the loop against the least that could answer"),
-    "obey": ("hil_tests.obey", "whether the edge runtime knows its link, and stops in time"),
     "recording": ("hil_tests.pictures:RECORDING_COMMAND", "record what the next release replays"),
 }
 
