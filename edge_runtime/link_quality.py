@@ -215,4 +215,5 @@ class LinkQuality:
             load, words = together, f"all axes add up to {together:.2f} of what they may"
         if self._envelope.box:
             load = min(load, shares[worst] / self._envelope.box)
-        return load, f"the link is outside the policy's envelope: {words}"
+        place = "outside" if load > 1.0 else "too near the edge of"
+        return load, f"the link is {place} the policy's envelope: {words}"

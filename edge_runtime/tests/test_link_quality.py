@@ -199,6 +199,9 @@ def test_the_edge(delay_ms, outside, armable):
     network = Network()
     network.run(310, lambda: delay_ms, lambda: delay_ms)
     assert bool(network.quality.outside) == outside
+    if outside:  # 91 of 100: no refusal may say that this is more
+        words = "the link is too near the edge of the policy's envelope: delay_ms 91, 100 at most"
+        assert network.quality.outside == words
     loss = 3 / 309 * 10  # what may have been missed counts, too
     assert (network.quality.refusal() == "") == (armable and delay_ms / 100 + loss < ARM_BELOW)
 
