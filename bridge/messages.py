@@ -184,20 +184,18 @@ class Pace:
     """Lets one message an interval through on average, and two at once at most; of 0 s, all."""
 
     def __init__(self, interval_s: float) -> None:
-        self.skipped = 0
         self._interval_s = interval_s
         self._tokens = BURST
         self._filled_s: float | None = None
 
     def due(self, now_s: float) -> bool:
-        """Whether a message may pass now; one that may not is counted."""
+        """Whether a message may pass now."""
         if not self._interval_s:
             return True
         elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
         self._filled_s = now_s
         self._tokens = min(BURST, self._tokens + elapsed_s / self._interval_s)
         if self._tokens < 1.0:
-            self.skipped += 1
             return False
         self._tokens -= 1.0
         return True

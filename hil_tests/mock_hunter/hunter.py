@@ -29,8 +29,6 @@ from hil_tests.mock_hunter.chassis import (
     check_fault,
 )
 
-ASSUMED = "assumed"
-_MANUAL = "AgileX user manual (HARDWARE_FACTS.md)"
 STANDS_MPS = 0.005
 """Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
 FAST_S = 0.02
@@ -63,13 +61,15 @@ _INT32 = 2**32
 
 @dataclass(frozen=True)
 class Parameters:
-    """Geometry and actuators of one model; SOURCES says how far to trust each number."""
+    """Geometry and actuators of one model."""
 
+    # From AgileX's user manual:
     max_speed_mps: float
     max_inner_rad: float  # Of the inner front wheel
     wheelbase_m: float
     track_m: float
     command_timeout_s: float = 0.5
+    # Assumed, since the manual says nothing of the actuators: measure them, and pass them by --set.
     dead_time_s: float = 0.03  # From a command on the bus to the first movement of an actuator
     speed_time_constant_s: float = 0.1
     acceleration_mps2: float = 2.0
@@ -93,22 +93,14 @@ MODELS: dict[str, Parameters] = {
     ),
 }  # fmt: skip
 
-_FROM_THE_MANUAL = (
-    "max_speed_mps", "max_inner_rad", "wheelbase_m", "track_m", "command_timeout_s",
-)  # fmt: skip
-SOURCES: dict[str, str] = {
-    field.name: _MANUAL if field.name in _FROM_THE_MANUAL else ASSUMED
-    for field in fields(Parameters)
-}
-"""The manual says nothing of how fast the actuators are: measure them on the vehicle, and pass
-them with ``--set``."""
+TUNABLE = [field.name for field in fields(Parameters)]
 
 
 def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> Parameters:
     """A model's row with some numbers replaced; UserError for a number that cannot be."""
     for name, value in (changes or {}).items():
-        if name not in SOURCES:
-            raise UserError(f"no parameter {name!r}; choose from {', '.join(SOURCES)}")
+        if name not in TUNABLE:
+            raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
         if not (value > 0.0 or (name == "dead_time_s" and value == 0.0)) or value == float("inf"):
             raise UserError(f"parameter {name} must be above 0, not {value}")
     return replace(MODELS[model], **(changes or {}))

@@ -23,7 +23,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.chassis import FAULTS, check_fault
-from hil_tests.mock_hunter.hunter import MODELS, SOURCES, MockHunter, make_parameters, read_changes
+from hil_tests.mock_hunter.hunter import MODELS, TUNABLE, MockHunter, make_parameters, read_changes
 
 Switch = tuple[str, bool]  # A fault's name, and whether it is switched on
 _WORDS = {"on": True, "off": False}
@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         f"{parser.description} "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
-        f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
+        f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(TUNABLE)}."
     )
     add, bits = parser.add_argument, "firmware's fault bits"
     add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")

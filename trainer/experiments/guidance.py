@@ -23,6 +23,7 @@ from trainer.experiments.run import Store
 from trainer.pictures import write_figure
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
+PHIL = "phil_td3"
 
 
 def write_guidance(store: Store, seeds: int) -> Path:
@@ -108,6 +109,22 @@ def _page(results: Results, store: Store) -> Iterator[str]:
     ]
     yield from markdown_table(head, rows)
     yield from (
+        "## PHIL-TD3's place",
+        "",
+        "With the same human: each row less PHIL-TD3, pair by pair of seeds. A seed that never "
+        f"reaches {LEARNED:.0%} counts with all that its human drove.",
+        "",
+    )
+    places = [
+        (Line(row).name, data.words(task), *_place(results, task, row))
+        for task in TASKS
+        for row in plan.HELPED
+        if row != PHIL and results.of(task, Line(row, plan.GOOD))
+    ]
+    yield from markdown_table(
+        ("", "task", "success, nominal, points", f"human s to {LEARNED:.0%}"), places
+    )
+    yield from (
         "## Which row forgives which human",
         "",
         "Left turn: success of the policy alone in %, then the human's seconds until it "
@@ -141,6 +158,17 @@ def _row(results: Results, task: str, line: Line, found: list[Result]) -> tuple[
         *(shares.get(name, "–") for name in CONDITIONS),
         data.mean_estimate(over).text(2),
     )
+
+
+def _place(results: Results, task: str, row: str) -> Iterator[str]:
+    line, phil = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
+    over = results.differences(data.Scene(task, "nominal"), line, phil, data.SUCCESS).values()
+    yield data.mean_estimate(over).times(100.0).text(1)
+    given, its = (
+        {one.unit.seed: (one.until(LEARNED) or one.costs).human_s for one in results.of(task, each)}
+        for each in (line, phil)
+    )
+    yield data.mean_estimate(given[seed] - its[seed] for seed in given.keys() & its.keys()).text(0)
 
 
 def _cells(results: Results, row: str) -> Iterator[str]:

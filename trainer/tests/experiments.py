@@ -26,7 +26,9 @@ SKILLS = {
     "phil_advantage_100": 0.97, "rd2_td3": 0.7, "rd2_phil": 0.92, "phil_without_cloning": 0.8,
     "phil_without_shaping": 0.9, CONSTANT: 0.3,
 }  # fmt: skip
-FACTORS = {"normal": 1.0, "one_frame": 0.85, "random": 0.97, "biased": 0.9, "printed": 0.5}
+FACTORS = {
+    "normal": 1.0, "one_frame": 0.85, "random": 0.97, "biased": 0.9, "printed": 0.5, "good": 1.0
+}  # fmt: skip
 BUDGET = 6_000
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data
-from trainer.experiments.guidance import typical_curves
+from trainer.experiments.guidance import _place, typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
@@ -80,6 +80,20 @@ class TestData:
         assert given[-1] == pytest.approx(np.median([one.costs.human_s for one in found]), abs=0.1)
         ends = [one.curve(data.ALONE, data.SUCCESS)[-1] for one in found]
         assert alone[-1] == pytest.approx(np.median(ends), abs=1e-3)
+
+    def test_a_row_of_the_fair_table_is_placed_beside_phil_td3_seed_by_seed(self):
+        rows = "phil_td3", "hi_td3"
+        units = [Unit("left_turn", row, "good", seed) for row in rows for seed in (1, 2, 3)]
+        results = results_of(units, SEEDS)
+        phil, hi = (results.of("left_turn", data.Line(row, "good")) for row in rows)
+        over, seconds = _place(results, "left_turn", "hi_td3")
+        points = [100.0 * (b.mean("nominal", "success") - a.mean("nominal", "success"))
+                  for a, b in zip(phil, hi, strict=True)]  # fmt: skip
+        assert over == data.mean_estimate(points).text(1)
+        # HI-TD3 never gets to 90 %: its human drove all of 30 s.
+        assert not any(one.until(0.9) for one in hi)
+        more = [30.0 - cost.human_s for one in phil if (cost := one.until(0.9))]
+        assert (len(more), seconds) == (3, data.mean_estimate(more).text(0))
 
     def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
         assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0

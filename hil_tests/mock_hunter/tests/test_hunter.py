@@ -5,7 +5,6 @@ import math
 import struct
 import threading
 import time
-from dataclasses import fields
 from pathlib import Path
 
 import can
@@ -21,7 +20,6 @@ from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter import chassis as rules
-from hil_tests.mock_hunter import hunter
 from hil_tests.mock_hunter.hunter import (
     MODELS,
     Body,
@@ -165,10 +163,6 @@ def test_the_path_of_an_inner_angle_by_hand_and_its_outer_wheel_covers_more():
     assert body.right_m > body.left_m > 0  # a turn to the left
     ratio = (radius_m + half_m) / (radius_m - half_m)
     assert body.right_m / body.left_m == pytest.approx(ratio, abs=1e-4)
-
-
-def test_every_number_says_where_it_comes_from():
-    assert set(hunter.SOURCES) == {field.name for field in fields(hunter.Parameters)}
 
 
 @pytest.mark.parametrize(("model", "name"), [("hunter-2.0", "2.0"), ("hunter-se", "se")])
