@@ -42,7 +42,7 @@ from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, read_json
-from hil_tests.trace import smallest_trace
+from hil_tests.trace import failing_drive, shrunk
 from trainer.drivers import load_driver
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
@@ -288,12 +288,16 @@ def _drive(env: Any, driver: Any, condition: str, spec: LatencySpec, seeds: rang
 
 
 def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
-    """Of the networks just outside, the failing drive that needs the fewest disturbed messages."""
+    """A failing drive just outside, shrunk to the disturbed messages that it needs.
+
+    Of each network's first one it is the one with the fewest, since that shrinks soonest.
+    """
     broken = [parse_spec(edge["outside"]) for edge in edges.values() if edge["outside"]]
     seeds = range(seed, seed + FRESH)
-    futures = [drivers.submit(_work, smallest_trace, spec, seeds) for spec in broken]
-    traces = filter(None, [drivers.result(future) for future in futures])
-    return min(traces, key=lambda trace: int(trace["disturbed"]), default=None)
+    futures = [drivers.submit(_work, failing_drive, spec, seeds) for spec in broken]
+    failed = filter(None, map(drivers.result, futures))
+    least = min(failed, key=lambda found: sum(map(len, found[2].values())), default=None)
+    return least and drivers.result(drivers.submit(_work, shrunk, *least))
 
 
 def confirm(drivers: Drivers, known: Mapping[str, Any], seeds: range) -> dict[str, Any]:

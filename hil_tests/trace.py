@@ -19,6 +19,7 @@ from trainer.evaluation import drive_episodes
 Item = TypeVar("Item")
 Trace = dict[str, dict[str, list[float]]]
 """Direction -> control period, as JSON has it -> seconds under way of that message."""
+UNDISTURBED: Trace = {name: {} for name in DIRECTIONS}
 ROUNDING = 1e-6  # Of a control period: a tick's time is a product
 
 
@@ -69,18 +70,25 @@ def shrink(items: Sequence[Item], fails: Callable[[Sequence[Item]], bool]) -> li
     return kept
 
 
-def smallest_trace(
+def failing_drive(
     env: Any, driver: Any, condition: str, spec: LatencySpec, seeds: Sequence[int]
-) -> dict[str, Any] | None:
-    """The first drive that the network alone makes fail, shrunk to the fewest messages: its seed,
-    outcome and steps, the network, how many messages are disturbed, and the trace. None: no drive.
-    """
-    every = (_shrunk(partial(drive, env, driver, condition, seed), seed, spec) for seed in seeds)
-    return next(filter(None, every), None)
+) -> tuple[int, str, Trace] | None:
+    """The first drive that the network alone makes fail: seed, network, what it disturbed."""
+    for seed in seeds:
+        whole: Trace = {name: {} for name in DIRECTIONS}
+        behind = partial(drive, env, driver, condition, seed)
+        if behind(UNDISTURBED).outcome != GOAL or behind(whole, spec).outcome == GOAL:
+            continue
+        if behind(whole).outcome != GOAL:  # Else two messages of one period had different luck.
+            return seed, str(spec), whole
+    return None
 
 
-def _shrunk(behind: Callable[..., EpisodeResult], seed: int, spec: LatencySpec) -> Any:
-    whole: Trace = {name: {} for name in DIRECTIONS}
+def shrunk(
+    env: Any, driver: Any, condition: str, seed: int, network: str, whole: Trace
+) -> dict[str, Any]:
+    """A failing drive with the fewest messages disturbed: what it is of, how it ends, its trace."""
+    behind = partial(drive, env, driver, condition, seed)
 
     def part(items: Sequence[tuple[str, str]]) -> Trace:
         return {
@@ -88,15 +96,8 @@ def _shrunk(behind: Callable[..., EpisodeResult], seed: int, spec: LatencySpec) 
             for name in DIRECTIONS
         }
 
-    def fails(items: Sequence[tuple[str, str]]) -> bool:
-        return behind(part(items)).outcome != GOAL
-
-    if fails([]) or behind(whole, spec).outcome == GOAL:
-        return None
     disturbed = [(name, period) for name in DIRECTIONS for period in whole[name]]
-    if not fails(disturbed):
-        return None  # two messages of one period had different luck
-    items = shrink(disturbed, fails)
+    items = shrink(disturbed, lambda some: behind(part(some)).outcome != GOAL)
     result = behind(part(items))
-    told = {"seed": seed, "network": str(spec), "outcome": result.outcome, "steps": result.steps}
+    told = {"seed": seed, "network": network, "outcome": result.outcome, "steps": result.steps}
     return {**told, "disturbed": len(items), "disturbed_before": len(disturbed), **part(items)}
