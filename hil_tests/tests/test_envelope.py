@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from hil_tests.envelope import (
     Search,
     SequentialTest,
     find_region,
+    find_trace,
     network,
 )  # fmt: skip
 from trainer.drivers import OnnxDriver
@@ -147,6 +149,37 @@ def test_shrinking_leaves_what_a_failure_needs_and_nothing_else(planted, needed)
     found = trace.shrink(range(200), lambda items: len(planted & set(items)) >= needed)
     assert len(found) == needed
     assert set(found) <= planted
+
+
+class Found:
+    """In the place of the processes: each network's failing drive, and what is shrunk."""
+
+    def __init__(self, **disturbed: int | None) -> None:
+        self.failures: dict[str, Any] = {
+            name: count and (7, name, {"up": {str(n): [] for n in range(count)}, "down": {}})
+            for name, count in disturbed.items()
+        }
+
+    def submit(self, _work, call, *arguments):
+        return call, arguments
+
+    def result(self, asked):
+        call, arguments = asked
+        if call is trace.failing_drive:
+            return self.failures[f"loss{arguments[0].up.loss_percent:.0f}"]
+        assert call is trace.shrunk
+        return {"network": arguments[1]}
+
+
+@pytest.mark.parametrize(
+    ("found", "shrunk"),
+    [(Found(loss1=9, loss2=3, loss3=5), {"network": "loss2"}),
+     (Found(loss1=None, loss2=None, loss3=4), {"network": "loss3"}),
+     (Found(loss1=None, loss2=None, loss3=None), None)],
+)  # fmt: skip
+def test_only_the_failing_drive_with_the_fewest_disturbed_messages_is_shrunk(found, shrunk):
+    edges = {str(n): {"outside": f"loss={n}%"} for n in (1, 2, 3)} | {"none": {"outside": None}}
+    assert find_trace(found, edges, 0) == shrunk
 
 
 @pytest.fixture
