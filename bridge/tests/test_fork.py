@@ -40,9 +40,10 @@ from edge_runtime.tests.harness import wait_until
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"
+PARKING = "bridge.tests.toy:BridgeParking-v0"
 TWO = ("--episodes", "2")
 NETWORK = "60ms+-40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
-PARKING = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation)
+GRAPH = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation)
 => (float[b, 2] action) {
     apart = Sub(desired_goal, achieved_goal) wide = MatMul(apart, turn) action = Tanh(wide)
 }"""
@@ -50,12 +51,12 @@ PARKING = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float
 
 def parking_policy(folder: Path) -> Path:
     """Drives towards its place, more or less."""
-    graph = onnx.parser.parse_graph(PARKING)
+    graph = onnx.parser.parse_graph(GRAPH)
     turn = np.random.default_rng(1).normal(0.0, 3.0, (6, 2)).astype(np.float32)
     graph.initializer.append(onnx.numpy_helper.from_array(turn, "turn"))
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
     model.ir_version = 8
-    task = describe(make_environment("parking-v0"))
+    task = describe(make_environment(PARKING))
     path = folder / "parking.onnx"
     path.write_bytes(make_any_policy(model.SerializeToString(), task, "test", {}))
     return path
@@ -86,14 +87,16 @@ def fork_of(path: Path, *options) -> dict:
         return read(out)
 
 
-def is_recorded_to_the_bit(path: Path, number: int, policy: Path, time_s: float) -> dict:
+def is_recorded_to_the_bit(
+    path: Path, number: int, policy: Path, time_s: float, *options: str
+) -> dict:
     """Fork it in the middle, and the fork's own recording once more; what was found first."""
     again = path.with_name(f"again{number}.mcap")
     words = ("--episode", number, "--at", f"{time_s / 2}s", "--policy", policy, "--record", again)
-    found = fork_of(path, *words)
+    found = fork_of(path, *words, *options)
     assert found["differs_from_s"] is None
     assert found["fork"] == found["recorded"]
-    once_more = fork_of(again, "--at", time_s / 4, "--policy", policy)
+    once_more = fork_of(again, "--at", time_s / 4, "--policy", policy, *options)
     assert (once_more["differs_from_s"], once_more["fork"]) == (None, found["fork"])
     return found
 
@@ -118,16 +121,16 @@ def test_without_a_change_the_fork_is_the_recorded_drive_to_the_bit(tmp_path, en
 
 def test_an_environment_of_others_is_rebuilt_whatever_stood_still(tmp_path):
     """Its steps take so long that on a busy machine the edge runtime stops now and then."""
-    path = record(tmp_path, "parking-v0", parking_policy(tmp_path), "--latency", "50ms+-30ms")
+    path = record(tmp_path, PARKING, parking_policy(tmp_path), "--latency", "50ms+-30ms")
     (row,) = read(tmp_path / "report.json")["per_episode"]
-    assert fork_of(path, "--at", row["time_s"] / 2)["recorded"] == row
+    assert fork_of(path, "--at", row["time_s"] / 2, "--env", PARKING)["recorded"] == row
 
 
 def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
     policy, path = parking_policy(tmp_path), tmp_path / "drive.mcap"
-    environment = make_environment("parking-v0")
+    environment = make_environment(PARKING)
     origin = Origin(
-        session="s", environment="parking-v0", condition="nominal", seed=4, standing=False,
+        session="s", environment=PARKING, condition="nominal", seed=4, standing=False,
         clock="lockstep", loop="policy", latency="50ms+-30ms,loss=5%",
     )  # fmt: skip
     nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
@@ -135,7 +138,8 @@ def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
         loaded = load_policy(policy, None, allow_unsigned=True)
         row = ForkedDrive(nothing, environment, 0, loaded, out=out).run()
         out.finish(dropped=0)
-    assert is_recorded_to_the_bit(path, 0, policy, row.time_s)["fork"] == asdict(row)
+    found = is_recorded_to_the_bit(path, 0, policy, row.time_s, "--env", PARKING)
+    assert found["fork"] == asdict(row)
 
 
 def test_another_policy_or_network_drives_on_in_another_way(tmp_path):

@@ -76,3 +76,7 @@ for name, options in VARIANTS.items():
     if name not in gymnasium.registry:
         made: Any = {"entry_point": "bridge.tests.toy:ToyEnv", "kwargs": options}
         gymnasium.register(name, **made, disable_env_checker=True, order_enforce=False)
+SHORT_PARKING = "BridgeParking-v0"  # One of highway-env's, which alone has 100 s
+if SHORT_PARKING not in gymnasium.registry:
+    parking, less = "highway_env.envs.parking_env:ParkingEnv", {"config": {"duration": 15}}
+    gymnasium.register(SHORT_PARKING, parking, kwargs=less)
