@@ -41,7 +41,7 @@ from edge_runtime.config import BUILT_IN, NONE, Config, load_config
 from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.policy import Policy, load_policy
-from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_bytes
 from edge_runtime.vehicles import GROUP, vehicle_limits
 
 NAME = "install.pyz"
@@ -187,13 +187,13 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
         )
     policy = load_policy(inputs.policy, inputs.public_key)
     config, text = _config(inputs)
-    _check_vehicle(config, policy, inputs.wheels)
+    _check_vehicle(config, policy, set().union(*map(_drivers_in, inputs.wheels)))
     if inputs.tls is not None:
         tls.check_name(tls.load_tls(inputs.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
     return key, policy, config, text
 
 
-def _check_vehicle(config: Config, policy: Policy, wheels: list[Path]) -> None:
+def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
     """Raise UserError for a vehicle that the board could not load, or whose settings do not hold.
 
     Those of another package's driver are not read: it need not be installed here.
@@ -202,7 +202,7 @@ def _check_vehicle(config: Config, policy: Policy, wheels: list[Path]) -> None:
     if name in (NONE, *BUILT_IN):
         limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
         shared_limits(policy.manifest.action, limits)
-    elif not any(name in _drivers_in(path) for path in wheels):
+    elif name not in brought:
         known = ", ".join((NONE, *BUILT_IN))
         raise UserError(
             f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
@@ -212,14 +212,13 @@ def _check_vehicle(config: Config, policy: Policy, wheels: list[Path]) -> None:
 
 def _drivers_in(path: Path) -> set[str]:
     """The vehicles that a wheel names in its entry points, and all of its modules."""
-    data = io.BytesIO(read_bytes(path, "wheel"))
     try:
-        with zipfile.ZipFile(data) as wheel:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as wheel:
             names = wheel.namelist()
             read = [wheel.read(one) for one in names if one.endswith(".dist-info/entry_points.txt")]
         points = configparser.ConfigParser(delimiters=("=",), interpolation=None)
         points.read_string("\n".join(text.decode() for text in read))
-    except (zipfile.BadZipFile, configparser.Error, ValueError) as error:
+    except (OSError, zipfile.BadZipFile, configparser.Error, ValueError) as error:
         raise UserError(f"wheel {path} cannot be read: {error}") from None
     modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") for one in names}
     return modules | (set(points[GROUP]) if GROUP in points else set())

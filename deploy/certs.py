@@ -130,7 +130,7 @@ def _run_certs(arguments: argparse.Namespace) -> int:
     out, days = Path(arguments.out), arguments.days
     hosts = list(dict.fromkeys(map(_host, [*LOOPBACK_HOSTS, *arguments.host])))
     roles = _missing(out, arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
-    now = datetime.datetime.now(datetime.UTC)
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)  # As certificates have it
     ca_folder = out / "ca"
     is_new = not ca_folder.exists()
     authority = _make_authority(now) if is_new else read_authority(ca_folder)

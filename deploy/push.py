@@ -100,7 +100,7 @@ def _steps(arguments: argparse.Namespace, manifest: Manifest, files: dict[str, P
         "--trust", f"{folder}/{_TRUST}", "--root", arguments.root,
         *(["--service", arguments.service] if arguments.service else []),
     ]  # fmt: skip
-    ssh = [*SSH, arguments.host]
+    ssh = [*SSH, re.sub(r"[\[\]]", "", arguments.host)]  # Only scp wants an address in brackets.
     return [
         Step(f"has it Python {target.python} on {target.machine}?", [*ssh, probe]),
         Step("a folder of its own there", [*ssh, f"umask 077 && mkdir -p {folder}"]),

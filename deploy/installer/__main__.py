@@ -136,18 +136,18 @@ def _status(layout: Layout, service: NoService, as_json: bool) -> int:
     current = layout.linked("current")
     if current is None:
         raise UserError(f"nothing is installed in {layout.root}")
-    manifest = _manifest(layout, current)
-    fault, whole = "", "yes"
+    fault, whole, manifest = "", "yes", None
     try:
         fault = why_not_whole(layout.release(current))
+        manifest = None if fault else _manifest(layout, current)
     except PermissionError:  # the vehicle's private key is in it
         whole = "not known: this user may not read all of it"
     rows: dict[str, Any] = {
         "current": current,
         "whole": fault or whole,
         "previous": layout.linked("previous") or "none",
-        "vehicle_id": manifest.vehicle_id,
-        "policy_id": manifest.policy_id,
+        "vehicle_id": manifest.vehicle_id if manifest else "not known",
+        "policy_id": manifest.policy_id if manifest else "not known",
         "service": service.describe(),
         "trusts": key_name(layout.trusted.read_bytes()),
     }
@@ -277,12 +277,15 @@ class Installer:
                 layout.link("previous", before)
             layout.link("current", version)
             self._start(version)
+            write_whole(layout.served, version.encode())
         # The old service is stopped: whatever goes wrong, somebody must start it again.
         except (UserError, OSError, KeyboardInterrupt) as error:
             why = str(error) or "interrupted"
             _say(f"{version} is not healthy: {why}")
-            # Cut off between the rename and here, `current` is this very release already.
-            good = before if before != version else earlier
+            # Cut off between the rename and here, `current` is this very release already, and has
+            # not served yet.
+            served = layout.served.is_file() and layout.served.read_text() == version
+            good = before if before != version or served else earlier
             self._go_back(version, good, earlier)
             raise UnhealthyError(
                 f"release {version} was not healthy as a service,"
@@ -315,7 +318,7 @@ class Installer:
             layout.link("previous", earlier)
         else:
             layout.unlink("previous")
-        if version != earlier:  # One that has served before stays, to be gone back to again.
+        if version not in (good, earlier):  # One that has served stays, to be gone back to again.
             layout.remove_release(version)
         try:
             self._start(good)

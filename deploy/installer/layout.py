@@ -66,6 +66,7 @@ class Layout:
         self.trusted = self.root / "trusted.pub"
         self.state = self.root / "state"
         self.hold = self.state / "hold"
+        self.served = self.state / "served"  # The release that was last found healthy
 
     def release(self, version: str) -> Path:
         """The folder of a release."""

@@ -211,11 +211,13 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
     if way == "systemd" and not is_there():
         # Before it makes a user and unpacks for a start that cannot come.
         raise UserError("--service systemd: no systemd runs this computer; use --service none")
+    kept = None
+    with contextlib.suppress(OSError):
+        kept = (root / "state" / _WAY).read_text()
+    if (way, kept) == ("none", "systemd") and is_there() and not only_look:
+        raise UserError("systemd runs this board: leave --service out, or `uninstall` first")
     if way is None:
-        way = "systemd" if is_there() else "none"
-        with contextlib.suppress(OSError):
-            kept = (root / "state" / _WAY).read_text()
-            way = kept if kept in WAYS else way
+        way = kept if kept in WAYS else "systemd" if is_there() else "none"
     if way == "none":
         return NoService()
     if os.geteuid() != 0 and not only_look:

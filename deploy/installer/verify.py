@@ -21,15 +21,14 @@ import tarfile
 import tempfile
 from typing import Any, NamedTuple
 
-from edge_runtime.util import UserError, open_regular
+from edge_runtime.util import UserError, read_bytes
 
 MANIFEST = "manifest.json"
 FORMAT = 1
 NAMESPACE = "phil-bundle"
 """Of the signature: one over something else, with the same key, does not pass for a bundle's."""
 _SIGNER = "owner"
-_MAX_BUNDLE_BYTES = 1 << 30
-_MAX_SMALL_BYTES = 1 << 16
+_MAX_BUNDLE_MIB = 1024
 _BEGIN, _END = "-----BEGIN PUBLIC KEY-----", "-----END PUBLIC KEY-----"
 _ED25519 = bytes.fromhex("302a300506032b6570032100")
 """What stands before the 32 bytes of a key in a SubjectPublicKeyInfo of Ed25519 (RFC 8410)."""
@@ -75,8 +74,8 @@ def read_bundle(path: str, public_key: bytes) -> Bundle:
     Raises UserError, having written nothing.
     """
     allowed = ssh_key(public_key)
-    data = read_file(path, "bundle", _MAX_BUNDLE_BYTES)
-    signature = read_file(f"{path}.sig", "signature", _MAX_SMALL_BYTES)
+    data = read_bytes(path, "bundle", _MAX_BUNDLE_MIB)
+    signature = read_bytes(f"{path}.sig", "signature", 1)
     try:
         _check_signature(data, signature, allowed)
         files = _unpack(data)
@@ -87,7 +86,7 @@ def read_bundle(path: str, public_key: bytes) -> Bundle:
 
 def read_public_key(path: str) -> bytes:
     """The PEM of an Ed25519 public key. Raises UserError for anything else."""
-    pem = read_file(path, "public key", _MAX_SMALL_BYTES)
+    pem = read_bytes(path, "public key", 1)
     try:
         ssh_key(pem)
     except UserError as error:
@@ -98,17 +97,6 @@ def read_public_key(path: str) -> bytes:
 def key_name(pem: bytes) -> str:
     """A few digits by which a person tells public keys apart."""
     return hashlib.sha256(ssh_key(pem).encode()).hexdigest()[:16]
-
-
-def read_file(path: str, what: str, most: int) -> bytes:
-    """The bytes of a regular file of at most `most` bytes. UserError for all else."""
-    try:
-        with open_regular(path) as stream:
-            if os.fstat(stream.fileno()).st_size > most:
-                raise UserError(f"{what} {path} is larger than {most} bytes")
-            return stream.read()
-    except OSError as error:
-        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
 
 
 def ssh_key(pem: bytes) -> str:

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import serialization as form
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
-from deploy.certs import _pem, issue, read_authority
+from deploy.certs import _make_authority, _pem, _write_folder, issue, read_authority
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.tls import load_tls, tls_for
 from edge_runtime.util import UserError
@@ -96,7 +96,6 @@ def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path, capsys)
         ("new --days 0", "--days: '0'"),
         ("new --days soon", "'soon' is not a whole number from 1 to 3650"),
         ("new --host a..b", "a..b"),
-        ("new --days 3650", "authority's own"),
         ("new --days 99999999999", "from 1 to 3650"),
         ("x" * 55, "shorter --vehicle-id"),
     ],
@@ -107,6 +106,16 @@ def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsy
     (line,) = capsys.readouterr().err.splitlines()
     assert word in line
     assert contents(made) == before
+
+
+def test_nothing_is_valid_for_longer_than_its_authority(tmp_path, capsys):
+    assert make(tmp_path / "new", "--days", "3650") == 0
+    yesterday = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=36)
+    old = _make_authority(yesterday)
+    _write_folder(tmp_path / "old/ca", old, {"ca.key.pem": _pem(old.key)})
+    assert make(tmp_path / "old", "--days", "3650") == 2
+    assert "longer than the authority's own 3648 days" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "old").iterdir()] == ["ca"]
 
 
 @pytest.mark.parametrize("name", ["ca.pem", "cert.pem", "key.pem"])

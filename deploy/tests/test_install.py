@@ -348,6 +348,10 @@ def test_what_may_not_be_read_or_named_in_a_unit_is_said(board, workshop, monkey
     for root in ("/opt/two words", "/opt/100%"):
         with pytest.raises(UserError, match="in a unit only"):
             systemd.choose("systemd", Path(root))
+    (board.root / "state/way").write_text("systemd")
+    with pytest.raises(UserError, match="systemd runs this board"):  # Its unit would be nobody's.
+        systemd.choose("none", board.root)
+    (board.root / "state/way").unlink()
 
 
 OLD, NEW = "0.1.0-old", "0.1.0-new"
@@ -440,6 +444,26 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
         installer.Installer(layout, service).activate(NEW, is_new=True)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
+
+
+@pytest.mark.parametrize("error", [UnhealthyError("it ended"), KeyboardInterrupt()])
+def test_the_running_release_installed_again_stays_whatever_happens(layout, monkeypatch, error):
+    layout.link("previous", OLD)
+    layout.link("current", NEW)
+    layout.served.write_text(NEW)
+    service, errors = Service(layout, error), [error]
+
+    def watch(limits: object) -> None:
+        if errors:
+            raise errors.pop()
+
+    monkeypatch.setattr(service, "watch", watch)
+    with pytest.raises(UnhealthyError, match=f"went back to {NEW}"):
+        installer.Installer(layout, service).activate(NEW, is_new=True)
+    assert (layout.linked("current"), layout.linked("previous"), service.runs) == (NEW, OLD, NEW)
+    assert sorted(layout.versions()) == [NEW, OLD]
+    installer.Installer(layout, service).activate(OLD, is_new=False)
+    assert layout.served.read_text() == OLD
 
 
 KILLER = """\
