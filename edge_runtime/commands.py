@@ -91,7 +91,7 @@ def _rearm(arguments: argparse.Namespace) -> int:
     if reply.get("accepted") is not True:
         why = reply.get("detail", "it does not say why")
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {why}")
-    print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
+    print(f"{arguments.vehicle_id} is re-armed; it drives once 5 states in a row were fresh")
     return 0
 
 

@@ -66,7 +66,7 @@ class _Way:
             filled = min(self.gaps[place], -missing)
             self.gaps[place] -= filled
             missing += filled
-        self.gaps.append(max(missing, 0))
+        self.gaps.append(min(max(missing, 0), MESSAGES))
         self.gaps.extend([0] * min(came - 1, MESSAGES))
         self.newest = max(number, self.newest)
 
@@ -83,9 +83,13 @@ class _Way:
         for least_run in range(2, max(runs, default=0) + 1):
             bursts = [run for run in runs if run >= least_run]
             by_chance = len(self.gaps) * rate**least_run
-            if len(bursts) > by_chance + 3.0 * by_chance**0.5 + (0.0 if unseen else 1.0):
+            excess = len(bursts) - by_chance - 3.0 * by_chance**0.5
+            if excess > (0.0 if unseen or len(bursts) == 1 else 1.0):
                 break
             bursts = []
+        if len(bursts) == 1 and not unseen:
+            runs.remove(bursts.pop())
+            total = len(self.gaps) + sum(runs)
         share = min((sum(runs) - sum(bursts) + unseen) / max(total, least), 1.0)
         if not bursts:
             return share, 0.0, 0.0

@@ -192,6 +192,8 @@ class ControlLoop:
             output, inference_ns = self._infer(received.state)
             with self._lock:
                 self._busy_since_s = None
+                if self._stopping:
+                    return  # The farewell has been said.
                 self._inference_window.add(inference_ns)
                 self._look_at_vehicle(time.monotonic())
                 now_s = time.monotonic()

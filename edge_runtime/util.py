@@ -60,12 +60,12 @@ def open_regular(path: PathLike) -> BinaryIO:
     raise OSError(errno.EINVAL, "it is no regular file", str(path))
 
 
-def read_bytes(path: PathLike, what: str) -> bytes:
+def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes:
     """The bytes of an existing regular file. `what` names it in the error, as in "policy file".
 
-    Raises UserError where it cannot be read, or holds more than MAX_FILE_MIB.
+    Raises UserError where it cannot be read, or holds more than `most_mib`.
     """
-    limit = MAX_FILE_MIB << 20
+    limit = most_mib << 20
     try:
         with open_regular(path) as stream:
             # The size first; and no more than that, for a file of /proc has none.
@@ -80,7 +80,7 @@ def read_bytes(path: PathLike, what: str) -> bytes:
     except ValueError as error:  # a NUL inside the name
         raise UserError(f"{what} {path!r} is not a file name: {error}") from None
     if not is_small or len(data) > limit:
-        raise UserError(f"{what} {path} is larger than {MAX_FILE_MIB} MiB")
+        raise UserError(f"{what} {path} is larger than {most_mib} MiB")
     return data
 
 

@@ -34,7 +34,7 @@ MAX_PLAN, MAX_RIDE_S = 10, 1.0  # further actions of a command at most, and for 
 DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
 
-# How often a second each of them is sent; 0: once a control period, or when it is asked for.
+# How often a second each is sent at least; 0: once a control period, or when it is asked for.
 TOPICS: Dict[str, float] = {
     "state": 0.0,  # simulator to edge
     "command": 0.0,  # edge to simulator and vehicle
@@ -158,8 +158,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
     `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
-    a re-arm; empty if nothing. `link` is `LinkQuality.summary`, `envelope` its limits; empty where
-    the policy has none.
+    a re-arm; empty if nothing. `link` and `envelope` are `LinkQuality.health`, or empty.
     """
 
     vehicle_id: str

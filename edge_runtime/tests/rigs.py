@@ -12,16 +12,21 @@ from edge_runtime.vehicles.mapping import SPECS, ScenarioCar, similarity_to
 from edge_runtime.vehicles.ros2 import STEERING as ANGLE
 from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
 
+
+def scenario_car(*numbers):
+    return ScenarioCar(**dict(zip(ScenarioCar.__struct_fields__, numbers)))
+
+
 SPEC = SPECS["2.0"]
 CARS = {
-    "left_turn": ScenarioCar(3.0, 4.0, 6.0, math.pi / 4, 5.0),
-    "congestion": ScenarioCar(3.0, 4.0, 6.0, -0.15, 5.0),  # its action +1 turns right
+    "left_turn": scenario_car(3.0, 4.0, 6.0, math.pi / 4, 5.0),
+    "congestion": scenario_car(3.0, 4.0, 6.0, -0.15, 5.0),  # its action +1 turns right
 }
 LEFT_TURN, CONGESTION = (similarity_to(CARS[name], SPEC) for name in ("left_turn", "congestion"))
 OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
 STREAM_S = 0.02
 PEDAL = {"pedal": 1.0}
-CAR = ScenarioCar(1.0, 2.0, 5.0, 0.3, 1.0)
+CAR = scenario_car(1.0, 2.0, 5.0, 0.3, 1.0)
 
 
 def a_manifest(car=CARS["left_turn"], **changes):

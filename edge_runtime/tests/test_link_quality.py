@@ -153,6 +153,18 @@ def test_a_run_stops_nothing_alone_but_arms_nothing_either():
     assert network.quality.refusal().endswith("add up to 2.90 of what they may")
 
 
+@pytest.mark.parametrize("length", [50, 200, 5000])
+def test_an_outage_alone_stops_nothing_however_long(length):
+    network, states = Network(), []
+    network.run(300)
+    network.run(length, lose=lambda way: way == "up")
+    for _ in range(300):
+        network.run(1)
+        states.append(network.quality.outside)
+    assert set(states) == {""}
+    assert network.quality.values()["loss_percent"] == 0.0
+
+
 def test_late_states_fill_their_gaps_and_copies_count_once():
     network = Network()
     network.run(100)

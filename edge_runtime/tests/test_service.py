@@ -234,6 +234,20 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert systemd.next() == "WATCHDOG=1"
 
 
+def test_no_late_answer_follows_the_last_safe_stop(running):
+    control, link, policy = running(Notifier({}))
+    link.state_comes(encode(make_state(0)))
+    wait_until(lambda: link.sent["command"][0] == 1, "the first command")
+    policy.free.clear()
+    link.state_comes(encode(make_state(1)))
+    wait_until(lambda: control._busy_since_s is not None, "the inference")
+    control._controller.farewell = lambda: policy.free.set()  # It ends between the last two.
+    control.close()
+    control._worker.join(5.0)
+    _, last = link.sent["command"]
+    assert (last.step, control._worker.is_alive()) == (0, False)
+
+
 def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
     control, link, policy = running(systemd.notifier())
     link.state_comes(encode(make_state(0)))

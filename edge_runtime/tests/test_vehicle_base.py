@@ -4,6 +4,8 @@ import math
 import threading
 import time
 
+import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,9 +14,11 @@ from edge_runtime.controller import ActionLimit
 from edge_runtime.tests.harness import make_command, wait_until
 from edge_runtime.tests.policies import T
 from edge_runtime.tests.rigs import CAR, CARS, PEDAL, a_manifest
+from edge_runtime.util import UserError
 from edge_runtime.vehicles import base, make_vehicle
 from edge_runtime.vehicles.base import LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
+from edge_runtime.wire import SAFE_STOP
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,6 +37,7 @@ class BrokenVehicle(MockVehicle):
         self.asked: list = []
         self.says: list = []
         self.stands: list = []
+        self.odd: dict = {}
         self.hanging, self.released = threading.Event(), threading.Event()
 
     def hang(self):
@@ -50,7 +55,7 @@ class BrokenVehicle(MockVehicle):
             self.hanging.set()
             self.released.wait()
         report = super().feedback(now_s)
-        return report._replace(faults=list(self.says), standing=list(self.stands))
+        return report._replace(faults=list(self.says), standing=list(self.stands), **self.odd)
 
     def enable(self, now_s):
         self._ask("enable")
@@ -102,6 +107,28 @@ def test_a_driver_that_raises_is_silent_and_its_thread_lives_on(vehicle, runner)
     vehicle.broken = ""
     count = len(runner.heard)
     wait_until(lambda: len(runner.heard) > count, "feedback again")
+
+
+@pytest.mark.parametrize("odd", [{"speed_mps": None}, {"action": {"pedal": "full"}}, {"faults": 3}])
+def test_a_report_that_is_none_is_silence_and_the_brake_still_comes(vehicle, runner, odd):
+    wait_until(lambda: runner.heard, "feedback")
+    vehicle.odd = odd
+    wait_until(lambda: runner.faults, "the fault")
+    assert runner.fault(runner.silent_at_s + 0.001) == SILENT
+    runner.command(make_command(mode=SAFE_STOP))
+    wait_until(lambda: vehicle.asked == ["brake"], "the brake")
+
+
+def test_a_report_in_numbers_of_numpy_is_one(vehicle, runner):
+    vehicle.odd = {"speed_mps": np.float32(1.5), "battery_v": np.float64(24.0)}
+    wait_until(lambda: runner.heard and runner.heard[-1].speed_mps == 1.5, "the report")
+    assert msgspec.json.decode(msgspec.json.encode(runner.heard[-1]))["battery_v"] == 24.0
+
+
+def test_a_driver_that_cannot_be_enabled_at_the_start_gets_one_line(vehicle):
+    vehicle.broken = "command"
+    with pytest.raises(UserError, match="vehicle mock cannot be enabled: bus off"):
+        NotingRunner(vehicle).start()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Iterable, Mapping, Tuple, Type
+from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
@@ -17,6 +17,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
 
 GROUP = "phil.vehicles"
+_Made = TypeVar("_Made")
 Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by name
 
 
@@ -26,12 +27,7 @@ def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
     Raises UserError where there is none, for its settings, and where it cannot be opened.
     """
     kind, settings = _find(name, tables)
-    try:
-        vehicle = kind.open(settings, manifest)
-    except UserError:
-        raise
-    except Exception as error:  # a stranger's driver raises what its library raises
-        raise UserError(f"vehicle {name} cannot be opened: {_words(error)}") from None
+    vehicle = _call(kind.open, name, settings, manifest)
     check_driver(vehicle)
     return vehicle
 
@@ -55,7 +51,16 @@ def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    return kind.limits_of(settings, manifest)
+    return _call(kind.limits_of, name, settings, manifest)
+
+
+def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
+    try:
+        return door(*arguments)
+    except UserError:
+        raise
+    except Exception as error:  # a stranger's driver raises what its library raises
+        raise UserError(f"vehicle {name} cannot be opened: {_words(error)}") from None
 
 
 def find_vehicle(name: str) -> Type[Vehicle]:

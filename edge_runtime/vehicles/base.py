@@ -288,10 +288,16 @@ class VehicleRunner:
         return self._seen_fault(now_s) or (seen.standing[0] if seen and seen.standing else "")
 
     def start(self, armed: bool = True) -> None:
-        """Start the vehicle's feedback, and enable it unless that is to wait for an operator."""
+        """Start the vehicle's feedback, and enable it unless that is to wait for an operator.
+
+        Raises UserError: it cannot be enabled.
+        """
         now_s = time.monotonic()
         if armed:
-            self._vehicle.enable(now_s)
+            try:
+                self._vehicle.enable(now_s)
+            except Exception as error:  # a driver may raise anything
+                raise UserError(f"vehicle {self.name} cannot be enabled: {error}") from error
         self._watch.begin(now_s)
         self._thread.start()
 
@@ -380,9 +386,7 @@ class VehicleRunner:
                 self._vehicle.brake(now_s, task.latch)
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
-            elif (
-                now_s - task.given_s <= self._silence_s
-            ):  # a driver that hung must not obey the past
+            elif now_s - task.given_s <= self._silence_s:  # One that hung must not obey the past.
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
         except Exception as error:  # a driver may raise anything; its thread must live on
             if not self._refuses:
@@ -424,7 +428,8 @@ class VehicleRunner:
     def _ask(self) -> Optional[VehicleReport]:
         """The vehicle's report; None where the driver fails, which is silence like any other."""
         try:
-            report = self._vehicle.feedback(time.monotonic())
+            report = _plain(self._vehicle.feedback(time.monotonic()))
+            self._watch.report(report, time.monotonic())
         except Exception as error:  # as in _obey
             if not self._failing:
                 log.event("error", "no_feedback", detail=error)
@@ -432,5 +437,13 @@ class VehicleRunner:
             return None
         self._failing = False
         self._report_seen = report
-        self._watch.report(report, time.monotonic())
         return report
+
+
+def _plain(report: VehicleReport) -> VehicleReport:
+    """In Python's own types: a driver's numbers may be numpy's. Raises for what is no report."""
+    more = (None if value is None else float(value) for value in report[5:])
+    action = {name: float(value) for name, value in report.action.items()}
+    faults, standing = list(map(str, report.faults)), list(map(str, report.standing))
+    speed_mps, braking = float(report.speed_mps), bool(report.self_braking)
+    return VehicleReport(action, speed_mps, braking, faults, standing, *more)

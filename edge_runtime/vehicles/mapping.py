@@ -18,7 +18,7 @@ import msgspec
 
 from edge_runtime.config import check_choice
 from edge_runtime.controller import ActionLimit
-from edge_runtime.manifest import Manifest
+from edge_runtime.manifest import Car, Manifest
 from edge_runtime.util import UserError
 
 # The set-point runs ahead of the speed by what full acceleration gives in this time, and no
@@ -73,14 +73,8 @@ SPECS: Dict[str, HunterSpec] = {
 }
 
 
-class ScenarioCar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The car that a policy was trained on, as `manifest.Car` describes it, and how it turns."""
-
-    throttle_mps2: float
-    brake_mps2: float
-    max_speed_mps: float
-    full_steering_rad: float
-    wheelbase_m: float
+class ScenarioCar(Car, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The car that a policy was trained on, and how it turns."""
 
     def curvature(self, steering: float) -> float:
         """Path curvature (1/m, positive to the left) of a steering action in -1 to 1.

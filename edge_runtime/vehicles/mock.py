@@ -14,6 +14,7 @@ import msgspec
 
 from edge_runtime.config import convert
 from edge_runtime.controller import ActionLimit
+from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.vehicles.mapping import clamp
 
@@ -62,7 +63,11 @@ class MockVehicle(Vehicle):
         """As quick as the policy's car, where that is known and the settings say nothing else."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in cls._OF_THE_CAR if name in car}
-        return cls(convert({**known, **settings}, MockParameters, "vehicle.mock"))
+        parameters = convert({**known, **settings}, MockParameters, "vehicle.mock")
+        for key, value in msgspec.structs.asdict(parameters).items():
+            if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
+                raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
+        return cls(parameters)
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""

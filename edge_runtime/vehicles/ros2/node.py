@@ -255,12 +255,11 @@ def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
 class Ros2Node:
     """Uses a session that somebody else opens and closes. `close` it before the session.
 
-    `rejected` counts what could not be read, by reason; `sent` what was published, by key.
+    `rejected` counts what could not be read, by reason.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
         self.rejected: Dict[str, int] = {}
-        self.sent: Dict[str, int] = {}
         self._session = session
         self._namespace = namespace
         self._zid = str(session.info.zid())
@@ -275,13 +274,7 @@ class Ros2Node:
         )
         self._declared.append(publisher)
         self._announce(topic_token(self._zid, PUBLISHER, key, kind))
-        self.sent[key] = 0
-
-        def publish(message: _M) -> None:
-            publisher.put(encode(message))
-            self.sent[key] += 1
-
-        return publish
+        return lambda message: publisher.put(encode(message))
 
     def subscribe(self, topic: str, kind: Type[_M], take: Callable[[_M], None]) -> None:
         """Call `take` with each message, in Zenoh's thread; what cannot be read is counted."""
