@@ -221,8 +221,8 @@ class RealTimeClock(_Clock):
         """Start an episode now; ``seed`` decides the link's delays and losses."""
         with self._arrived:
             self._check.begin(episode)
-            self._link = make_link(self._spec, seed)
             self._start_s = self._begun_s = time.monotonic()
+            self._link = make_link(self._spec, seed)
             self._hold = CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 

@@ -95,7 +95,8 @@ def _metadata(environment_id: str) -> dict[str, Any]:
         if isinstance(entry_point, str)
         else entry_point
     )
-    return getattr(made, "metadata", None) or {}
+    found = getattr(made, "metadata", None)
+    return found if isinstance(found, dict) else {}  # A wrapper's is a property of each object.
 
 
 def load_plugin(environment_id: str) -> None:
@@ -132,12 +133,16 @@ def describe(environment: Environment, period_s: float | None = None) -> Task:
     own = environment.unwrapped
     spec = environment.spec
     name = getattr(own, "scenario", None) or (spec.id if spec else type(own).__name__)
+    try:
+        car = msgspec.convert(getattr(own, "car", None), Car | None)
+    except msgspec.ValidationError as error:
+        raise UserError(f"environment {name!r}: its car is not valid: {error}") from None
     task = Task(
         task=name,
         observation=_entries(environment, name),
         action=_actions(environment, name),
         control_period_s=_period_s(own, name, period_s),
-        car=msgspec.convert(getattr(own, "car", None), Car | None),
+        car=car,
     )
     check_task(task)
     return task
@@ -169,14 +174,15 @@ def _actions(environment: Environment, name: str) -> list[Action]:
         raise UserError(f"environment {name!r} acts in {space}; the wire carries a Box with bounds")
     low, high = space.low.ravel().tolist(), space.high.ravel().tolist()
     count = len(low)
-    names = getattr(own, "action_names", None) or [f"action_{number}" for number in range(count)]
-    meanings, units = (
-        getattr(own, attribute, None) or [""] * count
-        for attribute in ("action_meanings", "action_units")
-    )
-    stops = known_stops(environment) or [None] * count
-    rows = zip(names, meanings, units, low, high, stops, strict=True)
-    fields = ("name", "meaning", "unit", "low", "high", "stop")
+    names, empty = [f"action_{number}" for number in range(count)], [""] * count
+    defaults = {"action_names": names, "action_meanings": empty, "action_units": empty}
+    said: dict[str, Any] = {key: getattr(own, key, None) or kept for key, kept in defaults.items()}
+    said["brake_action"] = known_stops(environment) or [None] * count
+    for key, values in said.items():
+        if len(values) != count:
+            raise UserError(f"environment {name!r}: {key} has {len(values)} entries, not {count}")
+    rows = zip(*said.values(), low, high, strict=True)
+    fields = ("name", "meaning", "unit", "stop", "low", "high")
     return [Action(**dict(zip(fields, row, strict=True))) for row in rows]
 
 

@@ -295,6 +295,7 @@ class ForkedDrive(InProcessClock):
 
     def finish(self, state: State) -> None:
         """Compare the final state, too."""
+        self._step = state.step
         self._compare(state)
         self._write("state", state, state.sim_time_s)
 

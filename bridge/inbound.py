@@ -214,18 +214,14 @@ class FeedbackHold:
         """Take the newest feedback: received from the wire, and (network injected) heard now."""
         self._newest, self._received_s, self._heard_s = feedback, received_s, now_s
 
-    def newest(self, now_s: float) -> Feedback | None:
-        """Return the newest feedback; None if it has been silent for 2 T."""
-        silent = now_s - self._heard_s > self._silence_s + ROUNDING_S
-        return None if silent else self._newest
-
     def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
         """Say what the vehicle did in the tick that ends now.
 
         ``heard`` is what its commands would have it do: the simulator hears those, too. They give
         a stop its reason, and decide nothing.
         """
-        feedback, reason = self.newest(now_s), ""
+        silent = now_s - self._heard_s > self._silence_s + ROUNDING_S
+        feedback, reason = None if silent else self._newest, ""
         if feedback is None:
             reason = NO_FEEDBACK
         elif feedback.episode != episode:

@@ -208,12 +208,11 @@ def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
     key = read_signing_key(key_file) if key_file else None
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     check_writable(signature_path)
-    if key is None:
-        # A signature of an older file beside it would only mislead.
-        signature_path.unlink(missing_ok=True)
     write_atomic(path, data)
     if key is not None:
         write_atomic(signature_path, key.sign(data))
+    else:  # A signature of an older file beside it would only mislead.
+        signature_path.unlink(missing_ok=True)
 
 
 EXAMPLE = examples(

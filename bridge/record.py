@@ -24,6 +24,7 @@ import functools
 import io
 import os
 import sys
+import threading
 import time
 import typing
 from collections import Counter
@@ -46,7 +47,7 @@ from bridge.ports import (
 )
 from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
-from edge_runtime.cli import Command, examples, seconds, sigterm_as_interrupt
+from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import (
     behind_link,
     check_writable,
@@ -95,10 +96,16 @@ def _run_record(arguments: Any) -> int:
     ):
         try:
             print(f"recording {path}", flush=True)
-            # Being interrupted is the ordinary way to end a recording.
-            with contextlib.suppress(KeyboardInterrupt):
-                _listen(listener, writer, arguments)
-            writer.finish(listener.dropped)
+            # A signal is the ordinary way to end a recording: it must not cut a message in two.
+            ended = threading.Event()
+
+            def end() -> bool:
+                ended.set()
+                return True
+
+            with quit_on_signals(end):
+                _listen(listener, writer, arguments, ended)
+                writer.finish(listener.dropped)
         except OSError as error:
             stopped = f"error: recording {path} stopped: {error.strerror}; it holds what was"
             print(f"{stopped} written before: python -m bridge repair {path}", file=sys.stderr)
@@ -110,11 +117,13 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
+def _listen(
+    listener: WireListener, writer: RecordingWriter, arguments: Any, ended: threading.Event
+) -> None:
     now_s = time.monotonic()
     end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
     flush_s, seen_s = now_s + FLUSH_S, now_s
-    while end_s is None or now_s < end_s:
+    while not ended.is_set() and (end_s is None or now_s < end_s):
         heard = listener.next(POLL_S)
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
@@ -200,8 +209,13 @@ class RecordingWriter:
         self._copies = ViewerCopies(self._add_copy)
         self._file = FlushedFile(path)
         self._mcap = start_mcap(self._file)
-        self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
-        self._channels: dict[str, int] = {}
+        try:
+            self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
+        except OSError as error:
+            self.close()
+            path.unlink()
+            raise UserError(f"cannot write {path}: {error.strerror}") from None
+        self._channels: dict[tuple[str, int], int] = {}
         self._schema_ids: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
 
@@ -240,10 +254,11 @@ class RecordingWriter:
         self._add(topic, "protobuf", now_ns, data, self._schema_ids[schema.name])
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
-        if topic not in self._channels:
-            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
+        kind = topic, schema_id  # A picture may have the name of a message.
+        if kind not in self._channels:
+            self._channels[kind] = self._mcap.register_channel(topic, encoding, schema_id)
         self._counts[topic] += 1
-        self._mcap.add_message(self._channels[topic], now_ns, data, now_ns, self._counts[topic])
+        self._mcap.add_message(self._channels[kind], now_ns, data, now_ns, self._counts[topic])
 
 
 def _vehicle_id(heard: Heard) -> str:

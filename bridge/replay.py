@@ -185,18 +185,19 @@ class RecordedDrive:
             raise UserError(f"{path} holds no answered state of vehicle {self.vehicle_id}")
 
     def states(self) -> Iterator[State]:
-        """Yield every state that can be read, answered or not, in order of arrival."""
+        """Yield every state that can be read, answered or not, once, in order of arrival."""
+        seen: set[Key] = set()  # A network may repeat them.
         for heard in heard_of(self.recording, self.vehicle_id):
             if heard.topic == "state":
                 state = DECODERS["state"](heard.payload)
-                if isinstance(state, State):
+                if isinstance(state, State) and key_of(state) not in seen:
+                    seen.add(key_of(state))
                     yield state
 
     def answered(self) -> Iterator[tuple[State, Exchange]]:
-        """Yield the states that reached the policy, each once."""
-        left = dict(self.exchanges)
+        """Yield the states that reached the policy."""
         for state in self.states():
-            if (exchange := left.pop(key_of(state), None)) is not None:
+            if (exchange := self.exchanges.get(key_of(state))) is not None:
                 yield state, exchange
 
     def _take(self, heard: Heard) -> None:

@@ -164,7 +164,7 @@ def _drive(
         bar.advance({}, told=told)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
-    by_simulator = check.rejected + Counter(edge.unreadable)
+    by_simulator = Counter({**check.rejected}) + Counter(edge.unreadable)
     if vehicle is not None:
         by_simulator += vehicle.rejected()
     return make_report(

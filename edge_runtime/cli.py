@@ -21,6 +21,7 @@ from edge_runtime.util import UserError, ending_signals, printable
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -220,6 +221,32 @@ def sigterm_as_interrupt() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
+    """Let the first signal ask for the end.
+
+    A second one ends the process, and so does the first where ``ask`` returns False: then nothing
+    is left that could end in order.
+    """
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(number: int, frame: Any) -> None:
+        restore()
+        if not ask():
+            os.kill(os.getpid(), number)
+
+    for number in SIGNALS:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        restore()
 
 
 def _interrupt(number: int, frame: Any) -> NoReturn:

@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from enum import IntEnum
@@ -30,8 +30,7 @@ from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
 LOCK_FILE = ".lock"  # In a directory that is claimed, for as long as it is
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-WRITTEN = ("results/paper",)
+WRITTEN = ("results/paper", "results/guidance")
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
@@ -192,32 +191,6 @@ def _is(path: Path, descriptor: int) -> bool:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False
-
-
-@contextmanager
-def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
-    """Let the first signal ask for the end.
-
-    A second one ends the process, and so does the first where ``ask`` returns False: then nothing
-    is left that could end in order.
-    """
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def stop(number: int, frame: Any) -> None:
-        restore()
-        if not ask():
-            os.kill(os.getpid(), number)
-
-    for number in SIGNALS:
-        signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        restore()
 
 
 def cores() -> int:

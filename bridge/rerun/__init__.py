@@ -160,7 +160,9 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
         finally:
             recording.flush()
             recording.disconnect()  # Writes the footer.
-            os.replace(temporary, target)
+            # No part takes a whole one's place; but ^C is the ordinary way to end one.
+            if not (target.exists() and isinstance(sys.exc_info()[1], Exception)):
+                os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
 

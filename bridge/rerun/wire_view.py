@@ -10,6 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -268,6 +269,9 @@ class WireLog:
 
     def write_health(self, health: Health, _arrived_ns: int) -> None:
         """Refresh the status text, and note what the edge runtime has newly rejected."""
+        needed = {"load", "up_ms", "down_ms", "error_ms", *health.envelope}
+        if not (needed <= health.link.keys() and all(health.envelope.values())):
+            health = msgspec.structs.replace(health, link={})  # None, or a stranger's
         for reason, count in health.rejected.items():
             new = count - self._edge_counts.get(reason, 0)
             if new > 0:

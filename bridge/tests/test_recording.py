@@ -11,9 +11,12 @@ import signal
 import time
 import zlib
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -47,6 +50,7 @@ from bridge.tests.harness import (
 )
 from bridge.tests.test_inbound import health
 from bridge.tests.test_replay import Hand
+from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
 from edge_runtime.policy import load_policy
@@ -270,6 +274,45 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
     assert read(out)["per_episode"][0]["steps"] == 60  # The loop went on to its end.
 
 
+def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "write", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(UserError, match=r"cannot write .*a.mcap: No space left"):
+        RecordingWriter(tmp_path / "a.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
+    """Not even while the writer is in the middle of one."""
+    listener, ended, path = WireListener(), Event(), tmp_path / "a.mcap"
+    monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
+    with writing(path) as writer, quit_on_signals(lambda: not ended.set()):
+        copy = writer._copies.write
+
+        def signalled(one):
+            signal.raise_signal(signal.SIGTERM)
+            copy(one)
+
+        monkeypatch.setattr(writer._copies, "write", signalled)
+        _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=9.0), ended)
+    assert [topic for topic, _, _ in told_in(path)] == ["phil/v/state", "view/v/state"]
+
+
+def test_a_picture_may_have_the_name_of_a_message(tmp_path):
+    frames = Entry(dtype="uint8", shape=[2, 45, 80])
+    task = msgspec.structs.replace(TASK, observation={"state": frames})
+    scene = Scene(episode=0, step=3, sim_time_s=0.3, task=task)
+    with writing(tmp_path / "a.mcap") as writer:
+        writer.write(heard("scene", encode_scene({}, scene)))
+        writer.write(heard("state", encode(make_state(3, observation={"state": bytes(SIZE)}))))
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        found = [
+            (channel.topic, schema.name)
+            for schema, channel, _ in make_reader(stream).iter_messages()
+            if schema is not None and channel.topic == "view/v/state"
+        ]
+    assert sorted(name for _, name in found) == ["foxglove.RawImage", "phil.State"]
+
+
 def test_a_feed_that_falls_behind_drops_and_counts():
     feed, endpoint = WireListener(), free_endpoint()
     with contextlib.closing(open_session(listen=endpoint, mode="router")) as session:
@@ -293,7 +336,7 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
 
     monkeypatch.setattr(listener, "next", hear)
     with writing(tmp_path / "drive.mcap") as writer:
-        _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=0.05))
+        _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=0.05), Event())
     assert writer.messages > 0
 
 

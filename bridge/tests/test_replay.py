@@ -92,6 +92,7 @@ def is_the_same(hand, compared=None):
 def test_the_same_policy_is_equal_and_the_report_says_of_what(hand):
     hand.drive(0, 20)
     hand.state(2.0, 20)  # Nobody answered it.
+    hand.state(2.01, 19)  # A network has repeated this one.
     status, report = replay(hand)
     assert status == 0
     assert (report["states"], report["compared"], report["unanswered"]) == (21, 20, 1)

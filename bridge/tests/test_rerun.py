@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import bridge.rerun
 from bridge import messages
 from bridge.__main__ import main
-from bridge.rerun import Sink, check_sink, flush, free_port, open_sink, read_sink
+from bridge.rerun import Sink, _saved, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.wire_view import Timeline, WireLog
 from bridge.tests import harness
@@ -298,6 +298,26 @@ def test_rejections_are_counted_by_side_and_reason(kept, monkeypatch):
         log.write(messages.Heard("", "feedback", payload, 10**18, len(payload)))
     assert [event.split(": ")[0] for event in events[2:]] == ["unreadable feedback"]
     assert kept["speed/vehicle"] == [0.5]
+
+
+@pytest.mark.parametrize(
+    ("link", "envelope"),
+    [({"x": 1.0}, {"y": 1.0}), ({"y": 1.0}, {"y": 1.0}), ({"y": 1.0, "load": 1.0}, {"y": 0.0})],
+)
+def test_the_link_of_a_stranger_is_not_drawn(kept, link, envelope):
+    log = WireLog(rr.RecordingStream("test"))
+    log.write_health(msgspec.structs.replace(HEALTH, link=link, envelope=envelope), 10**18)
+    assert not [path for path in kept if path.startswith("link/")]
+
+
+def test_no_part_of_a_recording_takes_a_whole_ones_place(tmp_path):
+    for error, taken in ((ValueError, False), (KeyboardInterrupt, True)):
+        out = tmp_path / "a.rrd"
+        out.write_bytes(b"whole")
+        with pytest.raises(error), _saved(rr.RecordingStream("t"), str(out), rrb.Blueprint()):
+            raise error
+        assert (out.read_bytes() != b"whole") == taken
+        assert list(tmp_path.iterdir()) == [out]
 
 
 def test_live_pictures_are_at_most_ten_a_second(monkeypatch):

@@ -37,6 +37,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy, write_rover
 from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 
 CONTRACT_KEYS = """
 scenario condition episodes policy_id seed success_rate collision_rate surviving_distance_m
@@ -282,6 +283,21 @@ def run(environment, clock, standing=False):
     )  # fmt: skip
     runner = EpisodeRunner(environment, clock, told, told, task, origin)
     return runner, runner.run(0, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("action_names", ["a", "b"], "action_names has 2 entries, not 1"),
+        ("brake_action", np.zeros(3), "brake_action has 3 entries, not 1"),
+        ("car", {"throttle_mps2": 3.0}, "its car is not valid: .*brake_mps2"),
+    ],
+)
+def test_what_an_environment_says_wrongly_of_itself_is_one_line(monkeypatch, name, value, words):
+    made = make_environment(TOY)
+    monkeypatch.setattr(made.unwrapped, name, value, raising=False)
+    with pytest.raises(UserError, match=f"^environment 'left_turn': {words}"):
+        describe(made)
 
 
 def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from edge_runtime import util
+from edge_runtime import cli, util
 from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
@@ -188,6 +188,27 @@ def test_all_that_end_a_process_are_interrupts(all_at_default):
                 signal.raise_signal(number)
         assert util.ending_signals() == set()
     assert util.ending_signals() == ending
+
+
+@pytest.mark.parametrize("number", cli.SIGNALS)
+@pytest.mark.parametrize("heeded", [True, False])
+def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
+    before, asked = [signal.getsignal(each) for each in cli.SIGNALS], []
+
+    def ask():
+        asked.append(number)
+        return heeded
+
+    with cli.quit_on_signals(ask):
+        assert [signal.getsignal(each) for each in cli.SIGNALS] != before
+        if heeded:
+            signal.raise_signal(number)
+            assert asked == [number]
+        if number == signal.SIGINT:
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(number)
+            assert asked == [number]
+    assert [signal.getsignal(each) for each in cli.SIGNALS] == before
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda number, frame: None])

@@ -1,5 +1,4 @@
 import os
-import signal
 import subprocess
 
 import pytest
@@ -62,27 +61,6 @@ def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
     (tmp_path / util.LOCK_FILE).mkdir()
     with pytest.raises(UserError, match="cannot lock"), util.claimed(tmp_path):
         pass
-
-
-@pytest.mark.parametrize("number", util.SIGNALS)
-@pytest.mark.parametrize("heeded", [True, False])
-def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
-    before, asked = [signal.getsignal(each) for each in util.SIGNALS], []
-
-    def ask():
-        asked.append(number)
-        return heeded
-
-    with util.quit_on_signals(ask):
-        assert [signal.getsignal(each) for each in util.SIGNALS] != before
-        if heeded:
-            signal.raise_signal(number)
-            assert asked == [number]
-        if number == signal.SIGINT:
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(number)
-            assert asked == [number]
-    assert [signal.getsignal(each) for each in util.SIGNALS] == before
 
 
 @pytest.mark.parametrize(
