@@ -65,5 +65,5 @@ class HillExpert:
         return "wasted" if self.against > self.PATIENCE else None
 
 
-gymnasium.register("examples/Racetrack-v0", lambda **o: Racetrack(**o), max_episode_steps=150)
-gymnasium.register("examples/Hill-v0", lambda **o: Hill(**o), max_episode_steps=200)
+gymnasium.register("examples/Racetrack-v0", Racetrack, max_episode_steps=150)
+gymnasium.register("examples/Hill-v0", Hill, max_episode_steps=200)

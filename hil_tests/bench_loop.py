@@ -18,16 +18,17 @@ from typing import Any, Self
 import numpy as np
 import zenoh
 
+from bridge.ports import add_options
 from bridge.progress import ProgressBar
 from bridge.report import markdown_table
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
-from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.files import write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from hil_tests.faults.rig import make_state
-from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, CommandTimeoutError, Process, wait_until
 from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
@@ -63,13 +64,11 @@ def add_arguments(parser: ArgumentParser) -> None:
         ("--steps", 100_000, "of the memory's run"),
     ):
         parser.add_argument(name, type=positive, default=default, help=text)
-    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
+    add_options(parser, "--out")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print the table, and write the JSON. Bars are shown, never enforced."""
-    if arguments.out is not None:
-        check_writable(arguments.out)
     load_policy(arguments.policy, arguments.public_key)
     machine: dict[str, Any] = {"processor": processor_model(), "cores": os.cpu_count()}
     machine["load_before"] = os.getloadavg()[0]
@@ -173,7 +172,7 @@ class Contender:
         self.put(payload)
         while step not in self.arrivals:
             if time.perf_counter() > begun_s + _ANSWER_S:
-                raise TimeoutError(f"{self.vehicle_id} does not answer step {step}")
+                raise CommandTimeoutError(f"{self.vehicle_id} does not answer step {step}")
             time.sleep(0.0001)
         return self.arrivals[step] - begun_s
 

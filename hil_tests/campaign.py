@@ -77,18 +77,18 @@ def run(arguments: argparse.Namespace) -> int:
     axes, faults = _choose(arguments)
     jobs = arguments.jobs or cores()
     result: dict[str, Any] = {"command": _this_command()}
-    name = Path(arguments.policy or f"{arguments.scenario}.onnx").name
-    text = [f"# Campaign: {name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
+    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
+    text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
     if axes:
-        latency = run_latency(_task(arguments), axes, arguments.target, jobs, out)
+        latency = run_latency(_task(arguments, policy), axes, arguments.target, jobs, out)
         result["latency"] = latency
         text += ["## Latency", "", render_latency(latency)]
         print(latency["budget"]["sentence"])
     if faults is not None:
         with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
             found = run_faults(
-                arguments.tries, faults or None, arguments.policy and Path(arguments.policy),
-                lambda row: bar.advance({"row": row}), jobs, arguments.public_key,
+                arguments.tries, faults or None, policy, lambda row: bar.advance({"row": row}),
+                jobs, arguments.public_key,
             )  # fmt: skip
         result["faults"] = found
         text += ["## Faults", "", render_faults(found)]
@@ -118,9 +118,8 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] 
     return axes, None if without_faults else faults
 
 
-def _task(arguments: argparse.Namespace) -> sweep.Task:
+def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:
     """UserError where the policy does not load; its signature is the edge runtime's to check."""
-    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
     return sweep.Task(
         policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,

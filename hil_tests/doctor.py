@@ -254,32 +254,21 @@ def _realtime_priority() -> str:
 
 
 def python_says(script: str) -> str:
-    """What a script prints, in its own process; ModuleNotFoundError, or UserError if it fails."""
-    try:
-        return program_says(sys.executable, "-c", script)
-    except UserError as error:
-        said = str(error).partition(": ")[2]
-        if said.startswith("ModuleNotFoundError"):
-            raise ModuleNotFoundError(name=said.split("'")[1]) from None
-        raise UserError(said) from None
-
-
-def program_says(*command: str) -> str:
-    """The first line that a program prints, else where it is; UserError where it fails."""
-    name = Path(command[0]).name
-    if (path := shutil.which(command[0])) is None:
-        raise UserError(f"{name} is not installed")
+    """The first line of a script in its own process; ModuleNotFoundError, UserError if it fails."""
     quiet = {**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
+    command = [sys.executable, "-c", script]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, env=quiet
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise UserError(f"{name}: {error}") from None
+        raise UserError(str(error)) from None
     if done.returncode != 0:
         said = (done.stderr or done.stdout).strip() or f"exit status {done.returncode}"
-        raise UserError(f"{name}: {said.splitlines()[-1]}")
-    return done.stdout.partition("\n")[0] or path
+        if (last := said.splitlines()[-1]).startswith("ModuleNotFoundError"):
+            raise ModuleNotFoundError(name=last.split("'")[1])
+        raise UserError(last)
+    return done.stdout.partition("\n")[0]
 
 
 CHECKS = (

@@ -269,7 +269,7 @@ def _begin(policy: str, env: str, condition: str, public_key: str | None) -> Non
     threading.Thread(target=die_with_parent, daemon=True).start()
     set_threads(1)
     environment = make_environment(env, condition)
-    _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
+    _mine[:] = environment, load_driver(policy, environment, public_key, True)[0], condition
 
 
 def _work(work: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
@@ -325,7 +325,7 @@ EXAMPLE = cli.examples(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    inner = cli.number("a share between 0 and 1", lambda value: 0.0 < value < 1.0)
+    inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
     add, count = parser.add_argument, cli.not_negative
     add("--out", required=True, metavar="F.json", help="what is found")
     add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
@@ -341,16 +341,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
 
 
+def _known(path: str) -> Mapping[str, Any]:
+    known = read_json(path, "envelope")
+    needed = {"policy_id", "promised_success", "edges"}
+    if not (isinstance(known, dict) and needed <= known.keys() and known["edges"]):
+        raise UserError(f"{path} is no envelope of hil_tests envelope, with edges to confirm")
+    return known
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Find an envelope, or confirm one: 0, or 1 where an edge is not confirmed."""
     check_writable(arguments.out)
     began_s, jobs = time.monotonic(), arguments.jobs or cores()
-    known = read_json(arguments.confirm, "envelope") if arguments.confirm else {}
+    known = _known(arguments.confirm) if arguments.confirm else {}
     asked = {"env": arguments.env, "condition": arguments.condition}
     env, condition = (str(known.get(name, asked[name])) for name in asked)
     policy = arguments.policy or known.get("policy") or f"results/policies/{env}.onnx"
     environment = make_environment(env, condition)
-    policy_id = load_driver(policy, environment, arguments.public_key)[1]
+    policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
     if known and known["policy_id"] != policy_id:
         raise UserError(f"{arguments.confirm} is of another policy than {policy}")
     found: dict[str, Any] = {

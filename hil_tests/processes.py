@@ -258,20 +258,20 @@ def in_parallel(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for children in Path("/proc/self/task").glob("*/children"):  # whichever thread waits
-                for child in children.read_text().split():
-                    with contextlib.suppress(ProcessLookupError):
+                with contextlib.suppress(OSError):  # A thread or child that has just ended
+                    for child in children.read_text().split():
                         os.kill(int(child), signal.SIGTERM)
             raise
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
-    """Poll until the condition is true and return its value; TimeoutError otherwise."""
+    """Poll until the condition is true and return its value; CommandTimeoutError otherwise."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
         if value := condition():
             return value
         time.sleep(POLL_S)
-    raise TimeoutError(f"not within {timeout_s:g} s: {what}")
+    raise CommandTimeoutError(f"not within {timeout_s:g} s: {what}")
 
 
 def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:

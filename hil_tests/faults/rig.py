@@ -370,8 +370,7 @@ class ChassisProcess:
         self.truth: list[Truth] = []
         self.switched: list[tuple[float, str, str]] = []
         command = ["hil_tests", "mock_hunter", "--bus", bus, *arguments]
-        self.process = Process(*command, told=True, on_line=self._on_line)
-        self.process.wait_for_line("ready")
+        self.process = Process(*command, told=True, on_line=self._on_line, ready="ready")
 
     @property
     def moves(self) -> bool:

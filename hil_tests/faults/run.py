@@ -21,7 +21,7 @@ from hil_tests.faults import hunter, messages, ride  # noqa: F401 (they fill the
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
-from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
+from hil_tests.processes import POLICY, in_parallel, trusting
 
 SLOW_S = 2.5 * TASK.control_period_s
 STALLED_PERIODS = 1.5
@@ -65,7 +65,7 @@ class Outcome:
 def run_faults(
     tries: int,
     rows: Sequence[str] | None = None,
-    policy: Path | None = None,
+    policy: Path = POLICY,
     on_try: Callable[[str], None] = lambda row: None,
     jobs: int = 2,
     public_key: str | None = None,
@@ -73,16 +73,14 @@ def run_faults(
     """Do every row ``tries`` times; a report for JSON.
 
     ``rows`` are names of the table's rows, or patterns of them (``hunter_*``); None for all. An
-    exported ``policy`` (None for the repository's own left turn) is verified with ``public_key``.
+    exported ``policy`` is verified with ``public_key``.
     ``on_try`` is called with the row's name after every try. ``jobs`` rigs run at once; rows that
     need the machine for themselves run after the others. Raises UserError for a row that the table
     does not hold, or no policy.
     """
     chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
-    given = load_policy(policy or POLICY, public_key, allow_unsigned=True).manifest
-    if policy is None:
-        trust = ("--policy", str(POLICY), "--public-key", public_key or str(PUBLIC_KEY))
+    given = load_policy(policy, public_key, allow_unsigned=True).manifest
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
         work = Path(folder)
         policies = {"given": trust}

@@ -241,6 +241,20 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(rig, tmp
     assert not (tmp_path / "none.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [("{}", []), ("[]", []), ('{"edges": {}}', []), ("", ["--promise", "0.4"]),
+     ("", ["--confidence", "0.1"])],
+)  # fmt: skip
+def test_what_cannot_be_searched_or_confirmed_is_one_line(tmp_path, capsys, text, options):
+    given_, out = tmp_path / "given.json", tmp_path / "out.json"
+    given_.write_text(text)
+    words = ["envelope", "--out", str(out), *options, *(["--confirm", str(given_)] if text else [])]
+    assert exit_status(main, words) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not out.exists()
+
+
 def test_a_break_below_a_network_that_does_not_break_is_an_edge_too(monkeypatch):
     def drive(spec, seeds):
         return [seed % 3 > 0 or not 300 <= spec.up.delay_ms <= 600 for seed in seeds]
