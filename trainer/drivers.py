@@ -84,10 +84,13 @@ def is_expert(word: str) -> bool:
     return word == "expert" or (bool(re.fullmatch(r"[\w.]+:\w+", word)) and CONSTANT not in word)
 
 
-def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[Driver, str]:
+def load_driver(
+    policy: str, env: Any, public_key: str | None = None, knows_delay: bool = False
+) -> tuple[Driver, str]:
     """The driver that the word or path ``policy`` names, and its policy id.
 
-    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
+    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`. Whoever
+    shows it what is on its way may have one that ``knows_delay``.
 
     Raises UserError: nothing there that drives.
     """
@@ -116,11 +119,14 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     else:
         raise UserError(
             f"{policy} is no policy: expected an .onnx file, a training run, "
-            "a human model's directory, the word expert, or constant:ACTION"
+            "a human model's directory, the word expert, module:Class of one, or constant:ACTION"
         )
     if about["scenario"] != env.scenario:
         raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
-    return TogetherDriver(actor.eval().act, _awareness(env, about)), policy_id
+    aware = _awareness(env, about)
+    if aware and not knows_delay:
+        raise UserError(f"{policy} sees the actions on their way: only trainer evaluate shows them")
+    return TogetherDriver(actor.eval().act, aware), policy_id
 
 
 def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
@@ -149,7 +155,7 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
         env = make_environment(label["scenario"])
         aware = _awareness(env, label)
         space = aware.space if aware else env.observation_space
-        first = weights.get("picture.trunk.conv1.weight")
+        first = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)
         frames = 2 if first is None else first.shape[1]
         actor = Actor(len(weights["head.output.bias"]), frames, space)
         actor.load_state_dict(weights)

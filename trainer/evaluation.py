@@ -129,19 +129,21 @@ def evaluate(
     policy, spec = fspath(policy), parse_spec(latency)
     scenario = scenario_of(scenario or _trained_in(policy))
     env = make_environment(scenario, condition)
-    driver, policy_id = load_driver(policy, env, public_key)
+    driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     threads, goals = torch.get_num_threads(), 0
     set_threads(1)  # The last bits must not depend on the machine's cores.
-    with ProgressBar("evaluating", runs) as bar:
+    try:
+        with ProgressBar("evaluating", runs) as bar:
 
-        def on_episode(result: EpisodeResult) -> None:
-            nonlocal goals
-            goals += result.outcome == GOAL
-            bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
+            def on_episode(result: EpisodeResult) -> None:
+                nonlocal goals
+                goals += result.outcome == GOAL
+                bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
-        seeds = range(seed, seed + runs)
-        results = drive_episodes(env, driver, seeds, condition, on_episode, spec)
-    set_threads(threads)
+            seeds = range(seed, seed + runs)
+            results = drive_episodes(env, driver, seeds, condition, on_episode, spec)
+    finally:
+        set_threads(threads)
     report = summarise(results, scenario, condition, policy_id, seed)
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
@@ -223,7 +225,7 @@ def drive_episodes(
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
-    Its noise is added here; its scene is the environment's own (``drivers.make_environment``).
+    Its noise is added here; its scene is the environment's own (``environments.make_environment``).
     ``latency`` is the network between driver and vehicle, in virtual time; a link serves one
     episode.
     """

@@ -119,12 +119,6 @@ def set_threads(count: int) -> None:
         torch.set_num_threads(count)
 
 
-def check_suffix(out: str, what: str, *suffixes: str) -> None:
-    """Refuse a name that says something else than what will be in the file; raises UserError."""
-    if not out.endswith(suffixes):
-        raise UserError(f"--out {out}: {what}")
-
-
 def read_json(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file.
 
@@ -134,14 +128,3 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise UserError(f"{what} {path} holds no JSON object")
     return value
-
-
-def existing_directory(path: str, what: str) -> Path:
-    """A directory that is there.
-
-    Raises UserError: it is not.
-    """
-    directory = Path(path)
-    if not directory.is_dir():
-        raise UserError(f"{what} {path} does not exist")
-    return directory

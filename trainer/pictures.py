@@ -15,7 +15,7 @@ from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
 from trainer.drivers import load_driver
 from trainer.environments import make_environment
-from trainer.options import add_scenario, add_seed, check_suffix, existing_directory
+from trainer.options import add_scenario, add_seed
 from trainer.training.metrics import read_metrics
 
 CURVE_FILE = "learning_curve.png"
@@ -34,16 +34,19 @@ def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
     runs = "directory of a training run; several are drawn thinly, and their mean"
     parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
     out = f"the picture (default: RUN_DIR/{CURVE_FILE})"
-    parser.add_argument("--out", metavar="F.png", help=out)
+    parser.add_argument("--out", type=_png, metavar="F.png", help=out)
+
+
+def _png(out: str) -> str:
+    if not out.endswith(".png"):
+        raise argparse.ArgumentTypeError(f"{out}: a picture is a .png")
+    return out
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    run_dirs = [existing_directory(path, "run directory") for path in arguments.run_dirs]
-    if arguments.out is None and len(run_dirs) > 1:
+    if arguments.out is None and len(arguments.run_dirs) > 1:
         raise UserError("several runs go into one picture: --out F.png")
-    if arguments.out is not None:
-        check_suffix(arguments.out, "a picture is a .png", ".png")
-    print(write_learning_curve(*run_dirs, out=arguments.out))
+    print(write_learning_curve(*map(Path, arguments.run_dirs), out=arguments.out))
     return 0
 
 
@@ -139,11 +142,10 @@ def _add_picture_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the episode")
     when = "the moment, in simulated seconds from the start"
     parser.add_argument("--time", type=positive_number, default=3.0, metavar="S", help=when)
-    parser.add_argument("--out", required=True, metavar="F.png", help="the picture")
+    parser.add_argument("--out", type=_png, required=True, metavar="F.png", help="the picture")
 
 
 def _picture(arguments: argparse.Namespace) -> int:
-    check_suffix(arguments.out, "a picture is a .png", ".png")
     check_writable(arguments.out)
     env = make_environment(arguments.scenario)
     driver, _ = load_driver(arguments.policy, env, arguments.public_key)

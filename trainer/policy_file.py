@@ -26,7 +26,7 @@ from edge_runtime.util import UserError
 from trainer.drivers import load_actor
 from trainer.environments import entries_of, make_environment, task_of
 from trainer.learner.networks import Actor
-from trainer.options import existing_directory, read_json
+from trainer.options import read_json
 from trainer.training.config import CONFIG_FILE
 
 EXAMPLE = examples(
@@ -47,8 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, check, sign; returns the exit status."""
-    run_dir = existing_directory(arguments.run_dir, "run directory")
-    made = export(run_dir, arguments.out, key=arguments.key, envelope=arguments.envelope)
+    made = export(arguments.run_dir, arguments.out, key=arguments.key, envelope=arguments.envelope)
     signed = "signed" if arguments.key else "not signed"
     size = f"{len(made.model) / 1e6:.1f} MB"
     print(f"{arguments.out}: {size}, {signed}, policy_id {made.policy_id}")

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -271,7 +272,7 @@ class Shown:
         self.steps = self.human_steps = self.episodes = 0
         self.without_road = 0
         """Episodes whose scenario drives differently today: their road is not shown."""
-        self._envs: dict[str, Any] = {}
+        self._environment = cache(make_environment)
 
     def entries(self, paths: Iterable[Path]) -> Iterator[Entry]:
         """Everything in these recordings, end to end; each episode ends with its own entry."""
@@ -309,7 +310,7 @@ class Shown:
         first, scenes = episode[0], []
         if first.step != 0:
             return []  # Its beginning was in another file, which is gone.
-        env = self._envs.setdefault(first.scenario, make_environment(first.scenario))
+        env = self._environment(first.scenario)
         observation, _ = env.reset(seed=first.seed)
         for step in episode:
             if not np.array_equal(observation, step.observation):

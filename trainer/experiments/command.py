@@ -97,8 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
     work, quick, place = plan.PLAN, plan.QUICK, "paper"
     if names == [GUIDANCE]:
         work, quick, place = plan.GUIDANCE_PLAN, plan.QUICK_GUIDANCE, GUIDANCE
-    results, runs = Path(arguments.results or f"results/{place}"), arguments.runs or f"runs/{place}"
-    runs, humans = Path(runs), Path(arguments.humans)
+    results = Path(arguments.results or f"results/{place}")
+    runs, humans = Path(arguments.runs or f"runs/{place}"), Path(arguments.humans)
     store = Store(work, results, runs, humans)
     if arguments.quick:
         store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         ends = run_units(left, arguments.jobs or cores())
     said = "".join(f", {count} {end}" for end, count in ends.items())
-    print(f"{len(done)} of {len(wanted)} units were done{said}")
+    print(f"{len(done)} of {len(wanted)} units were there already{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
     if names == [GUIDANCE] and store.results.exists():

@@ -76,7 +76,7 @@ SETTINGS: Mapping[str, Setting] = {
         "one third of the human's actions replaced by one wrong action, always the same",
         run={"poor_guidance_share": POOR_SHARE, "poor_guidance": BIASED_GUIDANCE},
     ),
-    PRINTED: Setting("every number and equation as the paper prints it", preset="printed"),
+    PRINTED: Setting("numbers and equations as the paper prints them", preset="printed"),
 }
 
 LABELS = {

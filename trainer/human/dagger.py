@@ -69,16 +69,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
     end_s = options.deadline_s(arguments.max_minutes)
-    about: dict[str, Any] = {"scenario": arguments.scenario, "seed": arguments.seed}
+    env = make_environment(arguments.scenario)
+    about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
     if arguments.recordings is None:
-        training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
+        training = HumanTraining(env, config, arguments.seed)
         model, episodes = training.model, training.episodes()
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
-        env = make_environment(arguments.scenario)
         size, space = env.action_space.shape[0], env.observation_space
         model = HumanModel(config, arguments.seed, size, space)
-        taken_over = demonstrate(model, recordings, arguments.scenario)
+        taken_over = demonstrate(model, recordings, env.scenario)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert: in place of an episode, those that follow one.
         episodes = (

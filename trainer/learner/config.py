@@ -226,7 +226,8 @@ class LearnerConfig:
     """What an intervention's penalty is charged to: ``overruled``, the policy's action that made
     the human take over, whose value it becomes; a return of several steps ends there, too. Or
     ``human``, the reward of the human's own first action, as printed, which teaches the critic that
-    rescuing is as bad as crashing."""
+    rescuing is as bad as crashing. The overruled action's error, where it is the larger one, also
+    stands for |delta| in the transition's priority (eq. 21)."""
     action_bound: float = 0.25
     """Bound of the initial weights with which the action joins the picture in the critics' first
     connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
@@ -263,12 +264,13 @@ WORDS = {
 }
 """What each word may be."""
 RANGES = {
-    FROM_ONE: ("batch_size", "return_steps", "policy_delay", "warmup_steps"),
+    FROM_ONE: ("return_steps", "policy_delay", "warmup_steps"),
     SHARE: ("learning_rate_decay", "learning_rate_final", "gamma", "tau",
             "exploration_correlation", "alpha", "beta"),
     ABOVE_ZERO: ("exploration_share", "priority_offset"),
     ANY: ("intervention_penalty",),
     (1, 2): ("frames",),
+    (1, 10**6): ("batch_size",),
     (1, 10**9): ("replay_capacity",),
     (0, 20): ("picture_shift",),
 }  # fmt: skip

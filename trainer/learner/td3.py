@@ -78,12 +78,12 @@ class TD3Learner:
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
-    def act(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
-        """pi(s) for one observation, or the target actor's: float32 [action size]."""
-        return self.act_together(frames[None], averaged)[0]
+    def act(self, frames: NDArray[Any]) -> NDArray[np.float32]:
+        """pi(s) for one observation: float32 [action size]."""
+        return self.actor.act(frames[None])[0]
 
     def act_together(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
-        """The same for observations [n, ...]: float32 [n, action size]."""
+        """The same for observations [n, ...], or the target actor's: float32 [n, action size]."""
         return (self.target_actor if averaged else self.actor).act(frames)
 
     @torch.no_grad()

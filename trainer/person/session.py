@@ -21,7 +21,7 @@ from msgspec import structs
 
 from bridge.fork import ForkedEnvironment, add_place, find_fork
 from bridge.report import failed
-from edge_runtime.cli import add_public_key, examples, positive
+from edge_runtime.cli import add_public_key, examples, positive, quit_on_signals
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
 from trainer.environments import Adapted, layout_of, make_environment, scenario_of
@@ -33,7 +33,7 @@ from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, o
 from trainer.person.recording import DISCARDED, RESTARTED, STOPPED, Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
-from trainer.util import Purpose, episode_seed, quit_on_signals
+from trainer.util import Purpose, episode_seed
 
 EXAMPLE = examples(
     "python -m trainer drive --human keyboard --out runs/drives",
@@ -70,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits; returns the exit status."""
     set_threads(arguments.threads)
     env, seed_of = _environment(arguments)
+    arguments.scenario = env.scenario  # By it the devices know their keys.
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)

@@ -118,7 +118,7 @@ def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
 def spawn_traffic(
     road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[TrafficVehicle]:
-    """Surround the ego car: cars ahead of it, beside it, and in the variant behind it."""
+    """Surround the ego car: cars ahead of it, beside it and behind it."""
     jam_mps = float(random.uniform(*config.jam_speed_mps))
     cars: list[TrafficVehicle] = []
     for lane in range(LANES):
@@ -206,11 +206,6 @@ class CongestionEnv(DrivingEnv):
     def brake_action(self) -> Action:
         """What a simulator applies when commands stop: the last steering. ``press_brake``, too."""
         return np.array([self._steering], dtype=np.float32)
-
-    @property
-    def view_corner_m(self) -> tuple[float, float]:
-        """As ``DrivingEnv.view_corner_m``, for a picture that moves with the ego car."""
-        return float(self.ego.position[0]) + self.rasteriser.left_m, self.rasteriser.top_m
 
     def press_brake(self, pressed: bool) -> None:
         """Full brake instead of the IDM, until released or reset: the simulator's safe stop."""

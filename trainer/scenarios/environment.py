@@ -44,7 +44,7 @@ class ScenarioConfig:
 
 
 class EgoVehicle(Vehicle):
-    """The controlled car. It stands outside ``road.vehicles``, so that traffic never yields.
+    """The controlled car. Traffic never looks for it, and so never yields.
 
     It moves by ``highway_env.vehicle.kinematics.Vehicle.step``; what is added is a speed that
     stays within ``[0, max_speed_mps]`` and the accelerations of the last step.
@@ -140,11 +140,6 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> NDArray[np.uint8]:
         """The scene from above for a person, uint8 [height, width, 3]."""
         return draw_scene(self.scene(), self.frames, self._caption())
-
-    @property
-    def view_corner_m(self) -> tuple[float, float]:
-        """Where on the ground the upper left corner of the policy's picture is, metres."""
-        return self.rasteriser.left_m, self.rasteriser.top_m
 
     @property
     def car(self) -> dict[str, float]:

@@ -14,7 +14,6 @@ from highway_env.road.road import LaneIndex, Road
 from highway_env.utils import not_zero
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from numpy.typing import NDArray
 
 from trainer.scenarios.picture import Rectangle
 
@@ -111,9 +110,6 @@ class TrafficVehicle(IDMVehicle):
     step, out of the loop. All lanes with traffic lead along x, so that a place is one number.
     """
 
-    DISTANCE_WANTED = 7.0  # Desired distance to the leader at rest, centre to centre, m
-    TIME_WANTED = 0.8  # Desired time gap, s
-
     def __init__(
         self,
         road: Road,
@@ -135,7 +131,6 @@ class TrafficVehicle(IDMVehicle):
             enable_lane_change=False,
         )
         self.road, self.lane, self.lane_index = road, lane, lane_index
-        self._direction = super().direction
         self._start_m = float(lane.start[0])
         self.leader = leader
 
@@ -166,14 +161,6 @@ class TrafficVehicle(IDMVehicle):
         self.position[0] += self.speed * dt
         self.speed += acceleration * dt
 
-    def on_state_update(self) -> None:
-        """Keep the lane: nothing to look up."""
-
-    @property
-    def direction(self) -> NDArray[np.float64]:
-        """Where the car points, a unit vector [2]: always the same, as it never steers."""
-        return self._direction
-
     @property
     def footprint(self) -> Rectangle:
         """The car's rectangle on the ground."""
@@ -186,11 +173,10 @@ def queue(
 ) -> list[TrafficVehicle]:
     """Cars in one lane at falling distances along it; each follows the one before it.
 
-    Speeds are the initial and the desired ones. The cars are added to ``road.vehicles``.
+    Speeds are the initial and the desired ones.
     """
     cars: list[TrafficVehicle] = []
     for position_m, speed_mps in zip(positions_m, speeds_mps, strict=True):
         leader = cars[-1] if cars else None
         cars.append(TrafficVehicle(road, lane_index, position_m, speed_mps, leader))
-    road.vehicles.extend(cars)
     return cars

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
+from edge_runtime.util import UserError
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes
 from trainer.tests.test_evaluate import brightness
@@ -211,6 +212,11 @@ def test_a_command_waits_until_all_are_as_old(spec):
     assert late >= ticks_late(today, driven.env.control_period_s)
     on_time = [np.isclose(done, n / 100) for n, done in enumerate(driven.carried[late:])]
     assert np.mean(on_time) > 0.9  # Two deviations of the jitter are waited for.
+
+
+def test_a_network_without_a_tick_of_delay_is_refused():
+    with pytest.raises(UserError, match="behind delay=5ms no command is a tick late"):
+        DelayAware(make_environment("left_turn"), parse_spec("5ms"))
 
 
 def test_it_sees_the_entries_of_any_environment():

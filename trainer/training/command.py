@@ -24,7 +24,7 @@ import torch
 from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
-from edge_runtime.cli import INTERRUPTED, examples
+from edge_runtime.cli import INTERRUPTED, examples, quit_on_signals
 from edge_runtime.util import UserError, counted, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
@@ -35,7 +35,7 @@ from trainer.pictures import write_learning_curve
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import claimed, quit_on_signals
+from trainer.util import claimed
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
@@ -179,7 +179,8 @@ def train(
         raise UserError("no CUDA device is available; use --device cpu")
     if not is_expert(human) and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
-        raise UserError(f"--human {human} is none of {known}, nor a human model's directory")
+        words = f"none of {known}, no module:Class and no human model's directory"
+        raise UserError(f"--human {human} is {words}")
     if preset not in PRESETS:
         raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
     start = PRESETS[preset]

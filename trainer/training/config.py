@@ -53,7 +53,7 @@ class RunConfig:
     late_to_s: float = 0.0
     """Longest such time."""
     missed_share: float = 0.0
-    """Share of the reasons to take over that the human overlooks, for 1.5 s each."""
+    """Share of the reasons to take over that the human overlooks, for 15 control periods each."""
     human_shift: float = 0.0
     """What is added to each of the human's actions: a human who drives in another way than the
     reward asks for, slower or more to one side."""
@@ -116,12 +116,9 @@ class RunConfig:
     def as_toml(self) -> str:
         """The same as a file for ``--config``."""
         values = self.as_dict()
-        learner = values.pop("learner")
-        lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
-        lines += ["", "[learner]"]
-        return (
-            "\n".join(lines + [f"{name} = {json.dumps(v)}" for name, v in learner.items()]) + "\n"
-        )
+        parts = values, values.pop("learner")
+        own, learner = ([f"{n} = {json.dumps(v)}" for n, v in part.items()] for part in parts)
+        return "\n".join([*own, "", "[learner]", *learner, ""])
 
     @property
     def kept_actor(self) -> str:
@@ -141,6 +138,7 @@ class RunConfig:
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
-"""What the paper prints, to the letter, and its least where it leaves a thing open."""
+"""As the paper prints it, and its least where it leaves a thing open; but a human who frees a
+stuck car is no penalty (eq. 17), and eq. 21b's exponent has a bound."""
 PRESETS = {"ours": RunConfig(), "printed": PRINTED}
 """Where the settings of a training start from, by the word behind ``--preset``."""

@@ -23,6 +23,7 @@ from gymnasium.spaces import Box, Dict
 
 from bridge.network import LatencySpec, Link
 from bridge.virtual_link import COMMAND_WINDOW, ROUNDING_S, VirtualLink
+from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, Command
 from trainer.environments import layout_of
 from trainer.human.guide import Action, Observation
@@ -39,10 +40,13 @@ class DelayAware:
     With a constant delay and these actions the decision process is Markov again (Katsikopoulos and
     Engelbrecht, 2003; rtgym's action buffer). So a command that comes early waits (the conservative
     agent). ``spec`` decides d; ``space`` and ``layout`` are of the larger observation.
+    Raises UserError where d is 0.
     """
 
     def __init__(self, env: Any, spec: LatencySpec) -> None:
         self.ticks = ticks_late(spec, env.control_period_s, JITTER_WAITED_FOR)
+        if not self.ticks:
+            raise UserError(f"behind {spec} no command is a tick late: delay_known adds nothing")
         own, layout = env.observation_space, layout_of(env)
         numbers = Box(-1.0, 1.0, (self.ticks * env.action_space.shape[0],), np.float32)
         entries = own.spaces if isinstance(own, Dict) else {PLAIN: own}

@@ -127,8 +127,7 @@ class TrainingRun:
         about = {**self.config.as_dict(), "source_revision": util.source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
         write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
-        period_s = self.env.control_period_s
-        metrics_writer = MetricsWriter(self.run_dir, self.episode, period_s)
+        metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
                 metrics = self.advance()
@@ -146,7 +145,8 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-        write_json(self.run_dir / REPORT_FILE, totals(read_metrics(self.run_dir), period_s))
+            so_far = totals(read_metrics(self.run_dir), self.env.control_period_s)
+            write_json(self.run_dir / REPORT_FILE, so_far)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
