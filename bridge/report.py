@@ -24,11 +24,14 @@ UNKNOWN = "ended"
 """An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
 COLLISION = "collision"
 OUTCOMES = (GOAL, COLLISION, "timeout", "off_road")
+STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
+DISCARDED = "discarded"
+"""The person threw it away: it is shown, and nothing learns from it."""
 
 
 def failed(outcome: str) -> bool:
-    """Whether an episode missed its goal; where no goal is known none is missed."""
-    return outcome not in (GOAL, UNKNOWN)
+    """Whether an episode missed its goal; not where none is known, or where a person ended it."""
+    return outcome not in (GOAL, UNKNOWN, STOPPED, RESTARTED, DISCARDED)
 
 
 @dataclass

@@ -285,7 +285,12 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     """Not even while the writer is in the middle of one."""
     listener, ended, path = WireListener(), Event(), tmp_path / "a.mcap"
     monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
-    with writing(path) as writer, quit_on_signals(lambda: not ended.set()):
+
+    def end() -> bool:
+        ended.set()
+        return True
+
+    with writing(path) as writer, quit_on_signals(end):
         copy = writer._copies.write
 
         def signalled(one):

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from bridge.report import failed
 from edge_runtime.util import counted
-from trainer.person.recording import DISCARDED, RESTARTED, STOPPED
 from trainer.training.metrics import LEARNED as LEVELS
 
 LEARNED, WELL = LEVELS
@@ -45,9 +44,8 @@ class Episode:
     @property
     def unattended(self) -> bool:
         """Whether it failed without the person, or too soon after a take-over."""
-        if not failed(self.outcome) or self.outcome in (STOPPED, RESTARTED, DISCARDED):
-            return False
-        return not self.takeovers or self.since_takeover_s <= TOO_LATE_S
+        late = not self.takeovers or self.since_takeover_s <= TOO_LATE_S
+        return failed(self.outcome) and late
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from bridge.record import FlushedFile, start_mcap
 from bridge.recording import Records
+from bridge.report import DISCARDED
 from edge_runtime.util import UserError, open_regular
 from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
@@ -35,9 +36,6 @@ TOPIC = "person/step"
 WIRE = ("phil/", "view/")
 """Begin the topics of a recording of the wire, and their copies for viewers."""
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
-STOPPED, RESTARTED = "stopped", "restarted"  # Outcomes of an episode that the person ended
-DISCARDED = "discarded"
-"""Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME, FRAMES = "('|u1', (45, 80))", "('|u1', (2, 45, 80))"  # Layouts, as in ``Step.layout``
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 

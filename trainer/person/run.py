@@ -20,7 +20,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from bridge.report import GOAL
+from bridge.report import DISCARDED, GOAL
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
 from trainer.human.guide import Guide, Intervention
@@ -29,7 +29,7 @@ from trainer.person.alone import BehindTheScenes, Check
 from trainer.person.coach import Coach, typical_curve
 from trainer.person.controls import amount, vector
 from trainer.person.interface import Person, open_person
-from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
+from trainer.person.recording import DIRECTORY, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
 from trainer.training.delayed import DelayedPolicy, Store, ticks_late

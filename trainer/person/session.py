@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import structs
 
 from bridge.fork import ForkedEnvironment, add_place, find_fork
-from bridge.report import failed
+from bridge.report import DISCARDED, RESTARTED, STOPPED, failed
 from edge_runtime.cli import add_public_key, examples, positive, quit_on_signals
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
@@ -30,7 +30,7 @@ from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
 from trainer.person.controls import Amount, amount, vector
 from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
-from trainer.person.recording import DISCARDED, RESTARTED, STOPPED, Recorder, Step, layout_text
+from trainer.person.recording import Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed
@@ -270,8 +270,9 @@ class Sitting:
             if self._discard:
                 self._write_last_step()  # At once: no kill shall take that back.
         self._write_last_step()
-        self.cost["failures"] += failed(outcome)
-        self._tell_coach(DISCARDED if self._discard else outcome)
+        told = DISCARDED if self._discard else outcome
+        self.cost["failures"] += failed(told)
+        self._tell_coach(told)
         if self._discard:
             self.discarded += 1
             return DISCARDED

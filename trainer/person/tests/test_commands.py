@@ -7,12 +7,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from bridge.report import STOPPED
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
 from trainer.environments import make_environment
 from trainer.person import devices
 from trainer.person.interface import LET_GO, Reading
 from trainer.person.recording import find_recordings, read_steps
-from trainer.person.session import STOPPED
 from trainer.person.tests.people import (
     QUIT,
     Discarding,

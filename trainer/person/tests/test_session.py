@@ -4,10 +4,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bridge.report import DISCARDED, RESTARTED, STOPPED
 from trainer.drivers import constant_driver
 from trainer.person.interface import LET_GO
-from trainer.person.recording import DISCARDED, read_episodes, read_steps
-from trainer.person.session import RESTARTED, STOPPED, Pacer, drive
+from trainer.person.recording import read_episodes, read_steps
+from trainer.person.session import Pacer, drive
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.people import QUIT, Discarding, Puppet, hold, make_sitting, wish
 
@@ -79,6 +80,7 @@ def test_an_episode_begun_anew_or_thrown_away_ends_and_is_marked(tmp_path, wishe
     counted = kept, sitting.discarded, sitting.episodes, sitting.human_steps > 0
     discarded = wished == "discard"
     assert counted == ([1] if discarded else [0, 1], discarded, 2 - discarded, not discarded)
+    assert sitting.cost["failures"] == 0  # What the person has ended failed nothing.
 
 
 def test_what_has_just_ended_can_still_be_thrown_away(tmp_path):
