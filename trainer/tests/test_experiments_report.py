@@ -256,7 +256,7 @@ def test_without_its_human_a_unit_is_left_out(capsys, tmp_path):
     status, out, err = said(capsys, "table1", *places)
     assert status == 0
     assert "no human model" in err
-    assert "0 of 16 units were done" in out
+    assert "0 of 16 units were there already" in out
 
 
 def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):

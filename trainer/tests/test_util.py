@@ -71,7 +71,8 @@ def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
             for offset in (0.0, -1e-3, 1e-45, float("inf"), float("nan"))
         ),
         ("gamma", 1.5, "0 to 1"),
-        ("batch_size", 0, "at least 1"),
+        ("batch_size", 0, "1 to 1000000"),
+        ("return_steps", 0, "at least 1"),
         ("intervention_penalty", float("nan"), "it must be a finite number"),
     ],
 )
