@@ -41,13 +41,13 @@ from bridge.policy_file import network_of_file
 from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError, read_json
+from edge_runtime.util import UserError
 from hil_tests.trace import failing_drive, shrunk
 from trainer.drivers import load_driver
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.experiments.data import success_estimate
-from trainer.options import set_threads
+from trainer.options import read_json, set_threads
 from trainer.util import cores, die_with_parent
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
@@ -343,8 +343,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _known(path: str) -> Mapping[str, Any]:
     known = read_json(path, "envelope")
-    needed = {"policy_id", "promised_success", "edges"}
-    if not (isinstance(known, dict) and needed <= known.keys() and known["edges"]):
+    if not ({"policy_id", "promised_success", "edges"} <= known.keys() and known["edges"]):
         raise UserError(f"{path} is no envelope of hil_tests envelope, with edges to confirm")
     return known
 
