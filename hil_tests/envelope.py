@@ -34,6 +34,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
@@ -342,7 +343,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _known(path: str) -> Mapping[str, Any]:
-    known = read_json(path, "envelope")
+    known = read_json(Path(path), "envelope")
     if not ({"policy_id", "promised_success", "edges"} <= known.keys() and known["edges"]):
         raise UserError(f"{path} is no envelope of hil_tests envelope, with edges to confirm")
     return known
