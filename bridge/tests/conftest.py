@@ -1,4 +1,4 @@
-"""How a refusal looks, and what a repair says."""
+"""How a refusal looks."""
 
 import pytest
 
@@ -15,15 +15,3 @@ def refusal(capsys):
         return line
 
     return refused
-
-
-@pytest.fixture
-def repair(capsys):
-    """Run ``python -m bridge repair``; return what it says."""
-
-    def repaired(*arguments):
-        capsys.readouterr()
-        assert bridge_status(["repair", *map(str, arguments)]) == 0
-        return capsys.readouterr().out
-
-    return repaired

@@ -16,7 +16,7 @@ from bridge.messages import Scene, encode_scene
 from bridge.record import RawImage, describe
 from bridge.rerun import free_port
 from bridge.tests import harness
-from bridge.tests.test_record import heard, writing
+from bridge.tests.test_recording import heard, writing
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import make_state
