@@ -171,6 +171,7 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     return draw.full_blueprint(left, right, [3, 2], "sim_time")
 
 
+Place = tuple[str, int, int]  # Session, episode and step of a state
 SILENT = "no command"
 NOTHING_WRONG = "-"
 MOST_LINES = 16  # Numbers of an observation that a plot can show
@@ -193,17 +194,18 @@ class WireLog:
         self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
         self._timeline = Timeline()
         self._layout: Layout | None = None
+        self._session = ""  # Of the newest state
         self._told, self._reason = "", ""
         self._heard_command_ns: int | None = None
         self._plan_periods = 0
-        self._sent_ns: dict[tuple[int, int], int] = {}
-        self._answered_ns: dict[tuple[int, int], int] = {}
+        self._sent_ns: dict[Place, int] = {}
+        self._answered_ns: dict[Place, int] = {}
         """From the sending of a state to that of its command, by the stamps of both."""
-        self._split: tuple[int, int] | None = None
+        self._split: Place | None = None
         """The state whose round trip was drawn in its parts last."""
         self._edge_counts: dict[str, int] = {}
         self._reasons: set[tuple[str, str]] = set()
-        self._drawn_episode = -1
+        self._drawn_episode: tuple[str, int] | None = None
         self._health: Health | None = None
         draw.style_lines(recording, SERIES)
         for side, colour in SIDES.items():
@@ -227,8 +229,9 @@ class WireLog:
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
         self._timeline.period_s = period_of(state) or self._timeline.period_s
-        self._stand_at(state.episode, state.step)
-        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
+        self._session = state.session
+        self._stand_at(place := (state.session, state.episode, state.step))
+        _keep(self._sent_ns, place, state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
             self._draw_observation(state)
         if state.speed_mps is not None:
@@ -249,10 +252,9 @@ class WireLog:
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
         """Draw what is asked, the mode, and where the time went."""
-        self._stand_at(command.episode, command.step)
+        self._stand_at(state := (command.session, command.episode, command.step))
         self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
         self._recording.log("action/asked", rr.Scalars(list(command.action)))
-        state = (command.episode, command.step)
         if (sent_ns := self._sent_ns.get(state)) is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
             # A safe stop is repeated for as long as it lasts: only the first is the answer.
@@ -292,13 +294,14 @@ class WireLog:
         """
         if scene.task is not None:
             self._layout, self._timeline.period_s = Layout(scene.task), scene.task.control_period_s
-        self._stand_at(scene.episode, scene.step)
-        if self._drawn_episode < 0:
+        session = scene.origin.session if scene.origin else self._session
+        self._stand_at((session, scene.episode, scene.step))
+        if self._drawn_episode is None:
             self._recording.send_blueprint(make_blueprint(scene))
-        if self._drawn_episode != scene.episode:
-            self._drawn_episode = scene.episode
+        if self._drawn_episode != (session, scene.episode):
+            self._drawn_episode = session, scene.episode
             draw.draw_ground(self._recording, scene)
-        self._round_trip(scene)
+        self._round_trip(session, scene)
         self._rejections("simulator", scene.rejected)
         if scene.ridden and self._told == DRIVE:
             self._tell(DRIVE, "rides on the plan", rr.TextLogLevel.WARN)
@@ -326,19 +329,19 @@ class WireLog:
                 numbers = rr.Scalars(array.ravel()) if few else rr.Tensor(array)
                 self._recording.log(f"observation/{name}", numbers)
 
-    def _stand_at(self, episode: int, step: int) -> None:
-        recording, moment = self._recording, self._timeline.place(episode, step)
+    def _stand_at(self, place: Place) -> None:
+        recording, moment = self._recording, self._timeline.place(*place)
         recording.reset_time()
         recording.set_time("sim_time", duration=moment.sim_time_s)
         recording.set_time("step", sequence=moment.total_step)
-        recording.set_time(f"episode_{moment.episode}", duration=moment.episode_time_s)
+        recording.set_time(moment.timeline, duration=moment.episode_time_s)
 
-    def _round_trip(self, scene: Scene) -> None:
+    def _round_trip(self, session: str, scene: Scene) -> None:
         """The newest round trip, and what is left of it for the way down."""
         if scene.round_trip_ms is None or scene.answered_step is None:
             return
         self._scalar("latency/round_trip", scene.round_trip_ms)
-        state = (scene.episode, scene.answered_step)
+        state = (session, scene.episode, scene.answered_step)
         # It is told with every scene until the next one is known.
         if state in self._answered_ns and state != self._split:
             self._split, answered_ms = state, self._answered_ns[state] * 1e-6
@@ -395,7 +398,7 @@ class WireLog:
         self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
 
-def _keep(table: dict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+def _keep(table: dict[Place, int], key: Place, value: int) -> None:
     """Remember a value, and forget the oldest where there are too many."""
     table[key] = value
     if len(table) > REMEMBERED_STATES:
@@ -405,7 +408,7 @@ def _keep(table: dict[tuple[int, int], int], key: tuple[int, int], value: int) -
 class Moment(NamedTuple):
     """One place on all timelines."""
 
-    episode: int
+    timeline: str  # The episode's own
     episode_time_s: float  # Simulated time within the episode
     total_step: int  # Episodes end to end, as ``sim_time_s``
     sim_time_s: float
@@ -416,18 +419,22 @@ class Timeline:
 
     Each episode's steps begin at 0; laid over one another they could not be told apart. So episodes
     are put end to end on the timelines ``sim_time`` and ``step``, and each has its own besides,
-    ``episode_0`` and so on, that begins at 0. Where each begins is learnt from what is seen, so
-    that a viewer may come late.
+    ``episode_0`` and so on, that begins at 0 (``episode_0_of_session_2`` where the simulator has
+    been started again). Where each begins is learnt from what is seen, so that a viewer may come
+    late.
     """
 
     def __init__(self) -> None:
-        self._starts: dict[int, int] = {}
+        self._starts: dict[tuple[str, int], int] = {}
+        self._sessions: dict[str, int] = {}  # In the order of their first messages, from 1
         self._end_step = 0
         self.period_s = 0.0  # The control period, as soon as a message tells it
 
-    def place(self, episode: int, step: int) -> Moment:
+    def place(self, session: str, episode: int, step: int) -> Moment:
         """Return the moment of a step."""
         # A viewer that comes late begins at zero as well: its first step is the first it saw.
-        total_step = self._starts.setdefault(episode, self._end_step) + step
+        total_step = self._starts.setdefault((session, episode), self._end_step) + step
         self._end_step = max(self._end_step, total_step + 1)
-        return Moment(episode, step * self.period_s, total_step, total_step * self.period_s)
+        nth = self._sessions.setdefault(session, len(self._sessions) + 1)
+        name = f"episode_{episode}" if nth == 1 else f"episode_{episode}_of_session_{nth}"
+        return Moment(name, step * self.period_s, total_step, total_step * self.period_s)

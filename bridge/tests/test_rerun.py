@@ -51,10 +51,18 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
 def test_episodes_stand_end_to_end():
     timeline = Timeline()
     timeline.period_s = 0.1
-    steps = [timeline.place(*place).total_step for place in ((0, 0), (0, 7), (1, 0), (0, 5))]
+    places = ((0, 0), (0, 7), (1, 0), (0, 5))
+    steps = [timeline.place("a", *place).total_step for place in places]
     assert steps == [0, 7, 8, 5]
-    late = timeline.place(1, 2)
-    assert (late.episode_time_s, late.sim_time_s) == (0.2, 1.0)
+    late = timeline.place("a", 1, 2)
+    assert (late.timeline, late.episode_time_s, late.sim_time_s) == ("episode_1", 0.2, 1.0)
+
+
+def test_a_second_session_is_not_drawn_over_the_first():
+    timeline = Timeline()
+    timeline.place("a", 0, 7)
+    moment = timeline.place("b", 0, 0)
+    assert (moment.timeline, moment.total_step) == ("episode_0_of_session_2", 8)
 
 
 def test_a_scene_is_read_without_what_is_not_drawn():
@@ -268,7 +276,7 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
     ms = 10**6
     for step in (3, 4):
         sent_ns = 10**18 + step * 100 * ms
-        log.write_state(make_state(step, sent_ns=sent_ns), sent_ns)
+        log.write_state(make_state(step, session="here", sent_ns=sent_ns), sent_ns)
         received_ns = sent_ns + (20 + step) * ms
         command = harness.make_command(
             step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
