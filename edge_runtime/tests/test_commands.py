@@ -279,7 +279,8 @@ def test_a_whole_number_is_taken_within_its_limits_only(value, least, width):
         (cli.positive_number, "1e-9", "0", "a finite number above 0"),
         (cli.positive_number, "1e-9", "inf", "a finite number above 0"),
         (cli.not_negative_number, "0", "nan", "a finite number, at least 0"),
-        (cli.seconds, "0.5", "-0.1", "a finite number of seconds, at least 0"),
+        (cli.seconds, "0.5", "-0.1", "a number of seconds from 0 to 1e9"),
+        (cli.seconds, "1e9", "1e10", "a number of seconds from 0 to 1e9"),  # no clock takes it
         (cli.share, "1", "1.01", "a share above 0 and at most 1"),
         (cli.share, "1", "half", "a share above 0 and at most 1"),
     ],

@@ -101,8 +101,9 @@ def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> P
     for name, value in (changes or {}).items():
         if name not in TUNABLE:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
-        if not (value > 0.0 or (name == "dead_time_s" and value == 0.0)) or value == float("inf"):
-            raise UserError(f"parameter {name} must be above 0, not {value}")
+        least = "at least" if name == "dead_time_s" else "above"
+        if not (0.0 < value < math.inf or (least == "at least" and value == 0.0)):
+            raise UserError(f"parameter {name} must be {least} 0 and finite, not {value}")
     return replace(MODELS[model], **(changes or {}))
 
 

@@ -246,7 +246,7 @@ MISTAKES = {
         "--bus udp_multicast:10.1.2.3": "is no IPv4 multicast group",
         "--bus virtual:here": "a virtual bus ends with its process",
         "--fault meteor": "no fault 'meteor'; choose from silent",
-        "--fault silent@-1": "not a finite number of seconds",
+        "--fault silent@-1": "not a number of seconds",
         "--set wings=2": "no parameter 'wings'",
         "--set track_m": "use NAME=VALUE",
         "--model hunter-3": "invalid choice",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.cli import positive_number, whole_number
+from edge_runtime.cli import number, whole_number
 from edge_runtime.util import UserError
 from trainer.person.controls import Amount
 
@@ -146,11 +146,12 @@ def add_person(parser: argparse.ArgumentParser) -> None:
     shipped = "what the axes and buttons of --human gamepad or wheel mean (default: as shipped)"
     here = "the address at which --human web listens; by default this machine's alone"
     port = "the port of --human web; 0: any that is free"
+    speed = number("a number from 0.01 to 100", lambda value: 0.01 <= value <= 100.0)
     slow = "simulated seconds in one of yours: 0.5 is slow motion"
     group.add_argument("--profile", metavar="F.toml", help=shipped)
     group.add_argument("--host", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)
-    group.add_argument("--speed", type=positive_number, metavar="X", help=slow)
+    group.add_argument("--speed", type=speed, metavar="X", help=slow)
     group.set_defaults(**{name: default for name, (default, _) in DEVICE_OPTIONS.items()})
 
 

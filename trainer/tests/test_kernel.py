@@ -144,7 +144,7 @@ def anew(tmp_path, monkeypatch):
     kernel.load.cache_clear()
 
 
-@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", None])
+@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", '"c++', None])
 def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, anew, compiler, caplog):
     if compiler is None:
         (tmp_path / "cache").write_text("in the way of a directory")

@@ -178,7 +178,7 @@ def test_the_drivers_own_table_agrees(model, name):
     [
         ({"wings": 1.0}, "no parameter 'wings'"),
         ({"track_m": 0.0}, "track_m must be above 0"),
-        ({"dead_time_s": -0.1}, "dead_time_s must be above 0"),
+        ({"dead_time_s": -0.1}, "dead_time_s must be at least 0"),
         ({"braking_mps2": math.nan}, "braking_mps2 must be above 0"),
         ({"braking_mps2": math.inf}, "braking_mps2 must be above 0"),
     ],

@@ -23,14 +23,13 @@ import torch.nn.functional as functional
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError
+
 _LOGGER = logging.getLogger(__name__)
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared")
 _OPENMP = "-fopenmp"
 _TIMEOUT_S = 120.0  # For a build; it takes a few
-
-
-class _BuildError(Exception):
-    """Why there is no kernel."""
 
 
 @functools.cache
@@ -44,8 +43,8 @@ def load() -> ctypes.CDLL | None:
         return None
     try:
         library = _built(Path(__file__).with_name("trunk.cpp"))
-    except (_BuildError, OSError, RuntimeError) as error:
-        # RuntimeError: there is no home directory, hence no cache.
+    except (UserError, OSError, RuntimeError, ValueError) as error:
+        # RuntimeError: no home directory, hence no cache. ValueError: quotes in $CXX left open.
         _LOGGER.warning(
             "no compiled trunk kernel (%s): torch does its work, several times slower",
             " ".join(str(error).split()),
@@ -71,7 +70,7 @@ def _built(source: Path) -> ctypes.CDLL:
 
 
 def _build(compiler: list[str], source: Path, library: Path) -> None:
-    """Compile under a name of its own, then rename: two processes may build at once."""
+    """Compile under a name of its own: two processes may build at once."""
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as directory:
         target = Path(directory) / library.name
@@ -84,12 +83,12 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
                     timeout=_TIMEOUT_S, check=False,
                 )  # fmt: skip
             except (OSError, subprocess.TimeoutExpired) as error:
-                raise _BuildError(f"{command[0]} cannot be run: {error}") from error
+                raise UserError(f"{command[0]} cannot be run: {error}") from error
             if done.returncode == 0:
-                os.replace(target, library)
+                write_atomic(library, target.read_bytes())
                 return
     errors = (line for line in done.stderr.splitlines() if "error" in line)
-    raise _BuildError(f"{command[0]} failed: {next(errors, f'status {done.returncode}')}")
+    raise UserError(f"{command[0]} failed: {next(errors, f'status {done.returncode}')}")
 
 
 def _compiler() -> list[str]:
@@ -100,7 +99,7 @@ def _compiler() -> list[str]:
     for candidate in ("c++", "g++", "clang++"):
         if shutil.which(candidate):
             return [candidate]
-    raise _BuildError("there is no C++ compiler; a package such as g++ or clang brings one")
+    raise UserError("there is no C++ compiler; a package such as g++ or clang brings one")
 
 
 def _processor() -> str:
