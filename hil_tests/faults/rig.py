@@ -95,36 +95,36 @@ class Rig:
             (directory / "edge.toml").write_text(f"[ride_through]\nmax_s = {ride_s}\n")
             self._policy = (*policy, "--config", str(directory / "edge.toml"))
         self._processes: list[tuple[str, Process]] = []
-        self._closing = contextlib.ExitStack()
         self.task = task
         self.period_s = task.control_period_s
         (directory / BRAKES).touch()
         (directory / inside.TASK).write_bytes(msgspec.json.encode(task))
         self._simulator_endpoint, self._hub = free_endpoint(), free_endpoint()
-        if not sender:
-            self.simulator = self.start_simulator()
-        connect = None if sender else self._simulator_endpoint
-        self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
-        self._closing.callback(self.probe.close)
-        self.edge_endpoint = self._hub  # Where the edge runtime connects
-        if between == "link":
-            self.link = Link(self._hub)
-            self._closing.callback(self.link.close)
-            self.edge_endpoint = self.link.endpoint
-        if between == "router":
-            self.edge_endpoint = free_endpoint()
-            self.router = self.start_router()
-        self._bus = free_bus() if vehicle == "hunter" else ""
-        if self._bus:
-            self.chassis = ChassisProcess(self._bus)
-            self._processes.append(("chassis", self.chassis.process))
-            self.monitor = CanMonitor(self._bus, HEARD)
-            self._closing.callback(self.monitor.close)
-        self.edge = self.start_edge()
-        self._closing.callback(self._end_processes)
-        if sender:
-            self.sender = Sender(self.probe, task)
-            self._closing.callback(self.sender.stop)
+        with contextlib.ExitStack() as self._closing:  # a rig that cannot start leaves nothing
+            if not sender:
+                self.simulator = self.start_simulator()
+            connect = None if sender else self._simulator_endpoint
+            self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
+            self._closing.callback(self.probe.close)
+            self.edge_endpoint = self._hub  # Where the edge runtime connects
+            if between == "link":
+                self.link = Link(self._hub)
+                self._closing.callback(self.link.close)
+                self.edge_endpoint = self.link.endpoint
+            if between == "router":
+                self.edge_endpoint = free_endpoint()
+                self.router = self.start_router()
+            self._bus = free_bus() if vehicle == "hunter" else ""
+            if self._bus:
+                self.chassis = ChassisProcess(self._bus)
+                self._keep("chassis", self.chassis.process)
+                self.monitor = CanMonitor(self._bus, HEARD)
+                self._closing.callback(self.monitor.close)
+            self.edge = self.start_edge()
+            if sender:
+                self.sender = Sender(self.probe, task)
+                self._closing.callback(self.sender.stop)
+            self._closing = self._closing.pop_all()
 
     def start_edge(self) -> Process:
         """The edge runtime, not waited for."""
@@ -272,14 +272,14 @@ class Rig:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._closing.close()
-
-    def _end_processes(self) -> None:
-        for name, process in self._processes:  # crashes are noted first
+        for name, process in self._processes:
             if process.crashed():
                 self.crashes.append(f"{name}: {process.lines[-1:]}")
-        for _, process in reversed(self._processes):
-            process.end()
+        self._closing.close()
+
+    def _keep(self, name: str, process: Process) -> None:
+        self._processes.append((name, process))
+        self._closing.callback(process.end)
 
     def _is_driving(self) -> bool:
         now_s = time.monotonic()
@@ -295,7 +295,7 @@ class Rig:
                 self.timeline.modes.append(ModeSeen(seen_s, found[1], found[2] or ""))
 
         process = Process(*arguments, environment={DIRECTORY: str(self.directory)}, on_line=on_line)
-        self._processes.append((name, process))
+        self._keep(name, process)
         return process
 
 

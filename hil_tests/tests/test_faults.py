@@ -12,7 +12,7 @@ from edge_runtime.util import UserError
 from hil_tests.campaign import render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
-from hil_tests.faults.rig import ChassisProcess, Truth, make_state
+from hil_tests.faults.rig import ChassisProcess, Rig, Truth, make_state
 from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, choose_rows, report_row, run_faults
 from hil_tests.mock_hunter.chassis import FAULTS
@@ -71,6 +71,19 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
     # The sender's pictures never trip a faulty policy.
     assert np.frombuffer(make_state(1).observation["frames"], np.uint8).max() < 200
+
+
+def test_a_rig_that_cannot_start_leaves_no_process(tmp_path, monkeypatch):
+    started = []
+
+    def no_edge(rig):
+        started.append(rig.simulator)
+        raise UserError("no edge runtime today")
+
+    monkeypatch.setattr(Rig, "start_edge", no_edge)
+    with pytest.raises(UserError, match="today"):
+        Rig((), tmp_path)
+    assert [process.has_ended for process in started] == [True]
 
 
 def judged(*tries, **outcome):
