@@ -23,7 +23,7 @@ from typing import Any
 
 import msgspec
 
-from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold
+from bridge.inbound import CommandCheck, FeedbackCheck
 from bridge.network import Direction, EventHeap, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
@@ -67,6 +67,7 @@ class _Clock:
         self._check = check
         self._spec = spec
         self._hold = CommandHold(0.0, self._period_s)
+        self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()  # Lock-step's
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
@@ -97,13 +98,6 @@ class _Clock:
 
 class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
-
-    def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
-    ) -> None:
-        self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
-        super().__init__(publish, check, spec, task)
-        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode at virtual time 0; ``seed`` decides the link's delays and losses."""
@@ -181,26 +175,6 @@ class LockStepClock(_Clock):
         if self._edge_silent and self._answered_at_s is not None:
             return time.monotonic() - self._answered_at_s
         return self._silence_s if self._edge_silent else None
-
-
-class InProcessClock(LockStepClock):
-    """Lock-step within one process: a function answers the states, and no wall time is in it.
-
-    Args:
-        answer: given a state's arrival at the edge runtime, its command; None: no answer.
-        spec: the network.
-        task: of the environment.
-    """
-
-    def __init__(
-        self, answer: Callable[[Arrival[State]], Command | None], spec: LatencySpec, task: Task
-    ) -> None:
-        self._answer = answer
-        super().__init__(lambda payload: None, CommandCheck("", task), spec, task)
-
-    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
-        if not arrival.overtaken and (command := self._answer(arrival)) is not None:
-            self._link.answer(arrival, command)
 
 
 class RealTimeClock(_Clock):
@@ -320,7 +294,6 @@ class VehicleClock(RealTimeClock):
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
         self.feedback_check = feedback
-        self._feedback = FeedbackHold(time.monotonic(), task.control_period_s)
         super().__init__(publish, check, spec, task)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -370,7 +343,8 @@ class VehicleClock(RealTimeClock):
         time.sleep(max(0.0, end_s - time.monotonic()))
         with self._arrived:
             now_s = time.monotonic()
-            decision = self._feedback.decide(self._hold.decide(now_s), state.episode, now_s)
+            heard = self._hold.decide(now_s)
+            decision = self.feedback_check.decide(heard, state.episode, now_s)
         if decision.feedback_age_s is not None:
             self.feedback_ages_ms.append(decision.feedback_age_s * 1e3)
         return decision
@@ -393,8 +367,8 @@ class VehicleClock(RealTimeClock):
     def _feedback_arrives(self, payload: bytes, received_s: float) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            if (feedback := self.feedback_check.read(payload, now_s)) is not None:
-                self._feedback.admit(feedback, received_s, now_s)
+            feedback = self.feedback_check.read(payload, now_s, received_s)
+            if feedback is not None:
                 self.tracking.feedback(feedback)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:

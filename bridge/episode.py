@@ -161,6 +161,7 @@ class EpisodeRunner:
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
         observation, info = self.environment.reset(seed=seed, options=self._options)
         self.clock.begin(episode, seed)
+        self._actuators.last = self._actuators.hands_off
         self._ridden = 0
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         self._applied = (None, False)

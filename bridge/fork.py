@@ -27,9 +27,10 @@ import gymnasium
 import msgspec
 import numpy as np
 
-from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, InProcessClock
+from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
+from bridge.inbound import CommandCheck
 from bridge.messages import DECODERS, STAMPS, Heard, Origin, Scene, encode_scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
@@ -239,8 +240,10 @@ class PolicyAnswers:
         )  # fmt: skip
 
 
-class ForkedDrive(InProcessClock):
+class ForkedDrive(LockStepClock):
     """A recorded drive once more: as it was until step ``fork``, and then on.
+
+    It publishes nothing, and no wall time is in it.
 
     Args:
         drive: what is recorded.
@@ -271,7 +274,8 @@ class ForkedDrive(InProcessClock):
                 raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {ours!r}")
             self._task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
             self._answers = PolicyAnswers(policy)
-        super().__init__(self._command, self._recorded, self._task)
+        check = CommandCheck("", self._task)
+        super().__init__(lambda payload: None, check, self._recorded, self._task)
 
     def run(self) -> EpisodeResult:
         """Drive it to its end. UserError where it cannot be rebuilt until the fork."""
@@ -317,8 +321,10 @@ class ForkedDrive(InProcessClock):
         self._note(self._drive.applied.get(self._step) == done)
         return action
 
-    def _command(self, arrival: Arrival[State]) -> Command | None:
-        """What the edge runtime says: before the fork what it said, then what the policy says."""
+    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
+        """Answer it: before the fork as the edge runtime did, then as the policy does."""
+        if arrival.overtaken:
+            return
         sent_ns = self._at_ns(arrival.arrived_s)
         state = msgspec.structs.replace(arrival.message, sent_ns=sent_ns)
         command, given = self._drive.commands.get(arrival.step), self._step < self._fork
@@ -334,7 +340,7 @@ class ForkedDrive(InProcessClock):
             place = {"session": state.session, "episode": state.episode}
             told = msgspec.structs.replace(command, **place, **stamps)
             self._write("command", told, arrival.arrived_s)
-        return command
+            self._link.answer(arrival, command)
 
     def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:

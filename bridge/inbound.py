@@ -1,7 +1,7 @@
 """What the simulator believes of the commands, feedback and health that it hears. No socket.
 
 What it does not believe is counted by reason. In the loop with a vehicle, feedback moves the car:
-it is checked as commands are, and `FeedbackHold` says how long the newest one counts.
+it is checked as commands are, and counts for 2 T.
 """
 
 from __future__ import annotations
@@ -28,15 +28,6 @@ from edge_runtime.wire import (
     decode_feedback,
     decode_health,
 )
-
-ACTION_SIZE = "action_size"
-"""Rejection reason: the policy has another number of actions than the environment."""
-ACTION_RANGE = "action_range"
-"""Rejection reason: beyond the action's range, where no policy and no actuator is."""
-PLAN_TOO_LONG = "plan_too_long"
-"""Rejection reason: it would keep the vehicle going for longer than any runtime may."""
-UNKNOWN_STEP = "unknown_step"
-"""Rejection reason: the command (that the vehicle has taken) answers a state never sent."""
 
 
 class CommandCheck:
@@ -110,9 +101,9 @@ class CommandCheck:
             if fault := _action_fault(action, self._actions, COMMAND_ROUNDING):
                 return fault
         if len(plan) * self._period_s > MAX_RIDE_S + ROUNDING_S:
-            return PLAN_TOO_LONG
+            return "plan_too_long"  # It would keep the vehicle going for longer than any may
         if (command.episode, command.step) > (self._episode, self._newest_step):
-            return UNKNOWN_STEP
+            return "unknown_step"  # It answers a state never sent
         if command.episode < self._episode and not self._overtaken(command):
             return Reason.STALE.value
         return ""
@@ -128,14 +119,17 @@ COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
 
 def _action_fault(values: Sequence[float], actions: Sequence[Action], rounding: float) -> str:
     if len(values) != len(actions):
-        return ACTION_SIZE
+        return "action_size"  # Another number of actions than the environment's
     for value, row in zip(values, actions, strict=True):
         slack = rounding * (row.high - row.low)
         if not row.low - slack <= value <= row.high + slack:
-            return ACTION_RANGE
+            return "action_range"  # Where no policy and no actuator is
     return ""
 
 
+NO_FEEDBACK = "no_feedback"
+"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
+SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
 NOT_COMMANDED = ""
 """Session of a vehicle that has not taken a command since its edge runtime was started."""
 
@@ -158,14 +152,17 @@ class FeedbackCheck:
         self._sent = (-1, -1)
         self._met = False
         self._newest: Feedback | None = None
-        self._newest_s = 0.0
+        self._newest_s = self._received_s = 0.0
 
     def sent(self, episode: int, step: int) -> None:
         """Note that a state has been sent."""
         self._sent = (episode, step)
 
-    def read(self, payload: bytes, now_s: float) -> Feedback | None:
-        """Return the feedback if it is this vehicle's newest, else None; ``now_s``: monotonic."""
+    def read(self, payload: bytes, now_s: float, received_s: float = 0.0) -> Feedback | None:
+        """Return the feedback if it is this vehicle's newest, else None.
+
+        Monotonic times: ``received_s`` from the wire, and (network injected) heard at ``now_s``.
+        """
         feedback = decode_feedback(payload)
         if isinstance(feedback, Rejection):
             self.rejected[feedback.reason.value] += 1
@@ -179,40 +176,8 @@ class FeedbackCheck:
             self.rejected[fault] += 1
             return None
         self._met = self._met or feedback.session == self._session
-        self._newest, self._newest_s = feedback, now_s
+        self._newest, self._newest_s, self._received_s = feedback, now_s, received_s
         return feedback
-
-    def _fault(self, feedback: Feedback, now_s: float) -> str:
-        """Why a well-formed feedback of this session is not believed; empty if it is."""
-        if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
-            return fault
-        if (feedback.episode, feedback.step) > self._sent:
-            return UNKNOWN_STEP
-        newest = self._newest
-        if newest is None:
-            return ""
-        if feedback.sent_ns == newest.sent_ns:
-            return Reason.DUPLICATE.value
-        in_order = now_s - self._newest_s <= self._silence_s
-        return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
-
-
-NO_FEEDBACK = "no_feedback"
-"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
-SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
-
-
-class FeedbackHold:
-    """The newest feedback, and how long ago it arrived. Times are monotonic seconds."""
-
-    def __init__(self, now_s: float, period_s: float) -> None:
-        self._silence_s = SILENCE_PERIODS * period_s
-        self._newest: Feedback | None = None
-        self._received_s = self._heard_s = now_s
-
-    def admit(self, feedback: Feedback, received_s: float, now_s: float) -> None:
-        """Take the newest feedback: received from the wire, and (network injected) heard now."""
-        self._newest, self._received_s, self._heard_s = feedback, received_s, now_s
 
     def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
         """Say what the vehicle did in the tick that ends now.
@@ -220,7 +185,7 @@ class FeedbackHold:
         ``heard`` is what its commands would have it do: the simulator hears those, too. They give
         a stop its reason, and decide nothing.
         """
-        silent = now_s - self._heard_s > self._silence_s + ROUNDING_S
+        silent = now_s - self._newest_s > self._silence_s + ROUNDING_S
         feedback, reason = None if silent else self._newest, ""
         if feedback is None:
             reason = NO_FEEDBACK
@@ -240,6 +205,20 @@ class FeedbackHold:
             feedback=feedback,
             feedback_age_s=None if feedback is None else now_s - self._received_s,
         )
+
+    def _fault(self, feedback: Feedback, now_s: float) -> str:
+        """Why a well-formed feedback of this session is not believed; empty if it is."""
+        if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
+            return fault
+        if (feedback.episode, feedback.step) > self._sent:
+            return "unknown_step"  # It answers a state never sent
+        newest = self._newest
+        if newest is None:
+            return ""
+        if feedback.sent_ns == newest.sent_ns:
+            return Reason.DUPLICATE.value
+        in_order = now_s - self._newest_s <= self._silence_s
+        return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
 
 
 class EdgeCounts:

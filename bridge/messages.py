@@ -15,7 +15,7 @@ import numpy as np
 from edge_runtime import wire
 from edge_runtime.manifest import Entry, Task, check_task
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES, check_vehicle_id
+from edge_runtime.wire import MAX_STATE_BYTES
 
 WIRE_TOPICS = ("state", "command", "feedback", "health", "scene")
 TOKEN_TOPICS = ("alive", "simulator")
@@ -112,11 +112,6 @@ _ENCODER = msgspec.msgpack.Encoder(
     enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 )
 _DECODER = msgspec.msgpack.Decoder(Scene)
-
-
-def scene_key(vehicle_id: str) -> str:
-    """Return the Zenoh key of the scene topic."""
-    return f"phil/{check_vehicle_id(vehicle_id)}/scene"
 
 
 def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:

@@ -216,13 +216,7 @@ def parse_spec(text: str) -> LatencySpec:
 
     Settings are separated by commas and hold each way; ``up.`` (state to edge) or ``down.``
     (command to simulator) before one is for that way alone and outranks the same one without, in
-    any order::
-
-        delay=50ms,jitter=10ms,loss=1%
-        50ms+-10ms                          the same delay and jitter, short
-        up.delay=30ms,down.loss=2%
-        outage=0.5s@2s+0.2s/10s             0.5 s at second 2, and 0.2 s every 10 s (from 10 s on)
-        none                                a perfect link
+    any order. GRAMMAR has them all.
     """
     if text.strip() in ("", "none"):
         return LatencySpec()

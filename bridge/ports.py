@@ -11,6 +11,7 @@ wait. Last comes ``python -m bridge router``, which connects simulators, edge ru
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import secrets
 import threading
@@ -23,7 +24,7 @@ import zenoh
 
 from bridge.environments import picture_of, scene_of
 from bridge.inbound import EdgeCounts
-from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Scene, encode_scene, scene_key
+from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Scene, encode_scene
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
 from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
@@ -44,11 +45,6 @@ QUERY_S = 1.0
 PayloadHandler = Callable[[bytes], None]
 
 
-def simulator_key(vehicle_id: str) -> str:
-    """Return the liveliness key by which viewers see that the simulator is there (extension)."""
-    return f"phil/{vehicle_id}/simulator"
-
-
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
     """The scene as it is sent, or else the environment's picture."""
     scene = scene_of(environment)
@@ -67,10 +63,10 @@ class SimulatorPort:
         self._zenoh = zenoh_session
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
-        states, scenes = key(vehicle_id, "state"), scene_key(vehicle_id)
+        states, ours = key(vehicle_id, "state"), f"phil/{vehicle_id}"
         self._states = zenoh_session.declare_publisher(states, congestion_control=drop)
-        self._scenes = zenoh_session.declare_publisher(scenes, congestion_control=drop)
-        token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
+        self._scenes = zenoh_session.declare_publisher(f"{ours}/scene", congestion_control=drop)
+        token = zenoh_session.liveliness().declare_token(f"{ours}/simulator")
         self._declared: list[Any] = [self._states, self._scenes, token]
         self.hear("health", self.edge_counts.observe_message)
 
@@ -189,39 +185,38 @@ class WireListener:
             return self._queue.get(timeout=timeout_s)
         return None
 
-    def until_gone(self, duration_s: float | None) -> Iterator[Heard]:
-        """Yield messages until no simulator is left and the queue is empty, or the time is over."""
-        end_s = None if duration_s is None else time.monotonic() + duration_s
-        while end_s is None or time.monotonic() < end_s:
-            heard = self.next(POLL_S)
-            if heard is not None:
-                yield heard
-            elif self.simulator_gone.is_set():
+    def until_gone(
+        self, duration_s: float | None, linger_s: float = POLL_S
+    ) -> Iterator[Heard | None]:
+        """Yield messages, and None where none comes, until the time is over, or no simulator has
+        been there for ``linger_s`` and the queue is empty.
+
+        An edge runtime behind a router goes on sending: that is no drive to wait for.
+        """
+        now_s = seen_s = time.monotonic()
+        end_s = math.inf if duration_s is None else now_s + duration_s
+        while now_s < end_s:
+            yield self.next(POLL_S)
+            now_s = time.monotonic()
+            if not self.simulator_gone.is_set():
+                seen_s = now_s
+            elif now_s - seen_s >= linger_s and not self.waiting:
                 return
 
-    def hearer(self, topic: str) -> Callable[[zenoh.Sample], None]:
-        """Return the subscriber callback of one topic."""
+    def hear(self, sample: zenoh.Sample) -> None:
+        """Take a message of the wire."""
+        key, size = str(sample.key_expr), len(sample.payload)
+        if "*" in key:
+            return  # put to many vehicles at once: no vehicle's own
+        # A flood of huge messages must not fill the memory.
+        self._put(key, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
 
-        def hear(sample: zenoh.Sample) -> None:
-            if "*" in str(sample.key_expr):
-                return  # put to many vehicles at once: no vehicle's own
-            size = len(sample.payload)
-            # A flood of huge messages must not fill the memory.
-            payload = sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b""
-            self._put(str(sample.key_expr), topic, payload, size)
-
-        return hear
-
-    def watch(self, topic: str) -> Callable[[zenoh.Sample], None]:
-        """Return the subscriber callback of one kind of token."""
-
-        def change(sample: zenoh.Sample) -> None:
-            key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
-            if topic == "simulator":
-                self._note_simulator(key, here)
-            self._put(key, topic, bytes([here]), size=1)
-
-        return change
+    def watch(self, sample: zenoh.Sample) -> None:
+        """Take a token that comes or goes."""
+        key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
+        if key.endswith("/simulator"):
+            self._note_simulator(key, here)
+        self._put(key, bytes([here]), size=1)
 
     def _note_simulator(self, key: str, here: bool) -> None:
         if here:
@@ -233,8 +228,8 @@ class WireListener:
             if not self._simulators:
                 self.simulator_gone.set()
 
-    def _put(self, key: str, topic: str, payload: bytes, size: int) -> None:
-        arrived_ns = self._zero_ns + time.monotonic_ns()
+    def _put(self, key: str, payload: bytes, size: int) -> None:
+        topic, arrived_ns = key.rpartition("/")[2], self._zero_ns + time.monotonic_ns()
         try:
             self._queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
         except queue.Full:
@@ -261,12 +256,12 @@ def open_listener(
             # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
             session.declare_subscriber(
                 f"phil/{vehicle_id}/{topic}",
-                zenoh.handlers.Callback(listener.hearer(topic), indirect=False),
+                zenoh.handlers.Callback(listener.hear, indirect=False),
             )
             for topic in WIRE_TOPICS
         ]
         for topic in TOKEN_TOPICS:
-            token, watch = f"phil/{vehicle_id}/{topic}", listener.watch(topic)
+            token, watch = f"phil/{vehicle_id}/{topic}", listener.watch
             declared.append(session.liveliness().declare_subscriber(token, watch, history=True))
         try:
             # A listener to a vehicle that is not there would never see it go, nor end.

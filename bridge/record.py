@@ -30,7 +30,7 @@ import typing
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
@@ -39,7 +39,6 @@ from mcap.writer import CompressionType, Writer
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, images_of
 from bridge.ports import (
     ANY_VEHICLE,
-    POLL_S,
     QUEUE_MESSAGES,
     WireListener,
     add_options,
@@ -63,7 +62,6 @@ from edge_runtime.util import UserError, counted, open_regular
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 CHUNK_BYTES = 1 << 20
-MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
 
 
@@ -120,22 +118,15 @@ def _run_record(arguments: Any) -> int:
 def _listen(
     listener: WireListener, writer: RecordingWriter, arguments: Any, ended: threading.Event
 ) -> None:
-    now_s = time.monotonic()
-    end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
-    flush_s, seen_s = now_s + FLUSH_S, now_s
-    while not ended.is_set() and (end_s is None or now_s < end_s):
-        heard = listener.next(POLL_S)
+    flush_s = time.monotonic() + FLUSH_S
+    for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
             writer.write(heard, with_view=listener.waiting < QUEUE_MESSAGES // 2)
-        now_s = time.monotonic()
-        if now_s >= flush_s:
+        if time.monotonic() >= flush_s:
             writer.flush()
-            flush_s = now_s + FLUSH_S
-        if not listener.simulator_gone.is_set():
-            seen_s = now_s
-        # An edge runtime behind a router goes on sending health: that is no drive to wait for.
-        elif now_s - seen_s >= arguments.linger_s and not listener.waiting:
+            flush_s = time.monotonic() + FLUSH_S
+        if ended.is_set():
             return
 
 
@@ -207,7 +198,7 @@ class RecordingWriter:
         """Make the file; UserError where it exists already."""
         self.messages = 0
         self._copies = ViewerCopies(self._add_copy)
-        self._file = FlushedFile(path)
+        self._file = new_file(path)
         self._mcap = start_mcap(self._file)
         try:
             self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
@@ -245,7 +236,8 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Close the file, finished or not."""
-        self._file.close()
+        with contextlib.suppress(OSError):  # it tries once more what the disk did not take
+            self._file.close()
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
         if schema.name not in self._schema_ids:
@@ -272,57 +264,20 @@ def start_mcap(stream: Any) -> Writer:
     return writer
 
 
-class FlushedFile:
-    """Collects bytes and writes them out on ``flush``; where that fails, it cuts off the torn part.
+def new_file(path: Path) -> BinaryIO:
+    """A new file, locked until it is closed: ``bridge repair`` keeps away meanwhile.
 
-    So what has been flushed stays whole on a full disk, too. It holds the file's lock until it is
-    closed: ``bridge repair`` keeps away meanwhile. ``mcap.writer.Writer`` needs ``write``, ``tell``
-    and ``flush``.
+    UserError where it exists already, or cannot be made.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Raise UserError where the file exists already, or cannot be made."""
-        make_directory(path.parent)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        try:
-            self._descriptor = os.open(path, flags, 0o666)
-        except FileExistsError:
-            raise UserError(f"{path} exists; {NEVER_OVER}") from None
-        except OSError as error:
-            raise UserError(f"cannot write {path}: {error.strerror}") from None
-        lock_file(self._descriptor)
-        self.flushed_bytes = 0
-        self._pending = bytearray()
-
-    def write(self, data: bytes) -> int:
-        """Keep the bytes for the next flush, which comes by itself when they are many."""
-        self._pending += data
-        if len(self._pending) > MAX_PENDING_BYTES:
-            self.flush()
-        return len(data)
-
-    def tell(self) -> int:
-        """Return the length of the file, what is still to be flushed included."""
-        return self.flushed_bytes + len(self._pending)
-
-    def flush(self) -> None:
-        """Hand all to the operating system; OSError (a full disk) leaves the file as it was."""
-        data = memoryview(bytes(self._pending))
-        self._pending.clear()
-        written = 0
-        try:
-            while written < len(data):
-                written += os.write(self._descriptor, data[written:])
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, self.flushed_bytes)
-                os.lseek(self._descriptor, self.flushed_bytes, os.SEEK_SET)
-            raise
-        self.flushed_bytes += written
-
-    def close(self) -> None:
-        """Close the file without a last flush."""
-        os.close(self._descriptor)
+    make_directory(path.parent)
+    try:
+        stream = path.open("xb")
+    except FileExistsError:
+        raise UserError(f"{path} exists; {NEVER_OVER}") from None
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    lock_file(stream.fileno())
+    return stream
 
 
 Field: Any = descriptor_pb2.FieldDescriptorProto

@@ -464,7 +464,7 @@ def _same_moment(
     """
     longer, shortest = max(ours, theirs, key=len), min(len(ours), len(theirs))
     stop = longer[shortest:]
-    noticed = len(stop) == 1 and stop[0].mode == SAFE_STOP
+    noticed = shortest > 0 and len(stop) == 1 and stop[0].mode == SAFE_STOP
     if noticed and tuple(stop) == tuple(ours_then[:1]) == tuple(theirs_then[:1]):
         return ours[:shortest], theirs[:shortest]
     return ours, theirs

@@ -153,15 +153,6 @@ def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
     return dict(zip(QUANTILES, map(float, found), strict=True))
 
 
-def rejections(by_edge: Mapping[str, int], by_simulator: Mapping[str, int]) -> dict[str, Any]:
-    """Return the report's counts of rejected messages by reason: of each side, and the sum."""
-    return {
-        "rejected": dict(Counter(by_edge) + Counter(by_simulator)),
-        "rejected_by_edge": dict(by_edge),
-        "rejected_by_simulator": dict(by_simulator),
-    }
-
-
 def make_report(
     results: Sequence[EpisodeResult],
     safe_stop_events: Sequence[SafeStopEvent],

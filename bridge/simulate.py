@@ -24,7 +24,7 @@ from bridge.inbound import CommandCheck, FeedbackCheck
 from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
-from bridge.report import episode_line, make_report, rejections, summary_line
+from bridge.report import episode_line, make_report, summary_line
 from bridge.virtual_link import Decision
 from edge_runtime.cli import (
     ArgumentParser,
@@ -150,8 +150,14 @@ def _drive(
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
-    if manifest is not None:  # else the edge runtime compares by itself what the states say
-        _refuse_another_task(asked, runner, manifest.text)
+    # Where it says nothing, the edge runtime compares by itself what the states say.
+    if manifest is not None and manifest.text != task.text:
+        runner.show_task(asked.seed)
+        time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
+        raise UserError(
+            f"the edge runtime's policy is for another task ({manifest.text!r}) than --env"
+            f" {asked.env} ({task.text!r}); start it with a policy of this, or choose another --env"
+        )
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
@@ -183,23 +189,13 @@ def _drive(
             "missed_ticks": clock.missed_ticks,
             "wall_clock_stalls": clock.wall_clock_stalls,
             "edge_changes": edge.changes,
-            **rejections(edge.rejected, by_simulator),
+            "rejected": dict(edge.rejected + by_simulator),
+            "rejected_by_edge": dict(edge.rejected),
+            "rejected_by_simulator": dict(by_simulator),
             "wall_s": wall_s,
             "vehicle": vehicle.report(action_names) if vehicle else None,
         },
     )
-
-
-def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str) -> None:
-    """Raise UserError where the edge runtime's policy is for another task."""
-    ours = runner.task.text
-    if theirs != ours:
-        runner.show_task(asked.seed)
-        time.sleep(runner.task.control_period_s)  # Its safe stop still finds this end of the wire.
-        raise UserError(
-            f"the edge runtime's policy is for another task ({theirs!r}) than --env"
-            f" {asked.env} ({ours!r}); start it with a policy of this, or choose another --env"
-        )
 
 
 class EpisodeBar(ProgressBar):

@@ -2,13 +2,10 @@
 
 `CommandHold` is the vehicle's side of the contract's safety rule, on every clock: the newest
 command is held from tick to tick; when none has arrived for 2 T, or when the command itself says
-``safe_stop``, the vehicle brakes. The command is its own heartbeat, so there is nothing else to
-listen to.
+``safe_stop``, the vehicle brakes.
 
-`VirtualLink` is shared by lock-step and by training under latency. Tick n stands at virtual time
-n T. Its state arrives at the edge runtime after the uplink's delay; the answer takes no time, and
-arrives at the vehicle after the downlink's; the tick is decided at n T + T / 4 from what has
-arrived by then. The caller gives the answers: those of a real edge runtime, or of a function.
+`VirtualLink` is shared by lock-step and by training under latency. The caller gives the answers:
+those of a real edge runtime, or of a function. An answer takes no time.
 
 The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
 states come faster than in life, would miss the gaps. So its safety machine runs along, and what it

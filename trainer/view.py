@@ -27,7 +27,6 @@ from bridge.rerun import (
     HUMAN,
     POLICY,
     SERVE,
-    Sink,
     ViewerGone,
     add_sink,
     check_sink,
@@ -132,12 +131,12 @@ def run(arguments: argparse.Namespace) -> int:
             flush=True,
         )
         with suppress(KeyboardInterrupt):
-            while sink.kind == SERVE:
+            while sink == SERVE:
                 time.sleep(LOOK_S)
     return 0
 
 
-def check_word(word: str) -> Sink:
+def check_word(word: str) -> str:
     """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
     return check_sink(read_sink(word))
 
@@ -173,7 +172,7 @@ Draw = Callable[[Entry], None]
 
 
 @contextmanager
-def watched(run: TrainingRun, sink: Sink) -> Iterator[Callable[[EpisodeMetrics], None]]:
+def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], None]]:
     """Show a run for as long as it lasts; what it yields is to be called after each episode."""
 
     @contextmanager

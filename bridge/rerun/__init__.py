@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from edge_runtime.cli import sigterm_as_interrupt
@@ -55,18 +55,6 @@ SPAWN, SERVE = "spawn", "serve"
 SUFFIX = ".rrd"
 
 
-class Sink(NamedTuple):
-    """``spawn`` (a window), ``serve`` (a page on loopback), or the file's path."""
-
-    kind: str
-    path: str = ""
-
-    @property
-    def is_live(self) -> bool:
-        """Whether somebody looks while it is made."""
-        return not self.path
-
-
 class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
     """The viewer has ended, hangs, or never came."""
 
@@ -88,35 +76,31 @@ def add_sink(parser: argparse.ArgumentParser) -> Any:
     where = parser.add_mutually_exclusive_group()
     page, window = "serve a web page on this machine's loopback only", "open a rerun window"
     for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
-        where.add_argument(
-            f"--{kind}", dest="sink", action="store_const", const=Sink(kind), help=text
-        )
+        where.add_argument(f"--{kind}", dest="sink", action="store_const", const=kind, help=text)
     text = "write a recording instead of showing it"
     where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
     return where
 
 
-def _file(path: str) -> Sink:
+def _file(path: str) -> str:
     if not path.endswith(SUFFIX):
         raise UserError(f"{path}: rerun opens only what is called F{SUFFIX}")
-    return Sink("save", path)
+    return path
 
 
-def read_sink(word: str) -> Sink:
-    """``spawn``, ``serve``, or a path that ends in .rrd; UserError for any other word."""
-    if word in (SPAWN, SERVE):
-        return Sink(word)
-    if not word.endswith(SUFFIX):
+def read_sink(word: str) -> str:
+    """The word itself: spawn, serve, or a path that ends in .rrd; UserError for any other."""
+    if word not in (SPAWN, SERVE) and not word.endswith(SUFFIX):
         raise UserError(f"{word!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    return Sink("save", word)
+    return word
 
 
-def check_sink(sink: Sink | None) -> Sink:
+def check_sink(sink: str | None) -> str:
     """The sink (None: a window); UserError at once where nothing could be shown there."""
-    sink = sink or Sink(SPAWN)
-    if sink.path:
-        check_writable(sink.path)
-    elif sink.kind == SERVE:
+    sink = sink or SPAWN
+    if sink.endswith(SUFFIX):
+        check_writable(sink)
+    elif sink == SERVE:
         for port in (GRPC_PORT, WEB_PORT):  # a view of somebody else may be there
             try:
                 check_port_is_free(f"tcp/{LOOPBACK}:{port}")
@@ -131,19 +115,20 @@ def check_sink(sink: Sink | None) -> Sink:
 
 @contextlib.contextmanager
 def open_sink(
-    sink: Sink, application: str, blueprint: rrb.Blueprint
+    sink: str, application: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """A recording that goes there; ``application`` keeps layouts of different kinds apart.
+    """A recording that goes to ``spawn`` (a window), ``serve`` (a page on loopback) or a file.
 
-    A window stays open afterwards; a page is served until then. SIGTERM raises KeyboardInterrupt
-    meanwhile, unless the command has another use for it: a file is to be finished, and a server
-    not to be left behind. ViewerGone: there is no viewer any more, or none has come.
+    ``application`` keeps layouts of different kinds apart. A window stays open afterwards; a page
+    is served until then. SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another
+    use for it: a file is to be finished, and a server not to be left behind. ViewerGone: there is
+    no viewer any more, or none has come.
     """
     import rerun as rr
 
     recording = rr.RecordingStream(application)
-    opened = _saved(recording, sink.path, blueprint) if sink.path else None
-    with sigterm_as_interrupt(), opened or _shown(recording, sink.kind, blueprint):
+    opened = _saved(recording, sink, blueprint) if sink.endswith(SUFFIX) else None
+    with sigterm_as_interrupt(), opened or _shown(recording, sink, blueprint):
         yield recording
 
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import rerun as rr
@@ -17,7 +17,17 @@ import rerun.blueprint as rrb
 from bridge.messages import DECODERS, Heard, Pace, Scene, images_of, is_picture, period_of
 from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.recording import Recording, choose_vehicle, heard_of
-from bridge.rerun import APPLIED, POLICY, SERVE, Sink, add_sink, check_sink, draw, flush, open_sink
+from bridge.rerun import (
+    APPLIED,
+    POLICY,
+    SERVE,
+    SUFFIX,
+    add_sink,
+    check_sink,
+    draw,
+    flush,
+    open_sink,
+)
 from bridge.rerun.draw import Plot
 from bridge.virtual_link import SILENCE_PERIODS
 from edge_runtime import wire
@@ -69,12 +79,12 @@ def run(arguments: Any) -> int:
         _show_recording(arguments, sink)
     else:
         _watch(arguments, _drawn(sink))
-    if sink.path:
-        print(f"wrote {sink.path}")
+    if sink.endswith(SUFFIX):
+        print(f"wrote {sink}")
     return 0
 
 
-def _show_recording(arguments: Any, sink: Sink) -> None:
+def _show_recording(arguments: Any, sink: str) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
     file = Recording(Path(arguments.recording))
     heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
@@ -89,16 +99,16 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
         if file.trouble():
             text = f"the recording {file.trouble()}; what is whole of it is shown"
             print(text, file=sys.stderr, flush=True)
-        if sink.kind == SERVE:
+        if sink == SERVE:
             flush(recording)
             print("all of it is there; ^C ends", flush=True)
             wait_to_be_told()
 
 
 @contextlib.contextmanager
-def _drawn(sink: Sink) -> Iterator[Callable[[Heard], None]]:
+def _drawn(sink: str) -> Iterator[Callable[[Heard], None]]:
     with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
-        yield WireLog(recording, draw.PICTURE_INTERVAL_S if sink.is_live else 0.0).write
+        yield WireLog(recording, 0.0 if sink.endswith(SUFFIX) else draw.PICTURE_INTERVAL_S).write
 
 
 def _watch(
@@ -114,7 +124,7 @@ def _watch(
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
-        for heard in listener.until_gone(arguments.duration_s):
+        for heard in filter(None, listener.until_gone(arguments.duration_s)):
             show(heard)
     if listener.dropped:
         print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
@@ -330,11 +340,12 @@ class WireLog:
                 self._recording.log(f"observation/{name}", numbers)
 
     def _stand_at(self, place: Place) -> None:
-        recording, moment = self._recording, self._timeline.place(*place)
+        recording, (name, total_step) = self._recording, self._timeline.place(*place)
+        period_s = self._timeline.period_s
         recording.reset_time()
-        recording.set_time("sim_time", duration=moment.sim_time_s)
-        recording.set_time("step", sequence=moment.total_step)
-        recording.set_time(moment.timeline, duration=moment.episode_time_s)
+        recording.set_time("sim_time", duration=total_step * period_s)
+        recording.set_time("step", sequence=total_step)
+        recording.set_time(name, duration=place[2] * period_s)
 
     def _round_trip(self, session: str, scene: Scene) -> None:
         """The newest round trip, and what is left of it for the way down."""
@@ -405,15 +416,6 @@ def _keep(table: dict[Place, int], key: Place, value: int) -> None:
         del table[next(iter(table))]
 
 
-class Moment(NamedTuple):
-    """One place on all timelines."""
-
-    timeline: str  # The episode's own
-    episode_time_s: float  # Simulated time within the episode
-    total_step: int  # Episodes end to end, as ``sim_time_s``
-    sim_time_s: float
-
-
 class Timeline:
     """Where a message stands in time.
 
@@ -430,11 +432,11 @@ class Timeline:
         self._end_step = 0
         self.period_s = 0.0  # The control period, as soon as a message tells it
 
-    def place(self, session: str, episode: int, step: int) -> Moment:
-        """Return the moment of a step."""
+    def place(self, session: str, episode: int, step: int) -> tuple[str, int]:
+        """The episode's own timeline, and the step with the episodes end to end."""
         # A viewer that comes late begins at zero as well: its first step is the first it saw.
         total_step = self._starts.setdefault((session, episode), self._end_step) + step
         self._end_step = max(self._end_step, total_step + 1)
         nth = self._sessions.setdefault(session, len(self._sessions) + 1)
         name = f"episode_{episode}" if nth == 1 else f"episode_{episode}_of_session_{nth}"
-        return Moment(name, step * self.period_s, total_step, total_step * self.period_s)
+        return name, total_step

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bridge import inbound
 from bridge.episode import Actuators, vehicle_action
-from bridge.report import SafeStopLog, rejections
+from bridge.report import SafeStopLog
 from bridge.tests.harness import make_command, make_feedback
 from bridge.tests.toy import ToyEnv
 from bridge.virtual_link import NO_COMMAND, CommandHold
@@ -200,9 +200,9 @@ STOPPED = CommandHold(0.0, T).decide(0.0, edge_silence_s=0.3)
 
 
 def decide(feedback, after_s=0.05, heard=HEARD, received_s=1.0):
-    hold = inbound.FeedbackHold(0.0, T)
-    hold.admit(feedback, received_s=received_s, now_s=1.0)
-    return hold.decide(heard, 0, now_s=1.0 + after_s)
+    check = inbound.FeedbackCheck("here", TASK)
+    check._newest, check._received_s, check._newest_s = feedback, received_s, 1.0
+    return check.decide(heard, 0, now_s=1.0 + after_s)
 
 
 def test_feedback_holds_for_2_periods_and_no_longer():
@@ -326,11 +326,3 @@ def test_the_status_answer_counts_as_a_message_and_junk_does_not():
         counts.observe_message(payload)
     assert counts.rejected == {"stale": 1}
     assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
-
-
-def test_the_report_joins_both_sides():
-    assert rejections({"stale": 2}, {"stale": 1, "schema": 3}) == {
-        "rejected": {"stale": 3, "schema": 3},
-        "rejected_by_edge": {"stale": 2},
-        "rejected_by_simulator": {"stale": 1, "schema": 3},
-    }

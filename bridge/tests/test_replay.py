@@ -6,6 +6,7 @@ import pytest
 
 from bridge.messages import Heard
 from bridge.record import RecordingWriter
+from bridge.replay import Answer, Exchange, compare
 from bridge.tests.harness import BridgeProcess, bridge_status, make_command, make_policy, start_edge
 from bridge.tests.test_inbound import health
 from edge_runtime.reach import free_endpoint
@@ -234,6 +235,14 @@ def test_a_watchdog_that_woke_with_the_state_after_the_silence_is_no_difference(
     hand.state(0.425, 3)  # 2.25 T after the last one
     hand.command(0.425 + ANSWER_S, 3, **SAFE_STOP)
     assert is_the_same(hand, compared=4)
+
+
+def test_a_stop_that_nobody_repeated_is_a_difference_where_it_was_the_only_answer():
+    stop = Answer("safe_stop", "no_fresh_state", (-1.0,))
+    states = [("here", 0, step) for step in range(3)]
+    recorded = {key: Exchange(0.0, 0.0, 0.0, 0.0, [stop]) for key in states}
+    report = compare(recorded, {states[0]: [stop], states[2]: [stop]}, states, 0.0)
+    assert (report["equal"], report["different"]) == (2, 1)
 
 
 def test_of_several_vehicles_one_is_named(hand, tmp_path, capsys, refusal):

@@ -328,6 +328,13 @@ def test_a_new_episode_starts_with_the_brake_released(environment):
     assert clock.states[10].speed_mps > 3.5
 
 
+def test_an_episode_that_begins_with_a_stop_does_not_hold_the_last_ones_action(environment):
+    clock = ScriptedClock()
+    runner, before = run(environment, clock)
+    clock.drive = 0
+    assert (before.actions[-1], runner.run(1, seed=3).actions[0]) == (pytest.approx([-0.02]), [0.0])
+
+
 @pytest.mark.parametrize(("options", "speed_mps"), [({}, 5.0), ({"standing": True}, 0.0)])
 def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, options, speed_mps):
     clock = ScriptedClock()

@@ -146,7 +146,7 @@ def add_person(parser: argparse.ArgumentParser) -> None:
     shipped = "what the axes and buttons of --human gamepad or wheel mean (default: as shipped)"
     here = "the address at which --human web listens; by default this machine's alone"
     port = "the port of --human web; 0: any that is free"
-    speed = number("a number from 0.01 to 100", lambda value: 0.01 <= value <= 100.0)
+    speed = number("a number from 0.01 to 1000", lambda value: 0.01 <= value <= 1000.0)
     slow = "simulated seconds in one of yours: 0.5 is slow motion"
     group.add_argument("--profile", metavar="F.toml", help=shipped)
     group.add_argument("--host", help=here)

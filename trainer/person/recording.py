@@ -8,6 +8,7 @@ ever overwritten: sittings add up.
 """
 
 import ast
+import contextlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
@@ -21,7 +22,7 @@ from mcap.records import Channel, Message
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from bridge.record import FlushedFile, start_mcap
+from bridge.record import new_file, start_mcap
 from bridge.recording import Records
 from bridge.report import DISCARDED
 from edge_runtime.util import UserError, open_regular
@@ -105,7 +106,7 @@ class Recorder:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
         self.index = 0  # The next step's number
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
-        self._file = FlushedFile(self.path)
+        self._file = new_file(self.path)
         self._mcap = start_mcap(self._file)
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
         self._closed = self._torn = False
@@ -114,8 +115,9 @@ class Recorder:
     def write(self, step: Step) -> None:
         """Keep a step; from here on no kill takes it away. UserError on a full disk."""
         data = msgspec.msgpack.encode(step)
-        self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, self.index)
+        place = (self._channel, step.time_ns, data, step.time_ns, self.index)
         self.index += 1
+        self._write_out(lambda: self._mcap.add_message(*place))
         self._write_out(self._mcap.flush)
 
     def close(self) -> None:
@@ -128,7 +130,8 @@ class Recorder:
                 self._write_out(self._mcap.finish)
                 self._write_out(self._file.flush)
         finally:
-            self._file.close()
+            with contextlib.suppress(OSError):  # it tries once more what the disk did not take
+                self._file.close()
         if self.index == 0:
             self.path.unlink()
 

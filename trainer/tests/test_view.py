@@ -14,7 +14,7 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
-from bridge.rerun import APPLIED, HUMAN, POLICY, Sink
+from bridge.rerun import APPLIED, HUMAN, POLICY
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer import view
@@ -60,7 +60,7 @@ def values_in(rrd):
 def train(directory, rrd=None):
     directory.mkdir()
     run: Any = TrainingRun(TINY, directory)
-    with view.watched(run, Sink("save", str(rrd))) if rrd else nullcontext() as on_episode:
+    with view.watched(run, str(rrd)) if rrd else nullcontext() as on_episode:
         run.train(*filter(None, [on_episode]))
     return run
 

@@ -43,7 +43,7 @@ WRONG = [
     (DRIVE, ("--human", "web", "--port", "70000"), "not a whole number from 0 to 65535"),
     (DRIVE, ("--human", "web", "--port", "http"), "'http' is not a whole number"),
     (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
-    (DRIVE, ("--speed", "0"), "not a finite number above 0"),
+    (DRIVE, ("--speed", "0"), "not a number from 0.01 to 1000"),
     (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
     (
         DRIVE,
