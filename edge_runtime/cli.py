@@ -228,9 +228,10 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     """Let the first signal ask for the end.
 
     A second one ends the process, and so does the first where ``ask`` returns False: then nothing
-    is left that could end in order.
+    is left that could end in order. Outside of the main thread it does nothing.
     """
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in (SIGNALS if is_main else ())}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -241,7 +242,7 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
         if not ask():
             os.kill(os.getpid(), number)
 
-    for number in SIGNALS:
+    for number in before:
         signal.signal(number, stop)
     try:
         yield

@@ -128,9 +128,11 @@ class LinkQuality:
         if len(self._sent) > MESSAGES:
             del self._sent[next(iter(self._sent))]
 
-    def note_state(self, state: State, arrived_ns: int) -> None:
+    def note_state(self, state: State, arrived_ns: int, is_new: bool = True) -> None:
         """A state has come, a new one or one that was overtaken."""
         if state.session != self._session:  # another simulator: another clock, another network
+            if not is_new:
+                return  # it is the simulator before that is heard once more
             self._begin()
             self._session = state.session
             self.up.newest = state.step - 1  # what came before it was not ours to hear

@@ -9,18 +9,16 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import queue
 import threading
 import time
-from typing import Any, Dict, Optional
+from typing import Any, Optional
 
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
 _WAITING_LINES = 1000
 _FLUSH_S = 0.5
-_FLOOD_PERIOD_S = 1.0
 
 
 def configure(level: str, log_format: str = "text") -> None:
@@ -95,19 +93,3 @@ def _quoted(value: Any) -> str:
     # Other parties' words may hold what a terminal would act upon: repr writes it as escapes.
     is_plain = text and text.isprintable() and not any(c in " \"'=" for c in text)
     return text if is_plain else repr(text)
-
-
-class Flood:
-    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept."""
-
-    def __init__(self) -> None:
-        self._next_s: Dict[str, float] = {}
-        self._unsaid: Dict[str, int] = {}
-
-    def admit(self, kind: str, now_s: float) -> Optional[int]:
-        """How many of this kind went unsaid since the last line, or None: so does this one."""
-        if now_s < self._next_s.get(kind, -math.inf):
-            self._unsaid[kind] = self._unsaid.get(kind, 0) + 1
-            return None
-        self._next_s[kind] = now_s + _FLOOD_PERIOD_S
-        return self._unsaid.pop(kind, 0)

@@ -17,7 +17,8 @@ import queue
 import threading
 import time
 import traceback
-from typing import TYPE_CHECKING, Optional, Tuple
+from collections import deque
+from typing import TYPE_CHECKING, Deque, Dict, Optional, Tuple
 
 from edge_runtime import log, wire
 from edge_runtime.controller import Controller, Order, Received
@@ -25,7 +26,7 @@ from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
-from edge_runtime.service import BoardWatch, LatencyWindow, Notifier
+from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
 from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Reason, Rejection, State
 
 if TYPE_CHECKING:  # Loaded only where they are used.
@@ -37,6 +38,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"]
 _JOIN_S = 0.5
 _RETRY_S = 0.1
+_FLOOD_PERIOD_S = 1.0
 # A policy that computes so long will not end: only a new process helps.
 _HUNG_S = 2.0
 
@@ -59,9 +61,11 @@ class ControlLoop:
         self._hold, self._rearm_command = hold, rearm_command
         self._link_quality = controller.link
         self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
-        self._board, self._flood = BoardWatch(), log.Flood()
+        self._board = BoardWatch()
+        self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._latest = LatestState(self._period_s)
-        self._inference_window, self._command_window = LatencyWindow(), LatencyWindow()
+        self._inferences_ns: Deque[int] = deque(maxlen=WINDOW)
+        self._commands_ns: Deque[int] = deque(maxlen=WINDOW)
         self._busy_since_s: Optional[float] = None
         self._slot: Optional[Received] = None
         self._superseded = 0
@@ -139,8 +143,8 @@ class ControlLoop:
                 deadline_misses=self._controller.deadline_misses,
                 safe_stops=safety.safe_stops,
                 policy_id=self._policy.policy_id,
-                inference_ms=self._inference_window.summary_ms(),
-                command_ms=self._command_window.summary_ms(),
+                inference_ms=quantiles_ms(self._inferences_ns),
+                command_ms=quantiles_ms(self._commands_ns),
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
                 rivals=self._link.rivals,
@@ -158,7 +162,7 @@ class ControlLoop:
                 return
             rejection = self._latest.offer(state, arrived_s)
             if self._link_quality and (not rejection or rejection.reason is Reason.STALE):
-                self._link_quality.note_state(state, arrived_ns)
+                self._link_quality.note_state(state, arrived_ns, is_new=rejection is None)
             if rejection is not None:
                 self._log_rejection(rejection, arrived_s)
                 return
@@ -194,14 +198,14 @@ class ControlLoop:
                 self._busy_since_s = None
                 if self._stopping:
                     return  # The farewell has been said.
-                self._inference_window.add(inference_ns)
+                self._inferences_ns.append(inference_ns)
                 self._look_at_vehicle(time.monotonic())
                 now_s = time.monotonic()
                 order = self._controller.finish(output, inference_ns, now_s)
                 self._send(order)
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s
-                    self._command_window.add(int(took_s * 1e9))
+                    self._commands_ns.append(int(took_s * 1e9))
                 if self._link_quality:  # Now: no command waits for it.
                     self._link_quality.judge()
 
@@ -298,6 +302,7 @@ class ControlLoop:
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
         """The first of each reason, then one a second: all are counted in the health message."""
         reason = rejection.reason.value
-        unsaid = self._flood.admit(reason, now_s)
-        if unsaid is not None:
-            log.event("warning", "rejected", reason=reason, detail=rejection.detail, unsaid=unsaid)
+        if now_s >= self._logged_rejection_s.get(reason, -math.inf) + _FLOOD_PERIOD_S:
+            self._logged_rejection_s[reason] = now_s
+            so_far = self._latest.rejected[reason]
+            log.event("warning", "rejected", reason=reason, detail=rejection.detail, so_far=so_far)

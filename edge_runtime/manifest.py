@@ -60,6 +60,20 @@ class Car(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     full_steering_rad: float
     wheelbase_m: float
 
+    def curvature(self, steering: float) -> float:
+        """Path curvature (1/m, positive to the left) of a steering action in -1 to 1.
+
+        highway-env's bicycle turns about its centre: slip b = atan(tan(angle) / 2), and a heading
+        rate of v sin(b) / (wheelbase / 2).
+        """
+        slip_rad = math.atan(0.5 * math.tan(steering * self.full_steering_rad))
+        return math.sin(slip_rad) / (0.5 * self.wheelbase_m)
+
+    def steering(self, curvature: float) -> float:
+        """The steering action of a path; not clamped. Inverse of the above."""
+        slip_rad = math.asin(min(max(0.5 * self.wheelbase_m * curvature, -1.0), 1.0))
+        return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
+
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
     """What is asked of a policy. `car` is left out where the policy drives no car."""

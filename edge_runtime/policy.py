@@ -89,15 +89,6 @@ def open_policy(data: bytes, trust: str) -> Policy:
     return policy
 
 
-def check_graph(data: bytes) -> dict[str, str]:
-    """The metadata of a whole ONNX file that the board can run. Raises UserError for others."""
-    ir_version, opset, metadata = read_onnx(data)
-    if opset not in OPSETS or ir_version > MAX_IR_VERSION:
-        needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
-        raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
-    return metadata
-
-
 def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
     """Raise UserError unless the network's inputs and output are the task's."""
     inputs = {each.name: each for each in session.get_inputs()}
@@ -285,11 +276,11 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
 }
 
 
-def read_onnx(data: bytes) -> tuple[int, int, dict[str, str]]:
-    """IR version, operator set and metadata of a whole ONNX file: onnxruntime does not tell them.
+def check_graph(data: bytes) -> dict[str, str]:
+    """The metadata of a whole ONNX file that the board can run; onnxruntime does not tell it.
 
-    Raises UserError for truncated or foreign bytes, and for weights anywhere but in plain tensors
-    inside the file.
+    Raises UserError for truncated or foreign bytes, for weights anywhere but in plain tensors
+    inside the file, and for another IR version or operator set.
     """
     try:
         model = _checked(memoryview(data), "model")
@@ -307,7 +298,11 @@ def read_onnx(data: bytes) -> tuple[int, int, dict[str, str]]:
         metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
     except ValueError as error:
         raise UserError(f"not a whole ONNX file: {error}") from None
-    return versions[-1], max(numbers), metadata
+    ir_version, opset = versions[-1], max(numbers)
+    if opset not in OPSETS or ir_version > MAX_IR_VERSION:
+        needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
+        raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
+    return metadata
 
 
 def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:

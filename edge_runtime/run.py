@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import math
 import os
 import signal
 import threading
@@ -18,7 +17,7 @@ import zenoh
 from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, shared_limits
-from edge_runtime.link import Link, require_free, taken, wait_for_router
+from edge_runtime.link import Link, require_free, taken
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
@@ -31,7 +30,6 @@ if TYPE_CHECKING:  # Loaded only where they are used.
 
 
 _WAITING_PERIOD_S = 5.0
-_POLL_S = 0.1
 
 
 class _StopSignal:
@@ -176,7 +174,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             from edge_runtime.files import Hold
 
             hold = Hold(config.hold)
-        has_router = require_free(open_client, config.vehicle_id)
+        require_free(open_client, config.vehicle_id)
         session = connected(mode="peer")
         undo.callback(session.close)  # An open one would hang the process at its exit.
         link = Link(session, config.vehicle_id, policy.manifest)
@@ -190,7 +188,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         undo.pop_all()
     stop.on_stop = loop.stop
     why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
-    waiting = Waiting(loop.has_heard, why)
+    over = threading.Event()
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()
     gc.freeze()
@@ -198,8 +196,6 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         if runner is not None:
             runner.start(armed)
         loop.start()
-        if has_router:
-            wait_for_router(session)
         link.appear(open_client, loop.stop)
         if policy.trust != VERIFIED:
             log.event("warning", "policy_not_verified", trust=policy.trust)
@@ -208,14 +204,15 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             f" connect={config.connect} policy_id={policy.policy_id}",
             flush=True,
         )
-        if session.info.routers_zid():  # then its first state may take as long
-            waiting.next_s = time.monotonic() + _WAITING_PERIOD_S
-        waiting.start()
+        # Where there is a router, its first state may take as long.
+        first_s = time.monotonic() + (_WAITING_PERIOD_S if session.info.routers_zid() else 0.0)
+        waiting = (loop.has_heard, why, over, first_s)
+        threading.Thread(target=say_what_is_missing, args=waiting, daemon=True).start()
         notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")
         if not stop.came:
             loop.run()
     finally:
-        waiting.ended.set()
+        over.set()
         notifier.tell("STOPPING=1")
         ended = loop.close()
         if runner is not None:
@@ -242,30 +239,15 @@ def rearm_command(connect: str, vehicle_id: str) -> str:
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
 
 
-class Waiting(threading.Thread):
-    """Logs what is waited for, until a state comes or `ended` is set. A name server takes time."""
-
-    def __init__(self, has_heard: Callable[[], bool], why: Callable[[], str]) -> None:
-        super().__init__(name="waiting", daemon=True)
-        self.next_s = -math.inf
-        self.ended = threading.Event()
-        self._has_heard, self._why = has_heard, why
-
-    def look(self, now_s: float) -> bool:
-        """Say what is waited for, at once and every 5 s; False once a state was heard."""
-        if self._has_heard():
-            return False
-        if now_s >= self.next_s:
-            self.next_s = now_s + _WAITING_PERIOD_S
-            why = self._why()
-            if why and not self._has_heard():
-                log.event("info", "waiting", why=why)
-        return True
-
-    def run(self) -> None:
-        """Look again and again."""
-        while self.look(time.monotonic()) and not self.ended.wait(_POLL_S):
-            pass
+def say_what_is_missing(
+    has_heard: Callable[[], bool], why: Callable[[], str], over: threading.Event, next_s: float
+) -> None:
+    """Log what is waited for, from `next_s` on and every 5 s, until a state comes or it is over."""
+    while not over.wait(max(0.0, next_s - time.monotonic())) and not has_heard():
+        next_s = time.monotonic() + _WAITING_PERIOD_S
+        words = why()  # a name server takes time
+        if not has_heard():
+            log.event("info", "waiting", why=words)
 
 
 def why_no_state(

@@ -9,9 +9,8 @@ import contextlib
 import os
 import socket
 import threading
-from collections import deque
 from pathlib import Path
-from typing import Deque, Dict, Mapping, NamedTuple, Optional
+from typing import Collection, Dict, Mapping, NamedTuple, Optional
 
 import numpy as np
 
@@ -94,19 +93,7 @@ class BoardWatch:
             self.last = look()
 
 
-class LatencyWindow:
-    """Quantiles of the last WINDOW durations. Not thread-safe: the caller holds a lock."""
-
-    def __init__(self) -> None:
-        self._durations_ns: Deque[int] = deque(maxlen=WINDOW)
-
-    def add(self, duration_ns: int) -> None:
-        """Take one measurement, in nanoseconds."""
-        self._durations_ns.append(duration_ns)
-
-    def summary_ms(self) -> Dict[str, float]:
-        """p50, p99 and max in milliseconds; zeros before the first measurement."""
-        if not self._durations_ns:
-            return {"p50": 0.0, "p99": 0.0, "max": 0.0}
-        p50, p99, top = np.percentile(np.array(self._durations_ns) / 1e6, [50, 99, 100])
-        return {"p50": float(p50), "p99": float(p99), "max": float(top)}
+def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
+    """p50, p99 and max in milliseconds; zeros where there is none."""
+    p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
+    return {"p50": float(p50), "p99": float(p99), "max": float(top)}

@@ -173,16 +173,6 @@ def test_of_foreign_frames_bus_off_stops_it_and_it_listens_on(chassis, vehicle, 
         vehicle._bus.recv(0.0)
 
 
-def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle):
-    for _ in range(100):
-        chassis.send(protocol.MOTION_STATUS, protocol.MotionStatus(1.0, 0.0))
-    vehicle.feedback(time.monotonic())  # from now on it listens
-    time.sleep(0.2)
-    assert vehicle.feedback(time.monotonic()).speed_mps == 0.0
-    chassis.send(protocol.MOTION_STATUS, protocol.MotionStatus(0.5, 0.0))
-    wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps == 0.5, "what comes now")
-
-
 def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(channel):
     bus = partial(can.Bus, interface="virtual", channel=channel)
     with bus() as receiver, bus() as sender:

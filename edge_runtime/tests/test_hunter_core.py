@@ -306,13 +306,15 @@ def test_a_counter_may_run_over_lose_two_frames_and_after_a_silence_start_again(
     driving.step(12).enabled()
 
 
-def test_feedback_that_could_not_be_while_it_is_enabled_stops_it_then(rig):
+@pytest.mark.parametrize("before", [False, True])
+def test_feedback_that_could_not_be_confirms_nothing(rig, before):
+    lie = (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))
+    rig.talks = False
+    if before:
+        rig.tell(*lie)
     rig.core.enable(rig.now_s)
     rig.step(1)
-    rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))
-    assert rig.core.state is State.ENABLING
-    rig.tell(protocol.SYSTEM_STATUS, OK)
-    rig.step(1)
+    rig.tell(*((protocol.SYSTEM_STATUS, OK) if before else lie))
     assert rig.core.state is State.STOPPED
 
 

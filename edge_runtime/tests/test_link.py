@@ -14,7 +14,7 @@ from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.reach import look
-from edge_runtime.run import Waiting
+from edge_runtime.run import say_what_is_missing
 from edge_runtime.tests.harness import HEALTH
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -37,7 +37,7 @@ def declared(session: Any) -> List[str]:
 
 def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
     presence = Presence(session, "k", lambda: session, lambda: None)
-    claims = [presence.claim]
+    claims = []
     for routers in ([], ["b", "a"], ["a", "b"], [], ["c"], ["c"]):
         session.info.routers_zid.return_value = routers
         if presence.refresh():
@@ -53,20 +53,22 @@ def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
     ("claims", "given", "rivals"),
     [
         # At first an elder one may be the leftover of a lost connection.
-        (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
+        (["0000000000000001-elder"] * 3, [0, 1, 2], 1),
         ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
     ],
 )
 def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, claims, given, rivals):
     give_way = MagicMock()
     presence = Presence(session, "k", lambda: session, give_way)
+    session.info.routers_zid.return_value = ["router"]
+    presence.refresh()
     for claim, times_given in zip(claims, given):
         keys = [f"k/{presence.claim}", f"k/{claim}"]
         replies = [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
         session.liveliness().get.return_value = replies
         presence.look()
         assert give_way.call_count == times_given
-    assert presence.rivals == rivals
+    assert len(presence.known) == rivals
 
 
 def test_nobody_there_is_nobody_else(session):
@@ -74,9 +76,9 @@ def test_nobody_there_is_nobody_else(session):
     presence = Presence(session, "k", fail, fail)
     for _ in range(2):
         presence.look()
-    assert presence.rivals == 0
-    assert not require_free(fail, "hunter01")
-    assert require_free(lambda: session, "hunter01")
+    assert presence.known == set()
+    for open_client in (fail, lambda: session):
+        require_free(open_client, "hunter01")
 
 
 @pytest.fixture
@@ -157,27 +159,34 @@ def said(monkeypatch) -> List[str]:
     return lines
 
 
+class Over:
+    """In place of an event: notes how long it is waited for, and is set after so many times."""
+
+    def __init__(self, times: int) -> None:
+        self.times = times
+        self.waits_s: List[float] = []
+
+    def wait(self, timeout_s: float) -> bool:
+        self.waits_s.append(timeout_s)
+        return len(self.waits_s) > self.times
+
+
 def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(said):
-    heard: List[str] = []
-    look = Waiting(lambda: bool(heard), lambda: f"because {len(said)}").look
-    for now_s, lines in ((100.0, 1), (100.1, 1), (104.9, 1), (105.0, 2), (109.9, 2)):
-        assert look(now_s)
-        assert said == ["because 0", "because 1"][:lines]
-    heard.append("a state")
-    assert not look(110.0)
-    assert len(said) == 2
+    over: Any = Over(9)
+    why = lambda: f"because {len(said)}"  # noqa: E731
+    say_what_is_missing(lambda: len(said) == 2, why, over, time.monotonic())
+    assert said == ["because 0", "because 1"]
+    assert over.waits_s == pytest.approx([0.0, 5.0, 5.0], abs=0.5)
 
 
 def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
-    looks = count()
-    assert Waiting(lambda: next(looks) > 0, lambda: "too late").look(0.0)
+    looks, over = count(), Over(1)
+    say_what_is_missing(lambda: next(looks) > 0, lambda: "too late", over, 0.0)  # type: ignore
     assert said == []
 
 
 def test_one_that_is_linked_has_time_for_its_first_state(said):
-    one = Waiting(lambda: False, lambda: "why")
-    one.next_s = time.monotonic() + 5.0
-    one.start()
-    time.sleep(0.3)
+    over: Any = Over(0)
+    say_what_is_missing(lambda: False, lambda: "why", over, time.monotonic() + 5.0)
+    assert over.waits_s == pytest.approx([5.0], abs=0.5)
     assert said == []
-    one.ended.set()

@@ -262,3 +262,10 @@ def test_what_is_no_envelope_of_the_policy(changes, words):
         read_envelope({**ENVELOPE, **changes}, TASK)
     with pytest.raises(UserError, match=words):
         LinkQuality(manifest(**changes))
+
+
+def test_a_late_state_of_the_simulator_before_begins_nothing_anew():
+    network = Network()
+    known = network.run(300)
+    network.quality.note_state(make_state(5, session="before"), 0, is_new=False)
+    assert network.quality.health()["link"] == known

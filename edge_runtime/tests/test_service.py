@@ -10,6 +10,8 @@ import socket
 import sys
 import threading
 import time
+from collections import Counter
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -18,7 +20,6 @@ import pytest
 
 from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, shared_limits
-from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
@@ -28,16 +29,20 @@ from edge_runtime.tests.policies import PEDAL, TASK, T
 from edge_runtime.tests.test_commands import HOSTILE
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.vehicles.base import VehicleRunner
-from edge_runtime.wire import encode
+from edge_runtime.wire import Reason, Rejection, encode
 
 
-def test_a_flood_is_one_line_a_second_for_each_kind():
-    flood = Flood()
-    assert flood.admit("stale", 5.0) == 0
-    assert [flood.admit("stale", 5.0 + tenth / 10) for tenth in range(1, 10)] == [None] * 9
-    assert flood.admit("schema", 5.5) == 0
-    assert flood.admit("stale", 6.0) == 9
-    assert flood.admit("stale", 7.5) == 0
+def test_rejections_are_one_line_a_second_for_each_reason(monkeypatch):
+    lines = []
+    monkeypatch.setattr(log, "event", lambda level, name, **said: lines.append(said))
+    counts: Counter[str] = Counter()
+    one: Any = SimpleNamespace(_logged_rejection_s={}, _latest=SimpleNamespace(rejected=counts))
+    for tenth in range(11):
+        for reason in (Reason.STALE, Reason.SCHEMA)[: 1 + (tenth == 5)]:
+            counts[reason.value] += 1
+            ControlLoop._log_rejection(one, Rejection(reason, "why"), 5.0 + tenth / 10)
+    expected = [("stale", 1), ("schema", 1), ("stale", 11)]
+    assert [(said["reason"], said["so_far"]) for said in lines] == expected
 
 
 def test_the_hottest_sensor_counts_and_a_silent_one_does_not(tmp_path):

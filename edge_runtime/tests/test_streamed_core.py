@@ -21,7 +21,6 @@ from edge_runtime.vehicles.core import (
     State,
 )
 from edge_runtime.vehicles.mapping import wish_of
-from edge_runtime.vehicles.ros2 import ROS2_LEADS_TO
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -236,13 +235,12 @@ def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
     assert rig.words == []
 
 
-def after(state, event, leads_to=LEADS_TO):
-    return leads_to[event].get(state, state)
+def after(state, event):
+    return LEADS_TO[event].get(state, state)
 
 
-@pytest.mark.parametrize("leads_to", [LEADS_TO, ROS2_LEADS_TO])
-def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop(leads_to):
-    ways = {(event, *way) for event in Event for way in leads_to[event].items()}
+def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
+    ways = {(event, *way) for event in Event for way in LEADS_TO[event].items()}
     assert all(before is not then for _, before, then in ways)
     assert {event for event, _, then in ways if then is State.ENABLED} == {Event.CONFIRMED}
     out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
@@ -262,7 +260,7 @@ def test_the_core_goes_where_the_table_says(rig, state, event):
     core.set_point.speed_mps = 1.0
     core._wish = core_wish = wish_of(PEDAL, None)
     core._apply(Finding(event, "why"), rig.now_s)
-    leads_to = after(state, event, core.leads_to)
+    leads_to = after(state, event)
     assert core.state is leads_to
     if leads_to is State.STOPPED and state is not State.STOPPED:
         assert (core.cause, core.words) == (event, "why")

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -15,7 +16,7 @@ from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
-from edge_runtime.service import WINDOW, LatencyWindow
+from edge_runtime.service import quantiles_ms
 from edge_runtime.util import UserError, printable, read_bytes
 
 
@@ -100,14 +101,17 @@ def test_run_cli_turns_errors_into_one_line(capsys):
         run_cli(partial(fails, OSError("about a socket")), [])
 
 
-def test_the_latency_window_forgets():
-    window = LatencyWindow()
-    assert window.summary_ms() == {"p50": 0.0, "p99": 0.0, "max": 0.0}
-    window.add(10**9)
-    assert window.summary_ms()["max"] == 1000.0
-    for _ in range(WINDOW):
-        window.add(2_000_000)
-    assert window.summary_ms() == {"p50": 2.0, "p99": 2.0, "max": 2.0}
+def test_a_hold_where_the_file_system_has_no_locks_holds_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "hold"
+    path.touch()
+    hold = Hold(str(path))
+    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
+    assert not hold.is_on()
+
+
+def test_quantiles_of_durations():
+    assert quantiles_ms([]) == {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    assert quantiles_ms([2_000_000] * 200 + [10**9]) == {"p50": 2.0, "p99": 2.0, "max": 1000.0}
 
 
 READERS = {
@@ -209,6 +213,17 @@ def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number,
                 signal.raise_signal(number)
             assert asked == [number]
     assert [signal.getsignal(each) for each in cli.SIGNALS] == before
+
+
+def test_outside_of_the_main_thread_no_signal_is_touched():
+    before = [signal.getsignal(each) for each in cli.SIGNALS]
+
+    def enter():
+        with cli.quit_on_signals(lambda: True):
+            return [signal.getsignal(each) for each in cli.SIGNALS]
+
+    with ThreadPoolExecutor(1) as thread:
+        assert thread.submit(enter).result() == before
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda number, frame: None])

@@ -14,7 +14,7 @@ import abc
 import math
 from collections import deque
 from enum import Enum
-from typing import ClassVar, Deque, Dict, List, NamedTuple, Optional, Tuple
+from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
@@ -83,7 +83,7 @@ LEADS_TO: Dict[Event, Dict[State, State]] = {
     Event.LOCKED: {_E: _X},
     Event.FAULT: {_E: _X},
     Event.SILENT: {_E: _X},
-    Event.LYING: {_E: _X},
+    Event.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
     Event.STUCK: {_E: _X},
     Event.BUS: {_G: _X, _E: _X},
     Event.FOREIGN: {_G: _X, _E: _X},
@@ -162,8 +162,6 @@ class SpeedWatch:
 
 class StreamedCore(abc.ABC):
     """The state machine, and what is asked for. `heard` is what the vehicle said of itself."""
-
-    leads_to: ClassVar[Dict[Event, Dict[State, State]]] = LEADS_TO
 
     def __init__(self, similarity: Similarity, heard: Speeds) -> None:
         self.state = State.DISABLED
@@ -246,17 +244,13 @@ class StreamedCore(abc.ABC):
     def _steering(self) -> float:
         """The steering in -1 to 1 that the vehicle reports."""
 
-    def _lie(self) -> Optional[Finding]:
-        """LYING where the newest feedback cannot be, and it was not refused when it came."""
-        return None
-
     def _obstacles(self, now_s: float) -> List[str]:
         """In words what stands between the vehicle and our commands."""
         silence = self._silence(-math.inf, now_s)
         return [silence.words] if silence else []
 
     def _apply(self, finding: Finding, now_s: float) -> None:
-        after = self.leads_to[finding.event].get(self.state, self.state)
+        after = LEADS_TO[finding.event].get(self.state, self.state)
         if after is self.state:
             return
         self.cause, self.words = None, ""
@@ -272,7 +266,7 @@ class StreamedCore(abc.ABC):
             self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
         if self.state is not State.ENABLED:
             return
-        found = self._silence(self._since_s, now_s) or self._lie()
+        found = self._silence(self._since_s, now_s)
         if found is None and now_s > self.late_at_s:
             found = Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
         asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps

@@ -73,28 +73,10 @@ SPECS: Dict[str, HunterSpec] = {
 }
 
 
-class ScenarioCar(Car, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The car that a policy was trained on, and how it turns."""
-
-    def curvature(self, steering: float) -> float:
-        """Path curvature (1/m, positive to the left) of a steering action in -1 to 1.
-
-        highway-env's bicycle turns about its centre: slip b = atan(tan(angle) / 2), and a heading
-        rate of v sin(b) / (wheelbase / 2).
-        """
-        slip_rad = math.atan(0.5 * math.tan(steering * self.full_steering_rad))
-        return math.sin(slip_rad) / (0.5 * self.wheelbase_m)
-
-    def steering(self, curvature: float) -> float:
-        """The steering action of a path; not clamped. Inverse of the above."""
-        slip_rad = math.asin(clamp(0.5 * self.wheelbase_m * curvature, 1.0))
-        return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
-
-
 class Similarity(NamedTuple):
     """A robot in the place of a scenario's car. `scale`: its metres for one of the scenario."""
 
-    car: ScenarioCar
+    car: Car
     spec: HunterSpec
     scale: float
 
@@ -145,7 +127,7 @@ class Similarity(NamedTuple):
         }
 
 
-def similarity_to(car: ScenarioCar, spec: HunterSpec, scale: Optional[float] = None) -> Similarity:
+def similarity_to(car: Car, spec: HunterSpec, scale: Optional[float] = None) -> Similarity:
     """The similarity of a robot; by default its top speed is the car's top speed."""
     return Similarity(car, spec, spec.max_speed_mps / car.max_speed_mps if scale is None else scale)
 
@@ -159,7 +141,7 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     model: str = "2.0"
     scale: Optional[float] = None
-    car: Optional[ScenarioCar] = None
+    car: Optional[Car] = None
 
     def similarity(self, vehicle: str, manifest: Manifest) -> Similarity:
         """From the policy's car to this vehicle. Raises UserError where one of them is not known,
@@ -183,8 +165,7 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
                 words = "above 0 and below 1.5 rad, or below 0 and above -1.5"
             if not fits:
                 raise UserError(f"{table}: {name} {value} is not valid: it must be {words}")
-        car = ScenarioCar(**msgspec.structs.asdict(given))
-        return similarity_to(car, SPECS[self.model], self.scale)
+        return similarity_to(given, SPECS[self.model], self.scale)
 
 
 class Wish(NamedTuple):

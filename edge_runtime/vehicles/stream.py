@@ -11,12 +11,13 @@ from __future__ import annotations
 import abc
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, ClassVar, Dict, Mapping, Optional, Type
+from collections import deque
+from typing import TYPE_CHECKING, Any, Callable, ClassVar, Deque, Dict, Mapping, Optional, Type
 
 from edge_runtime import log
 from edge_runtime.config import convert
 from edge_runtime.controller import Limits
-from edge_runtime.service import LatencyWindow
+from edge_runtime.service import WINDOW, quantiles_ms
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
 from edge_runtime.vehicles.mapping import RobotSettings
@@ -31,7 +32,8 @@ _JOIN_S = 0.5
 class StreamedVehicle(Vehicle):
     """A core behind a lock, and the stream that sends what it asks for.
 
-    It is made of its settings and the similarity of its robot to the policy's car.
+    It is made of its settings and the similarity of its robot to the policy's car. Whoever derives
+    from it starts the stream at the end of `__init__`: nothing leaves before `enable`.
     """
 
     settings_type: ClassVar[Type[RobotSettings]]
@@ -71,7 +73,6 @@ class StreamedVehicle(Vehicle):
         with self._lock:
             self._core.follow_period(self.control_period_s)
             self._core.enable(now_s)
-        self._start()
         self._stream.wake()
 
     def command(
@@ -118,9 +119,6 @@ class StreamedVehicle(Vehicle):
     def _leave(self) -> None:
         """The stream has ended: give control back, and free what is held."""
 
-    def _start(self) -> None:
-        self._stream.start()
-
     def _is_at_rest(self) -> bool:
         with self._lock:
             return self._core.is_at_rest(time.monotonic())
@@ -142,13 +140,12 @@ class Stream:
         self._wake = threading.Event()
         self._stopping = False
         self._sent_s: Optional[float] = None
-        self._gaps = LatencyWindow()
+        self._gaps_ns: Deque[int] = deque(maxlen=WINDOW)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin; nothing where it has begun."""
-        if self._thread.ident is None:
-            self._thread.start()
+        """Begin."""
+        self._thread.start()
 
     def wake(self) -> None:
         """Send now: somebody brakes."""
@@ -164,14 +161,13 @@ class Stream:
         """End the thread; one that hangs in `send` is left alone."""
         self._stopping = True
         self._wake.set()
-        if self._thread.ident is not None:
-            self._thread.join(_JOIN_S)
+        self._thread.join(_JOIN_S)
 
     def gaps_ms(self) -> Dict[str, float]:
         """Quantiles of the times between two sendings, as words for the log; none, none."""
         if self._sent_s is None:
             return {}
-        return {f"gap_{name}_ms": round(ms, 2) for name, ms in self._gaps.summary_ms().items()}
+        return {f"gap_{name}_ms": round(ms, 2) for name, ms in quantiles_ms(self._gaps_ns).items()}
 
     def _run(self) -> None:
         next_s = time.monotonic()
@@ -182,7 +178,7 @@ class Stream:
             now_s = time.monotonic()
             if sent:
                 if self._sent_s is not None:
-                    self._gaps.add(int((now_s - self._sent_s) * 1e9))
+                    self._gaps_ns.append(int((now_s - self._sent_s) * 1e9))
                 self._sent_s = now_s
                 if now_s - began_s > PERIOD_S:
                     # A process that was stopped in between has sent what was asked for before.

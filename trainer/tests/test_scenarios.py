@@ -11,7 +11,7 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from bridge.environments import CONDITIONS as SERVED
 from bridge.environments import describe
-from edge_runtime.vehicles.mapping import ScenarioCar
+from edge_runtime.manifest import Car
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.scenarios import SCENARIOS
@@ -163,7 +163,7 @@ def test_the_jam_is_closer_and_less_even():
 @every_scenario
 def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
     env = make_environment(scenario)
-    car, config = ScenarioCar(**env.car), env.config
+    car, config = Car(**env.car), env.config
     if scenario == "left_turn":
         wanted = config.throttle_mps2, config.max_speed_mps, EgoVehicle.MAX_STEERING_RAD
     else:  # its +1 turns right
@@ -180,7 +180,7 @@ def test_the_curvature_is_the_bicycles_own():
     way_m = math.hypot(*ego.position)
     assert way_m == pytest.approx(0.4)
     # Its y axis points down: positive turns right.
-    car = ScenarioCar(**make_environment("congestion").car)
+    car = Car(**make_environment("congestion").car)
     assert -ego.heading / way_m == pytest.approx(car.curvature(0.5))
 
 

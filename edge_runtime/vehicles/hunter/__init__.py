@@ -26,7 +26,6 @@ from typing import Any, ClassVar, Dict, NamedTuple, Optional, Type
 from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import (
@@ -217,23 +216,18 @@ class HunterVehicle(StreamedVehicle):
         super().__init__(HunterCore(similarity, profile))
         self._stopping = False
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
+        self._stream.start()
+        self._listener.start()
 
     def enable(self, now_s: float) -> None:
         """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
         self._gate.open()  # the core gives no frame before it is enabled
         super().enable(now_s)
 
-    def feedback(self, now_s: float) -> VehicleReport:
-        """From the newest frames of the chassis, which it listens to before `enable`, too."""
-        if not self._closed:
-            self._start()
-        return super().feedback(now_s)
-
     def _leave(self) -> None:
         """Lock the brake, give control back, and leave the bus."""
         self._stopping = True
-        if self._listener.ident is not None:
-            self._listener.join(_JOIN_S)
+        self._listener.join(_JOIN_S)
         with self._lock:
             parts = self._core.close(time.monotonic())
         try:
@@ -242,11 +236,6 @@ class HunterVehicle(StreamedVehicle):
         except Exception as error:  # the chassis stops by itself, and the bus must be freed
             log.event("warning", "hunter_not_parked", detail=error)
         self._bus.shutdown()
-
-    def _start(self) -> None:
-        super()._start()
-        if self._listener.ident is None:
-            self._listener.start()
 
     def _send_due(self) -> bool:
         with self._lock:
@@ -263,7 +252,6 @@ class HunterVehicle(StreamedVehicle):
         return bool(parts)
 
     def _listen(self) -> None:
-        self._skip_the_past()
         while not self._stopping:
             try:
                 message = self._bus.recv(_LISTEN_S)
@@ -273,15 +261,6 @@ class HunterVehicle(StreamedVehicle):
                 continue
             if message is not None:
                 self._hear(message)
-
-    def _skip_the_past(self) -> None:
-        """Drop what waited in the bus since it was opened: it would be taken for fresh."""
-        end_s = time.monotonic() + PERIOD_S  # of a flood some will be left
-        try:
-            while time.monotonic() < end_s and self._bus.recv(0.0) is not None:
-                pass
-        except Exception as error:  # as in _send_due
-            self._note_bus(error)
 
     def _hear(self, message: Any) -> None:
         if message.is_error_frame:

@@ -123,7 +123,7 @@ class Reports(Speeds):
             return Finding(Event.STANDBY, f"the chassis is in {name}, not under CAN control")
         if status.brake:
             return Finding(Event.LOCKED, "the chassis has locked its brake")
-        return None
+        return self.lie()
 
     def _count(self, counter: int, now_s: float) -> None:
         """A status is a sign of life where its counter is ahead of all before, or it was silent.
@@ -185,7 +185,7 @@ class HunterCore(StreamedCore):
         elif can_id == protocol.MOTION_STATUS.can_id:
             # At once, not with the next tick: else the runtime's own watch would stop it first,
             # and what it then says is over with the lie.
-            lie = self._lie()
+            lie = self.reports.lie()
             if lie is not None:
                 self._apply(lie, now_s)
 
@@ -248,9 +248,6 @@ class HunterCore(StreamedCore):
 
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         return self.reports.silence(since_s, now_s)
-
-    def _lie(self) -> Optional[Finding]:
-        return self.reports.lie()
 
     def _requests(self, now_s: float) -> List[Sent]:
         """Beside the stream: for control while ENABLING, for the brake while STOPPED."""

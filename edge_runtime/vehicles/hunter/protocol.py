@@ -84,41 +84,39 @@ class MotorSlow(NamedTuple):
     status: int
 
 
-class Field(NamedTuple):
-    """Where a number stands: first byte, struct code, and what one count of it is worth."""
-
-    offset: int
-    code: str
-    per_count: Optional[float] = None  # None: a plain integer
-
-
 class Frame(NamedTuple):
-    """A row of the table. `fields` are in the order of the message's; bytes without one are 0."""
+    """A row of the table. `layout` is struct's: a letter for each field of the message, and x for a
+    byte that is 0. `worth`: of one count of each field; 1 of a plain integer.
+    """
 
     can_id: int
     message: Type[Any]
-    length: int
-    fields: Tuple[Field, ...]
+    layout: str
+    worth: Tuple[float, ...]
     period_s: Optional[float] = None  # None: sent when something happens
+
+    @property
+    def length(self) -> int:
+        """Of its data, in bytes."""
+        return struct.calcsize(self.layout)
 
 
 _MILLI, _TENTH = 0.001, 0.1
-_MOTION = (Field(0, "h", _MILLI), Field(6, "h", _MILLI))
-_FAST = (Field(0, "h"), Field(2, "h", _TENTH), Field(4, "i"))
-_SLOW = (Field(0, "H", _TENTH), Field(2, "h"), Field(4, "b"), Field(5, "B"))
-_STATUS = (
-    Field(0, "B"), Field(1, "B"), Field(2, "H", _TENTH), Field(4, "H"), Field(6, "B"), Field(7, "B")
-)  # fmt: skip
+_BYTE = (">B", (1,))
+_MOTION = (">h4xh", (_MILLI, _MILLI))
+_FAST = (">hhi", (1, _TENTH, 1))
+_SLOW = (">HhbB2x", (_TENTH, 1, 1, 1))
+_STATUS = (">BBHHBB", (1, 1, _TENTH, 1, 1, 1))
 
-MOTION_COMMAND = Frame(0x111, MotionCommand, 8, _MOTION, 0.02)
-BRAKE_COMMAND = Frame(0x131, BrakeCommand, 1, (Field(0, "B"),))
-MODE_COMMAND = Frame(0x421, ModeCommand, 1, (Field(0, "B"),))
-CLEAR_COMMAND = Frame(0x441, ClearCommand, 1, (Field(0, "B"),))
-SYSTEM_STATUS = Frame(0x211, SystemStatus, 8, _STATUS, 0.1)
-MOTION_STATUS = Frame(0x221, MotionStatus, 8, _MOTION, 0.02)
+MOTION_COMMAND = Frame(0x111, MotionCommand, *_MOTION, 0.02)
+BRAKE_COMMAND = Frame(0x131, BrakeCommand, *_BYTE)
+MODE_COMMAND = Frame(0x421, ModeCommand, *_BYTE)
+CLEAR_COMMAND = Frame(0x441, ClearCommand, *_BYTE)
+SYSTEM_STATUS = Frame(0x211, SystemStatus, *_STATUS, 0.1)
+MOTION_STATUS = Frame(0x221, MotionStatus, *_MOTION, 0.02)
 _MOTORS = ("steering", "rear right", "rear left")
-MOTORS_FAST = [Frame(0x251 + place, MotorFast, 8, _FAST, 0.02) for place in range(len(_MOTORS))]
-MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, 8, _SLOW, 0.1) for place in range(len(_MOTORS))]
+MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST, 0.02) for place in range(len(_MOTORS))]
+MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW, 0.1) for place in range(len(_MOTORS))]
 STEER_MOTOR_FAST, REAR_RIGHT_FAST, REAR_LEFT_FAST = MOTORS_FAST
 STEER_MOTOR_SLOW, REAR_RIGHT_SLOW, REAR_LEFT_SLOW = MOTORS_SLOW
 
@@ -141,14 +139,13 @@ def encode(frame: Frame, message: Any) -> bytes:
 
     Raises ValueError for a number that is not finite: no count stands for it.
     """
-    data = bytearray(frame.length)
-    for field, value in zip(frame.fields, message):
+    counts = []
+    for code, worth, value in zip(filter(_RANGES.__contains__, frame.layout), frame.worth, message):
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for the bus")
-        low, high = _RANGES[field.code]
-        counts = value if field.per_count is None else value / field.per_count
-        _PACKERS[field.code].pack_into(data, field.offset, round(min(max(counts, low), high)))
-    return bytes(data)
+        low, high = _RANGES[code]
+        counts.append(round(min(max(value / worth, low), high)))
+    return struct.pack(frame.layout, *counts)
 
 
 def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
@@ -163,11 +160,8 @@ def decode(can_id: int, data: bytes) -> Any:
     frame = FRAMES.get(can_id)
     if frame is None or len(data) != frame.length:
         return None
-    values: List[float] = []
-    for field in frame.fields:
-        (count,) = _PACKERS[field.code].unpack_from(data, field.offset)
-        values.append(count if field.per_count is None else count * field.per_count)
-    return frame.message(*values)
+    counts = struct.unpack(frame.layout, data)
+    return frame.message(*(count * worth for count, worth in zip(counts, frame.worth)))
 
 
 _RANGES: Dict[str, Tuple[int, int]] = {
@@ -177,7 +171,6 @@ _RANGES: Dict[str, Tuple[int, int]] = {
     "H": (0, 2**16 - 1),
     "i": (-(2**31), 2**31 - 1),
 }
-_PACKERS: Dict[str, struct.Struct] = {code: struct.Struct(f">{code}") for code in _RANGES}
 
 
 # While nobody streams, the chassis misses its upper computer: only a fault once we stream.

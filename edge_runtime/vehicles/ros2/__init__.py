@@ -14,9 +14,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from typing import TYPE_CHECKING, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type
-
-import zenoh
+from typing import TYPE_CHECKING, Callable, ClassVar, List, NamedTuple, Optional, Type
 
 from edge_runtime import log
 from edge_runtime.config import check_choice
@@ -25,7 +23,6 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import (
     ENABLE_TIMEOUT_S,
     IMPOSSIBLE,
-    LEADS_TO,
     Event,
     Finding,
     Speeds,
@@ -47,12 +44,6 @@ _MAX_CHARS = 200
 
 # Below this the path's curvature, yaw rate over speed, is more noise than steering.
 STEERS_FROM_MPS = 0.2
-
-# Odometry that cannot be confirms nothing, and need not be waited for.
-ROS2_LEADS_TO = {
-    **LEADS_TO,
-    Event.LYING: {State.ENABLING: State.STOPPED, State.ENABLED: State.STOPPED},
-}
 
 
 def check_ros_name(name: str, what: str = "ROS name") -> str:
@@ -79,28 +70,6 @@ def topic_key(namespace: str, topic: str) -> str:
     return joined
 
 
-def check_ros2_endpoint(endpoint: Optional[str]) -> None:
-    """Raise UserError for an endpoint (None is one that was not given) that cannot be used."""
-    if endpoint is not None and is_tls(check_endpoint(endpoint)):
-        raise UserError(
-            f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
-            " use tcp/ or udp/ on one machine, or inside a tunnel"
-        )
-
-
-def open_ros2_session(listen: Optional[str], connect: Optional[str]) -> zenoh.Session:
-    """Listen as a router (the default, on loopback), or go on connecting to a bridge as a peer.
-
-    Raises UserError for a busy port. The endpoints are checked already.
-    """
-    if connect is not None:
-        return open_session(connect=connect, mode="peer")
-    try:
-        return open_session(listen=listen or DEFAULT_ROS2_ENDPOINT, mode="router")
-    except UserError as error:
-        raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
-
-
 class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
     """`config.example.toml` documents each key. A topic that is empty is not published."""
 
@@ -121,7 +90,11 @@ def check_settings(settings: Ros2Settings) -> None:
     if settings.listen is not None and settings.connect is not None:
         raise UserError("ros2 has both listen and connect: give one of them")
     for endpoint in (settings.listen, settings.connect):
-        check_ros2_endpoint(endpoint)
+        if endpoint is not None and is_tls(check_endpoint(endpoint)):
+            raise UserError(
+                f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
+                " use tcp/ or udp/ on one machine, or inside a tunnel"
+            )
     if not settings.twist_topic and not settings.ackermann_topic:
         raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
     if not settings.odometry_topic:
@@ -141,8 +114,6 @@ class Motion(NamedTuple):
 
 class Ros2Core(StreamedCore):
     """The state machine, what was heard, and what is asked for."""
-
-    leads_to = ROS2_LEADS_TO
 
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         super().__init__(similarity, Speeds())
@@ -230,7 +201,14 @@ class Ros2Vehicle(StreamedVehicle):
         super().__init__(Ros2Core(settings, similarity))
         self._failing = False
         self._publish: List[Callable[[Motion], None]] = []
-        self._session = open_ros2_session(settings.listen, settings.connect)
+        # A router (by default on loopback), or a peer that goes on connecting to a bridge.
+        connect, listen = settings.connect, None
+        if connect is None:
+            listen = settings.listen or DEFAULT_ROS2_ENDPOINT
+        try:
+            self._session = open_session(listen, connect, "peer" if connect else "router")
+        except UserError as error:
+            raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
         try:
             self._node = node = ros.Ros2Node(self._session, settings.namespace)
             if settings.twist_topic:
@@ -247,19 +225,13 @@ class Ros2Vehicle(StreamedVehicle):
         except BaseException:
             self._session.close()  # An open session would hang the process at its exit.
             raise
-
-    @property
-    def rejected(self) -> Dict[str, int]:
-        """Odometry that could not be read or was not new, by reason."""
-        counts = dict(self._node.rejected)
-        if self._core.stale:
-            counts["stale"] = self._core.stale
-        return counts
+        self._stream.start()
 
     def _leave(self) -> None:
         try:
-            if self.rejected:
-                log.event("info", "ros2_odometry_rejected", **self.rejected)
+            rejected = {**self._node.rejected, "stale": self._core.stale}
+            if any(rejected.values()):
+                log.event("info", "ros2_odometry_rejected", **rejected)
             self._node.close()
         finally:
             with self._lock:

@@ -12,15 +12,15 @@ annotations` here: pycdr2 reads the annotations, also on Python 3.8.
 
 import math
 import struct
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Tuple, Type, TypeVar, Union
+from dataclasses import dataclass, field, is_dataclass
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Type, TypeVar, Union
 
 import zenoh
 
 from edge_runtime.transport import only_own
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2 import STEERING, Motion, topic_key
-from edge_runtime.wire import Reason, Rejection
+from edge_runtime.wire import Reason
 
 try:
     from pycdr2 import IdlStruct
@@ -175,42 +175,36 @@ def encode(message: IdlStruct) -> bytes:
     return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
 
 
-def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
+def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Reason]:
     """A message of that kind, all of whose numbers are finite, or why not. Never raises."""
     if len(payload) > MAX_PAYLOAD_BYTES:
-        detail = f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
-        return Rejection(Reason.OVERSIZED, detail)
+        return Reason.OVERSIZED
     if len(payload) < HEADER_BYTES:
-        return Rejection(Reason.MALFORMED, f"{len(payload)} bytes are no CDR")
+        return Reason.MALFORMED
     (representation,) = struct.unpack_from(">H", payload)
     if representation not in (CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN):
-        return Rejection(Reason.SCHEMA, f"CDR of kind {representation:#06x}, not plain CDR")
+        return Reason.SCHEMA
     buffer = Buffer(payload, align_offset=HEADER_BYTES)
     try:
         # A buffer of our own in place of the bytes, to see where the message ends.
         message: _M = kind.deserialize(buffer)  # type: ignore[arg-type]
-    except _DECODE_ERRORS as error:
-        return Rejection(Reason.MALFORMED, str(error))
+    except _DECODE_ERRORS:
+        return Reason.MALFORMED
     # pycdr2 takes a text or data that is cut off for a short one; and the type is not in the
     # payload: what is left over is the mark of another one.
     if not 0 <= len(payload) - buffer.tell() < _ALIGNMENT:
-        detail = f"{len(payload)} bytes, the {kind.__name__} ends at {buffer.tell()}"
-        return Rejection(Reason.MALFORMED, detail)
-    for name, value in _leaves(message, ""):
-        if isinstance(value, float) and not math.isfinite(value):
-            return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
-    return message
+        return Reason.MALFORMED
+    return message if all(map(math.isfinite, _floats(message))) else Reason.NOT_FINITE
 
 
-def _leaves(value: Any, name: str) -> Iterator[Tuple[str, Any]]:
-    if isinstance(value, (list, tuple)):
-        for number in value:
-            yield name, number
-    elif hasattr(value, "__dataclass_fields__"):
-        for part in value.__dataclass_fields__:
-            yield from _leaves(getattr(value, part), f"{name}.{part}" if name else part)
-    else:
-        yield name, value
+def _floats(value: Any) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, (list, tuple)):  # a covariance
+        yield from value
+    elif is_dataclass(value):
+        for part in vars(value).values():
+            yield from _floats(part)
 
 
 def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
@@ -281,11 +275,11 @@ class Ros2Node:
         key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            message: Union[_M, Rejection] = Rejection(Reason.OVERSIZED, "")
+            message: Union[_M, Reason] = Reason.OVERSIZED
             if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
                 message = decode(sample.payload.to_bytes(), kind)
-            if isinstance(message, Rejection):
-                self.rejected[message.reason.value] = self.rejected.get(message.reason.value, 0) + 1
+            if isinstance(message, Reason):
+                self.rejected[message.value] = self.rejected.get(message.value, 0) + 1
             else:
                 take(message)
 
