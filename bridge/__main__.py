@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime, and report"),
@@ -17,17 +17,13 @@ COMMANDS = {
     "repair": ("bridge.record:REPAIR", "save what is whole of a cut-off or damaged recording"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }
-EXAMPLE = examples(
+main = program(
+    "python -m bridge",
+    "The simulator's side of the wire.",
+    COMMANDS,
     "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime",
     "python -m bridge view --serve",
 )
-
-
-def main(argv: list[str]) -> int:
-    """Run one of the commands and return its exit status."""
-    parser = ArgumentParser(prog="python -m bridge", description=__doc__, epilog=EXAMPLE)
-    return dispatch(parser, COMMANDS, argv)
-
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "keys": ("deploy.certs:KEYS", "make a key pair that signs policies and bundles"),
@@ -17,19 +17,14 @@ COMMANDS = {
 }
 
 
-def main(argv: list[str]) -> int:
-    """Run one command; the exit status."""
-    parser = ArgumentParser(
-        prog="python -m deploy",
-        description="Prepares what goes onto the board, and brings it there.",
-        epilog=examples(
-            "python -m deploy keys --out keys",
-            "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
-            "    --public-key results/policies/policy.pub --target jetpack5",
-        ),
-    )
-    return dispatch(parser, COMMANDS, argv)
-
+main = program(
+    "python -m deploy",
+    "Prepares what goes onto the board, and brings it there.",
+    COMMANDS,
+    "python -m deploy keys --out keys",
+    "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+    "    --public-key results/policies/policy.pub --target jetpack5",
+)
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import List
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "check": ("edge_runtime.commands:CHECK", "say whether a policy may drive, and how fast it is"),
@@ -15,19 +14,15 @@ COMMANDS = {
 }
 
 
-def main(argv: List[str]) -> int:
-    """Run one of the commands and return its exit status."""
-    trusted = "my.onnx \\\n    --public-key keys/policy.pub"
-    parser = ArgumentParser(
-        prog="python -m edge_runtime",
-        description="Drives a verified policy over Zenoh, and stops safely when in doubt.",
-        epilog=examples(
-            f"python -m edge_runtime check {trusted}",
-            f"python -m edge_runtime run --policy {trusted}",
-            "python -m edge_runtime status",
-        ),
-    )
-    return dispatch(parser, COMMANDS, argv)
+_TRUSTED = "my.onnx \\\n    --public-key keys/policy.pub"
+main = program(
+    "python -m edge_runtime",
+    "Drives a verified policy over Zenoh, and stops safely when in doubt.",
+    COMMANDS,
+    f"python -m edge_runtime check {_TRUSTED}",
+    f"python -m edge_runtime run --policy {_TRUSTED}",
+    "python -m edge_runtime status",
+)
 
 
 def script() -> None:

@@ -102,31 +102,38 @@ class Command(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:
-    """Parse and run one of many commands; its exit status. Without a command, print the help.
+def program(
+    name: str, description: str, commands: Dict[str, Tuple[str, str]], *shown: str
+) -> Callable[[List[str]], int]:
+    """The `main(argv)` of many commands: runs one of them. `shown` are examples of the help.
 
     `commands` has for each name a place and one line on what it does. The place is a module with
     EXAMPLE, `add_arguments(parser)` and `run(arguments)`, or `module:name` of a `Command` in it.
     Only the command that is asked for is loaded: a mock of a chassis need not wait for torch.
     """
-    parser.add_argument("--version", action="version", version=__version__)
-    word = argv[0] if argv else "--help"
-    near = difflib.get_close_matches(word, commands, 1)
-    if near and near[0] != word:
-        parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
-    parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    chosen: Any = None
-    for name, (place, summary) in commands.items():
-        text = f"{summary[0].upper()}{summary[1:]}."
-        one = parsers.add_parser(name, help=summary, description=text)
-        if name == word:
-            module, _, member = place.partition(":")
-            chosen = import_module(module)
-            chosen = getattr(chosen, member) if member else chosen
-            one.epilog = chosen.EXAMPLE
-            chosen.add_arguments(one)
-    arguments = parser.parse_args(argv or ["--help"])
-    return int(chosen.run(arguments))
+
+    def main(argv: List[str]) -> int:
+        parser = ArgumentParser(prog=name, description=description, epilog=examples(*shown))
+        parser.add_argument("--version", action="version", version=__version__)
+        word = argv[0] if argv else "--help"
+        near = difflib.get_close_matches(word, commands, 1)
+        if near and near[0] != word:
+            parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
+        parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+        chosen: Any = None
+        for command, (place, summary) in commands.items():
+            text = f"{summary[0].upper()}{summary[1:]}."
+            one = parsers.add_parser(command, help=summary, description=text)
+            if command == word:
+                module, _, member = place.partition(":")
+                chosen = import_module(module)
+                chosen = getattr(chosen, member) if member else chosen
+                one.epilog = chosen.EXAMPLE
+                chosen.add_arguments(one)
+        arguments = parser.parse_args(argv or ["--help"])
+        return int(chosen.run(arguments))
+
+    return main
 
 
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:

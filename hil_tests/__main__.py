@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("hil_tests.doctor", "what this machine can and cannot do, and how to get the rest"),
@@ -19,15 +19,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-def main(argv: list[str]) -> int:
-    """Run one command; the exit status."""
-    parser = ArgumentParser(
-        prog="python -m hil_tests",
-        description="Proves the loop.",
-        epilog=examples("python -m hil_tests doctor", "python -m hil_tests demo"),
-    )
-    return dispatch(parser, COMMANDS, argv)
-
+main = program(
+    "python -m hil_tests", "Proves the loop.", COMMANDS,
+    "python -m hil_tests doctor", "python -m hil_tests demo",
+)  # fmt: skip
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

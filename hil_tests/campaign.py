@@ -18,11 +18,20 @@ from matplotlib.figure import Figure
 from bridge.environments import CONDITIONS, NOMINAL
 from bridge.progress import ProgressBar
 from bridge.report import markdown_table
-from edge_runtime.cli import add_public_key, examples, not_negative, positive, share
+from edge_runtime.cli import (
+    add_public_key,
+    examples,
+    not_negative,
+    positive,
+    share,
+    sigterm_as_interrupt,
+    whole_number,
+)  # fmt: skip
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests import sweep
+from hil_tests.faults.rows import Row
 from hil_tests.faults.run import choose_rows, run_faults
 from hil_tests.sweep import Found
 from trainer.options import add_scenario
@@ -48,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
     for name, kind, value, text in (
-        ("--runs", _several, 100, "episodes of each row, the same seeds"),
+        ("--runs", whole_number(2), 100, "episodes of each row, the same seeds"),
         ("--seed", not_negative, 0, "of the first episode"),
         ("--target", share, 0.98, "success that is asked for"),
     ):
@@ -63,18 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
-def _several(text: str) -> int:
-    count = positive(text)
-    if count < 2:
-        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
-    return count
-
-
+@sigterm_as_interrupt()  # whoever ends a campaign ends its processes
 def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
     check_report(out)
-    axes, faults = _choose(arguments)
+    axes, rows = _choose(arguments)
     jobs = arguments.jobs or cores()
     result: dict[str, Any] = {"command": _this_command()}
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
@@ -84,11 +87,11 @@ def run(arguments: argparse.Namespace) -> int:
         result["latency"] = latency
         text += ["## Latency", "", render_latency(latency)]
         print(latency["budget"]["sentence"])
-    if faults is not None:
-        with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
+    if rows:
+        with ProgressBar("faults", arguments.tries * len(rows)) as bar:
             found = run_faults(
-                arguments.tries, faults or None, policy, lambda row: bar.advance({"row": row}),
-                jobs, arguments.public_key,
+                rows, arguments.tries, policy, lambda row: bar.advance({"row": row}), jobs,
+                arguments.public_key,
             )  # fmt: skip
         result["faults"] = found
         text += ["## Faults", "", render_faults(found)]
@@ -98,11 +101,11 @@ def run(arguments: argparse.Namespace) -> int:
                     print(f"{row['name']}: {kind}: {what}")
         print("Every fault was met." if found["passed"] else "Not every fault was met.")
     write_report(out, result, text)
-    return 0 if faults is None or result["faults"]["passed"] else 1
+    return 0 if not rows or result["faults"]["passed"] else 1
 
 
-def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] | None]:
-    """The latency axes, and the faults by name ([]: all of them; None: no faults)."""
+def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[Row]]:
+    """The latency axes, and the rows of the fault table."""
     known = {axis.name: axis for axis in sweep.NETWORK_AXES}
     named = arguments.rows.split(",") if arguments.rows else []
     axes = [known[name] for name in named if name in known] if named else list(known.values())
@@ -113,9 +116,8 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] 
         if named and not faults:
             raise UserError(f"{arguments.rows} names latency axes, no fault")
         axes = []
-    choose_rows(faults)  # now, not after the hours of the latency rows
     without_faults = arguments.only == "latency" or (named and not faults)
-    return axes, None if without_faults else faults
+    return axes, [] if without_faults else choose_rows(faults or ["*"])
 
 
 def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:
@@ -149,7 +151,9 @@ def run_latency(
         "budget": sweep.budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
     }
-    return {**latency, "figures": write_figures(out, latency)}
+    picture = out.with_name(f"{out.stem}_success.png")
+    write_figure(draw_axes(latency), picture)
+    return {**latency, "figures": {"success": picture.name}}
 
 
 def check_report(out: Path) -> None:
@@ -255,14 +259,8 @@ def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
     return " / ".join(_number(value, digits) for value in found.values()) if found else "-"
 
 
-def write_figures(out: Path, swept: Found) -> dict[str, str]:
-    """Write a PNG beside ``out``, with a panel for each axis of a report's part; its name."""
-    name = f"{out.stem}_success.png"
-    write_figure(_draw_axes(swept), out.with_name(name))
-    return {"success": name}
-
-
-def _draw_axes(swept: Found) -> Figure:
+def draw_axes(swept: Found) -> Figure:
+    """A panel for each axis of a report's part."""
     axes, name = swept["axes"], Path(swept["policy"]).stem
     rows, columns = math.ceil(len(axes) / COLUMNS), min(COLUMNS, len(axes))
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")

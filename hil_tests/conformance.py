@@ -7,6 +7,7 @@ runtime calls it: by one thread. It will drive, with each action at its highest:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -69,7 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
             verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
             print(verdict, flush=True)
     finally:
-        bench.vehicle.close()
+        with contextlib.suppress(Exception):  # its own rule has said it
+            bench.vehicle.close()
         log.close()
     print(f"{bench.vehicle.name}: {len(RULES) - broken} rules kept, {broken} broken")
     return BROKEN if broken else 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import runpy
 import sys
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 FOLDERS = {
     "trainer": "train a policy with a human's help, evaluate and export it",
@@ -25,10 +25,6 @@ def _run(argv: list[str]) -> int:
     if argv and argv[0] in FOLDERS:
         sys.argv[1:] = argv[1:]
         runpy.run_module(argv[0], run_name="__main__", alter_sys=True)  # ends by itself
-    parser = ArgumentParser(
-        prog="phil",
-        description="Human-guided driving policies, from training to the board.",
-        epilog=examples("phil hil_tests demo", "phil trainer train --help"),
-    )
     commands = {name: (f"{name}.__main__", summary) for name, summary in FOLDERS.items()}
-    return dispatch(parser, commands, argv)
+    what = "Human-guided driving policies, from training to the board."
+    return program("phil", what, commands, "phil hil_tests demo", "phil trainer train --help")(argv)

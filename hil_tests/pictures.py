@@ -9,32 +9,29 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import shutil
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from bridge.recording import Recording
 from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
 from edge_runtime.cli import Command, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, read_bytes, read_json
-from hil_tests.campaign import write_figures
+from hil_tests.campaign import draw_axes
 from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
     Process,
     drive_shown,
     run_command,
-    wait_until,
 )
 from trainer.drivers import load_driver
 from trainer.environments import make_environment
@@ -116,11 +113,9 @@ def policy_sees(out: Path, _work: Path) -> None:
     write_figure(figure, out)
 
 
-def success_against_latency(out: Path, work: Path) -> None:
+def success_against_latency(out: Path, _work: Path) -> None:
     """The shipped policy behind worse and worse networks."""
-    report = read_json(SHIPPED, "latency report")
-    names = write_figures(work / SHIPPED.name, report["latency"])
-    shutil.copyfile(work / names["success"], out)
+    write_figure(draw_axes(read_json(SHIPPED, "latency report")["latency"]), out)
 
 
 def rerun_loop(out: Path, work: Path) -> None:
@@ -143,25 +138,10 @@ def rerun_training(out: Path, work: Path) -> None:
     write_atomic(out, screenshot(rrd, "step", sequence=last))
 
 
-def screenshot(rrd: Path, timeline: str, **moment: float) -> bytes:
-    """The viewer's window with this recording as a PNG.
+def screenshot(rrd: Path, timeline: str, **moment: Any) -> bytes:
+    """The window of rerun's viewer, without a screen, with this recording as a PNG.
 
     ``moment`` is where the cursor stands on the timeline, as ``ViewerClient.set_time`` takes it.
-    Raises UserError where the viewer does not start here.
-    """
-    with headless_viewer() as client:
-        client.open(str(rrd.resolve()))
-        time.sleep(LOADED_S)
-        client.set_time(timeline, **moment, play_state="paused")
-        time.sleep(DRAWN_S)
-        picture: bytes = client.take_screenshot()
-        return picture
-
-
-@contextlib.contextmanager
-def headless_viewer() -> Iterator[Any]:
-    """Rerun's viewer without a screen, as a ``ViewerClient`` that asks it for pictures.
-
     Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
     Raises UserError where it does not start here, or ends as soon as it is to draw.
     """
@@ -173,7 +153,13 @@ def headless_viewer() -> Iterator[Any]:
         try:
             viewer = Viewer([*options, "--port", str(port)], [port])
             stack.callback(viewer.end)
-            yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            client.open(str(rrd.resolve()))
+            time.sleep(LOADED_S)
+            client.set_time(timeline, **moment, play_state="paused")
+            time.sleep(DRAWN_S)
+            picture: bytes = client.take_screenshot()
+            return picture
         except (ConnectionError, ViewerGone) as error:
             needs = "it needs Vulkan, in software with apt install mesa-vulkan-drivers"
             raise UserError(f"rerun's viewer does not draw here ({error}): {needs}") from None
@@ -219,14 +205,15 @@ def _record(out: Path) -> None:
     simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
     record = ("bridge", "record", "--out", str(out), "--connect", endpoint)
     first = Process(*simulate, "--episodes", str(EPISODES))
-    with first, Process(*record, "--wait-s", "30", "--linger-s", "30") as recorder:
-        _wait_for_simulators(out, 1)
+    more = ("--wait-s", "30", "--linger-s", "30")
+    with first, Process(*record, *more, ready="recording") as recorder:
         run = ("edge_runtime", "run", *TRUST, "--connect", endpoint)
-        with Process(*run, ready="ready", shown=True):
+        with Process(*run, ready="ready", shown=True) as edge:
             first.succeed(PATIENCE_S)
+            edge.lines.clear()  # What follows is of the second one.
             realtime = ("--seed", str(EPISODES), "--clock", "realtime")
             with Process(*simulate, *realtime) as second:
-                _wait_for_simulators(out, 2)
+                edge.wait_for_line("now=drive", PATIENCE_S)
                 time.sleep(DRIVEN_BEFORE_S)
                 second.send(signal.SIGSTOP)
                 time.sleep(STOPPED_S)
@@ -234,18 +221,6 @@ def _record(out: Path) -> None:
                 second.succeed(PATIENCE_S)
         recorder.send(signal.SIGTERM)
         recorder.succeed(PATIENCE_S)
-
-
-def _wait_for_simulators(out: Path, count: int) -> None:
-    """Until so many simulators have come in all."""
-
-    def came() -> bool:
-        return out.exists() and count <= sum(
-            stored.channel.topic.endswith("/simulator") and b"true" in stored.message.data
-            for stored in Recording(out).messages()
-        )
-
-    wait_until(came, "the simulator", PATIENCE_S)
 
 
 PICTURES_COMMAND = Command(

@@ -141,8 +141,10 @@ class Process:
     def resident_mb(self) -> float:
         """Its resident memory now, MB (10^6 bytes), by the kernel's own count."""
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
-        kib = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
-        return kib * 1024 / 1e6
+        kib = [int(line.split()[1]) for line in lines if line.startswith("VmRSS:")]
+        if not kib:
+            raise UserError(f"{self.name} has ended")
+        return kib[0] * 1024 / 1e6
 
     def __enter__(self) -> Self:
         return self
@@ -244,11 +246,13 @@ def in_parallel(
     items: Sequence[Item],
     jobs: int,
     on_done: Callable[[Item, Result], None],
+    ended: threading.Event | None = None,
 ) -> None:
     """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
 
     In threads, which suits work that waits for processes. After a failure, and on ^C, what has not
-    begun is not begun any more, and every process that this one has started is asked to end.
+    begun is not begun any more, ``ended`` is set, and every process that this one has started is
+    asked to end.
     """
     with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
         futures = {pool.submit(work, item): item for item in items}
@@ -256,6 +260,8 @@ def in_parallel(
             for future in as_completed(futures):
                 on_done(futures[future], future.result())
         except BaseException:
+            if ended is not None:
+                ended.set()
             pool.shutdown(wait=False, cancel_futures=True)
             for children in Path("/proc/self/task").glob("*/children"):  # whichever thread waits
                 with contextlib.suppress(OSError):  # A thread or child that has just ended

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 from bridge.progress import ProgressBar
 from bridge.report import COLLISION, GOAL
-from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory, write_json
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, read_json
@@ -187,8 +186,7 @@ def drive_all(
         for one, path in paths.items()
         if path.is_file()
     }
-    # Whoever ends a campaign ends its processes.
-    with sigterm_as_interrupt(), ProgressBar("parts", len(parts), len(found)) as bar:
+    with ProgressBar("parts", len(parts), len(found)) as bar:
 
         def on_done(one: Part, results: list[dict[str, Any]]) -> None:
             found[one] = results

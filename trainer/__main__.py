@@ -2,7 +2,7 @@
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.training.command", "train a policy with human guidance"),
@@ -18,18 +18,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-def main(argv: list[str]) -> int:
-    """Run one command; the exit status."""
-    parser = ArgumentParser(
-        prog="python -m trainer",
-        description="Trains driving policies with human guidance, evaluates and exports them.",
-        epilog=examples(
-            "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
-            "python -m trainer evaluate runs/phil_1 --runs 50",
-        ),
-    )
-    return dispatch(parser, COMMANDS, argv)
-
+main = program(
+    "python -m trainer",
+    "Trains driving policies with human guidance, evaluates and exports them.",
+    COMMANDS,
+    "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
+    "python -m trainer evaluate runs/phil_1 --runs 50",
+)
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -177,9 +177,10 @@ def check_fits(target: Target) -> None:
         )
     if platform.machine() != target.machine:
         raise UserError(f"the bundle is for {target.machine}, this is {platform.machine()}")
-    name, _, version = (os.confstr("CS_GNU_LIBC_VERSION") or "another").partition(" ")
+    name, version = platform.libc_ver()
     if name != "glibc" or _numbers(version) < _numbers(target.glibc):
-        raise UserError(f"the bundle needs glibc {target.glibc}, this is {name} {version}")
+        found = f"{name or 'another'} {version}".rstrip()
+        raise UserError(f"the bundle needs glibc {target.glibc}, this is {found}")
 
 
 def _numbers(version: str) -> list[int]:

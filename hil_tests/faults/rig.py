@@ -50,7 +50,7 @@ _INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) .*motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
-_SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
+_SETTLED_PERIODS, _SETTLED_COMMANDS = 3.5, 3
 _REARM_EVERY_S = 2.0
 _HEALTH_S = 0.6  # Longer than a period of the health message
 _CHUNK_BYTES = 65536
@@ -282,11 +282,11 @@ class Rig:
         self._closing.callback(process.end)
 
     def _is_driving(self) -> bool:
-        now_s = time.monotonic()
-        recent = [c for c in self.timeline.commands[-10:] if now_s - c.seen_s < _SETTLED_S]
+        now_s, settled_s = time.monotonic(), _SETTLED_PERIODS * self.period_s
+        recent = [c for c in self.timeline.commands[-10:] if now_s - c.seen_s < settled_s]
         steady = len(recent) >= _SETTLED_COMMANDS and {c.mode for c in recent} == {"drive"}
         brakes = self.brakes()
-        fresh = now_s - self.last_drive_s() < _SETTLED_S
+        fresh = now_s - self.last_drive_s() < settled_s
         return steady and fresh and not (brakes and brakes[-1][1])
 
     def _start(self, name: str, *arguments: str) -> Process:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -28,7 +27,7 @@ from edge_runtime.tests.policies import T
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, stops_between
-from hil_tests.faults.rig import VEHICLE_ID, Rig, address
+from hil_tests.faults.rig import VEHICLE_ID, Rig
 from hil_tests.processes import Process, wait_until
 
 GAP = "longest gap between commands"
@@ -153,7 +152,7 @@ def sleep_until(time_s: float) -> None:
 
 
 LASTS_S = 1.0
-STALLED_S = 0.6
+STALL_PERIODS = 6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once."""
 BRIGHT_S = 0.5
 STARVED_S = 2.0
@@ -233,7 +232,7 @@ def link_stalled(rig: Rig, number: int) -> Try:
     rig.link.stall()
     stop = rig.logged_stop(begin_s)
     last_s = rig.link.last_state_s
-    sleep_until(begin_s + STALLED_S)
+    sleep_until(begin_s + STALL_PERIODS * rig.period_s)
     ended_s = time.monotonic()
     rig.link.restore()
     recovered_s = rig.recovered_after_s(ended_s)
@@ -250,7 +249,7 @@ def router_restarted(rig: Rig, number: int) -> Try:
     rig.router.kill()
     stop = rig.logged_stop(begin_s)
     rig.router = rig.start_router()
-    ended_s = wait_until(lambda: _listens_s(rig.edge_endpoint), "the new router")
+    ended_s = rig.router.wait_for_line("ready")
     reaction_s = stop.seen_s - rig.last_state_s(before_s=begin_s)
     return Try(reaction_s, rig.recovered_after_s(ended_s), stop.reason)
 
@@ -391,12 +390,3 @@ def _start_recorder(rig: Rig, number: int) -> tuple[Path, Process]:
     recorder = rig.start_recorder(path)
     recorder.wait_for_line("recording")
     return path, recorder
-
-
-def _listens_s(endpoint: str) -> float | None:
-    """Now, if somebody listens there."""
-    try:
-        socket.create_connection(address(endpoint), timeout=0.1).close()
-    except OSError:
-        return None
-    return time.monotonic()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -63,8 +64,8 @@ class Outcome:
 
 
 def run_faults(
+    chosen: Sequence[Row],
     tries: int,
-    rows: Sequence[str] | None = None,
     policy: Path = POLICY,
     on_try: Callable[[str], None] = lambda row: None,
     jobs: int = 2,
@@ -72,13 +73,10 @@ def run_faults(
 ) -> dict[str, Any]:
     """Do every row ``tries`` times; a report for JSON.
 
-    ``rows`` are names of the table's rows, or patterns of them (``hunter_*``); None for all. An
-    exported ``policy`` is verified with ``public_key``.
-    ``on_try`` is called with the row's name after every try. ``jobs`` rigs run at once; rows that
-    need the machine for themselves run after the others. Raises UserError for a row that the table
-    does not hold, or no policy.
+    An exported ``policy`` is verified with ``public_key``. ``on_try`` is called with the row's name
+    after every try. ``jobs`` rigs run at once; rows that need the machine for themselves run after
+    the others. Raises UserError where there is no policy.
     """
-    chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
     given = load_policy(policy, public_key, allow_unsigned=True).manifest
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
@@ -89,14 +87,16 @@ def run_faults(
             POLICIES[kind](path)
             policies[kind] = trusting(path, None)
         outcomes: dict[str, Outcome] = {}
+        ended = threading.Event()
         for alone in (False, True):
             in_parallel(
                 lambda row: run_row(
-                    row, policies[row.policy], task_of(row, given), work, tries, on_try
+                    row, policies[row.policy], task_of(row, given), work, tries, on_try, ended
                 ),
                 [row for row in chosen if row.alone == alone],
                 1 if alone else jobs,
                 lambda row, outcome: outcomes.update({row.name: outcome}),
+                ended,
             )
     found = [report_row(row, outcomes[row.name], later_s(task_of(row, given))) for row in chosen]
     return {
@@ -108,11 +108,14 @@ def run_faults(
     }
 
 
-def choose_rows(names: Sequence[str] | None) -> list[Row]:
-    """The rows of these names or patterns, in the table's order; UserError where one fits none."""
+def choose_rows(names: Sequence[str]) -> list[Row]:
+    """The rows of these names or patterns (``hunter_*``), in the table's order.
+
+    UserError where one fits none.
+    """
     known = [row.name for row in ROWS]
     chosen: set[str] = set()
-    for name in ["*"] if names is None else names:
+    for name in names:
         if not (found := fnmatch.filter(known, name)):
             raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
         chosen.update(found)
@@ -131,10 +134,14 @@ def run_row(
     work: Path,
     tries: int,
     on_try: Callable[[str], None],
+    ended: threading.Event,
 ) -> Outcome:
-    """All tries of a row, each rig in a directory in ``work``; one that hangs is replaced."""
+    """All tries of a row, each rig in a directory in ``work``; one that hangs is replaced.
+
+    Once the campaign has ``ended``, no more are begun.
+    """
     outcome, number = Outcome(), 0
-    while number < tries:
+    while number < tries and not ended.is_set():
         with Rig(trust, Path(tempfile.mkdtemp(dir=work)), task, **row.rig) as rig:
             going = True
             while going and number < tries:
@@ -158,7 +165,7 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
         at_any_phase(number)
         begin_s = time.monotonic()
         done = row.run(rig, number)
-    except TimeoutError as error:
+    except (OSError, UserError) as error:  # a time-out, or a process that is gone
         outcome.failures.append(f"try {number}: {error}")
         return False
     gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
@@ -172,12 +179,15 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
 def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, Any]:
     """A row of the report: spreads of the times, how many were late, and what was wrong.
 
-    Its limit of reactions is that of the row and ``later_s``.
+    Its limits are those of the row, later by ``later_s``: `observe.later_s`.
     """
     limit_s = None if row.reaction_limit_s is None else row.reaction_limit_s + later_s
+    recovery_limit_s = row.recovery_limit_s  # It holds five states, and 2 T are 2 of them.
+    if recovery_limit_s is not None:
+        recovery_limit_s += 2.5 * later_s
     reactions = [t.reaction_s for t in outcome.tries if t.reaction_s is not None]
     recoveries = [t.recovery_s for t in outcome.tries if t.recovery_s is not None]
-    late = _over(reactions, limit_s), _over(recoveries, row.recovery_limit_s)
+    late = _over(reactions, limit_s), _over(recoveries, recovery_limit_s)
     wrong = [*outcome.failures, *(text for t in outcome.tries for text in t.wrong)]
     names = {name for t in outcome.tries for name in t.figures}
     figures = {n: max(t.figures[n] for t in outcome.tries if n in t.figures) for n in names}
@@ -189,7 +199,7 @@ def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, An
         "reaction_limit_ms": _ms(limit_s),
         "reactions_late": late[0],
         "recovery_ms": spread_ms(recoveries),
-        "recovery_limit_ms": _ms(row.recovery_limit_s),
+        "recovery_limit_ms": _ms(recovery_limit_s),
         "recoveries_late": late[1],
         "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
         "rejected": dict(sum((Counter(t.rejected) for t in outcome.tries), Counter())),

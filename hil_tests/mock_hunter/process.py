@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
             # A byte that is no text is a wrong order, not the end of all orders.
             sys.stdin.reconfigure(errors="replace")
         complain = partial(print, file=sys.stderr, flush=True)
-        reader = (sys.stdin, server.orders.put, complain)
+        reader = (sys.stdin or (), server.orders.put, complain)
         threading.Thread(target=read_orders, args=reader, daemon=True).start()
         tell(f"ready bus={arguments.bus} model={arguments.model}")
         server.run()

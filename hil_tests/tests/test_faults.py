@@ -1,6 +1,8 @@
 """Two real faults (all: `hil_tests campaign --only faults`), and what the verdicts rest on."""
 
 import fnmatch
+import threading
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,8 +16,17 @@ from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
 from hil_tests.faults.rig import ChassisProcess, Rig, Truth, make_state
 from hil_tests.faults.rows import Row, Try
-from hil_tests.faults.run import ROWS, Outcome, choose_rows, report_row, run_faults
+from hil_tests.faults.run import (
+    ROWS,
+    Outcome,
+    _try,
+    choose_rows,
+    report_row,
+    run_faults,
+    run_row,
+)  # fmt: skip
 from hil_tests.mock_hunter.chassis import FAULTS
+from hil_tests.processes import in_parallel
 
 PLACE = ("session", 0, 7)
 STATES = {PLACE: 10.0}
@@ -86,6 +97,25 @@ def test_a_rig_that_cannot_start_leaves_no_process(tmp_path, monkeypatch):
     assert [process.has_ended for process in started] == [True]
 
 
+def test_a_process_that_is_gone_is_a_failed_try_and_ends_no_campaign():
+    gone = Mock(wait_until_driving=Mock(side_effect=BrokenPipeError("the chassis is gone")))
+    outcome = Outcome()
+    assert not _try(ROW, gone, 3, outcome)
+    assert outcome.failures == ["try 3: the chassis is gone"]
+
+
+def test_a_campaign_that_has_ended_begins_no_try(tmp_path):
+    ended = threading.Event()
+
+    def fail(item):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_parallel(fail, [1], 1, lambda *_: None, ended)
+    outcome = run_row(ROW, (), TASK, tmp_path, 9, lambda name: None, ended)
+    assert outcome == Outcome()
+
+
 def judged(*tries, **outcome):
     return report_row(ROW, Outcome(tries=list(tries), **outcome))
 
@@ -116,7 +146,7 @@ def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
     assert len(set(names)) == len(names)
     for other in ("meteor", "meteor_*"):
         with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from .*edge_killed"):
-            run_faults(1, [other])
+            choose_rows([other])
     hunters = {name for name in names if fnmatch.fnmatch(name, "hunter_*")}
     assert hunters == {f"hunter_{name}" for name in FAULTS}
     chosen = [row.name for row in choose_rows(["vehicle_*", "vehicle_stuck", "edge_killed"])]
@@ -130,7 +160,7 @@ def test_a_real_fault_stops_it_and_it_drives_on_when_it_may(name, reason):
     """Off the bus for over 500 ms the chassis stands by, and takes control again when frames come
     back: the very thing that our own latch is for."""
     progress: list[str] = []
-    report = run_faults(1, [name], on_try=progress.append)
+    report = run_faults(choose_rows([name]), 1, on_try=progress.append)
     (row,) = report["rows"]
     assert (row["wrong"], row["unsafe"], row["crashes"]) == ([], [], [])
     assert row["reasons"] == {reason: 1}

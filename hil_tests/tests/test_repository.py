@@ -164,7 +164,7 @@ PROGRAMS = sorted(
     name
     for folder in ARROWS
     for path in sources(folder)
-    for name in re.findall(r'prog="python -m (\S+)"', path.read_text())
+    for name in re.findall(r'(?:prog=|program\(\s*)"python -m (\S+)"', path.read_text())
 )
 
 
@@ -367,7 +367,8 @@ def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(monkeypatch, t
 
 
 def test_a_viewer_that_ends_as_it_draws_is_said(monkeypatch):
-    for name in ("hil_tests.pictures.Viewer", "rerun.experimental.ViewerClient.connect"):
-        monkeypatch.setattr(name, mock.Mock())
-    with pytest.raises(UserError, match="mesa-vulkan-drivers"), pictures.headless_viewer():
-        raise ConnectionError("transport error")
+    gone = mock.Mock(open=mock.Mock(side_effect=ConnectionError("transport error")))
+    monkeypatch.setattr("hil_tests.pictures.Viewer", mock.Mock())
+    monkeypatch.setattr("rerun.experimental.ViewerClient.connect", lambda _: gone)
+    with pytest.raises(UserError, match="mesa-vulkan-drivers"):
+        pictures.screenshot(Path("x.rrd"), "step", sequence=1)

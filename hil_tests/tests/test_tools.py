@@ -190,9 +190,6 @@ def test_ratios_have_an_interval_that_widens_where_blocks_differ():
     ours = [block * factor for block, factor in zip(floor, np.linspace(1, 2, 8), strict=True)]
     low, high = compare(ours, floor)["p50"]["interval"]
     assert 1.0 < low < compare(ours, floor)["p50"]["ratio"] < high < 2.0
-    for blocks, says in (([np.ones(3)] * 2, "2 blocks of ours beside 1"), ([], "0 blocks")):
-        with pytest.raises(ValueError, match=says):
-            compare(blocks, blocks[1:])
 
 
 def report(ratio=1.1, end_mb=100.0, grown_mb=0.1, idle=0.01, start_s=1.0):
@@ -228,7 +225,7 @@ MISTAKES = {
         "--rows lag --only latency": "no latency axis 'lag'",
         "--rows delay,edge_kiled": "no fault 'edge_kiled'",
         "--rows delay --only faults": "no fault",
-        "--runs 1": "2 or more have an interval",
+        "--runs 1": "at least 2",
         "--policy nowhere.onnx --only latency": "nowhere.onnx",
         "--only latency --public-key no.pub": "public key no.pub does not",
     },
