@@ -24,11 +24,14 @@ import tarfile
 import tempfile
 import tomllib
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from packaging.tags import compatible_tags, cpython_tags
+from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 
 import deploy.installer
 import edge_runtime
@@ -45,6 +48,7 @@ from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_
 from edge_runtime.vehicles import GROUP, vehicle_limits
 
 NAME = "install.pyz"
+EDGE_PACKAGE = "phil-edge-runtime"
 DEFAULT_OUT = "build/bundles"
 UNITS = Path(__file__).parent / "systemd"
 HOLD = "../../state/hold"  # Seen from a release's folder: what the installer locks while it judges
@@ -123,7 +127,9 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
     target, out = TARGETS[arguments.target], arguments.out
     given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
     inputs = Inputs(**given, wheels=arguments.more)
-    check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
+    # Before minutes of downloads: the inputs, and where it goes.
+    check_inputs(inputs)
+    check_wheels(arguments.more, target)
     check_writable(out / "bundle.tar")
     wheels = arguments.more + gather(target, lock_path(target), arguments.wheels / target.name)
     with tempfile.TemporaryDirectory() as place:
@@ -222,6 +228,24 @@ def _drivers_in(path: Path) -> set[str]:
         raise UserError(f"wheel {path} cannot be read: {error}") from None
     modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") for one in names}
     return modules | (set(points[GROUP]) if GROUP in points else set())
+
+
+def check_wheels(wheels: Sequence[Path], target: Target) -> None:
+    """Raise UserError for a wheel that the target cannot run, or whose package it has anyway."""
+    version = tuple(map(int, target.python.split(".")))
+    platforms = [*_platforms(target), f"linux_{target.machine}"]  # As built on the board itself.
+    fits = set(cpython_tags(version, platforms=platforms))
+    fits.update(compatible_tags(version, platforms=platforms))
+    own = {canonicalize_name(pin.name) for pin in read_lock(lock_path(target))} | {EDGE_PACKAGE}
+    for path in wheels:
+        try:
+            name, _, _, tags = parse_wheel_filename(path.name)
+        except InvalidWheelFilename as error:
+            raise UserError(f"wheel {path}: {error}") from None
+        if not tags & fits:
+            raise UserError(f"wheel {path} is not for Python {target.python} on {target.machine}")
+        if name in own:
+            raise UserError(f"wheel {path}: the bundle has a {name} of its own")
 
 
 def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: str) -> Manifest:
@@ -362,14 +386,18 @@ def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
 def download(target: Target, wanted: list[str], folder: Path) -> None:
     """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
     make_directory(folder)
-    newest = int(target.glibc.split(".")[1])
-    tags = [*(f"_2_{minor}" for minor in _MANYLINUX if minor <= newest), "1", "2010", "2014"]
     pip(
         "download", "--only-binary=:all:", "--no-deps",
         f"--python-version={target.python}.{_PATCH}",
-        *(f"--platform=manylinux{tag}_{target.machine}" for tag in tags),
+        *(f"--platform={platform}" for platform in _platforms(target)),
         "--dest", str(folder), *wanted,
     )  # fmt: skip
+
+
+def _platforms(target: Target) -> list[str]:
+    newest = int(target.glibc.split(".")[1])
+    tags = [*(f"_2_{minor}" for minor in _MANYLINUX if minor <= newest), "1", "2010", "2014"]
+    return [f"manylinux{tag}_{target.machine}" for tag in tags]
 
 
 def build_edge_wheel(folder: Path) -> Path:

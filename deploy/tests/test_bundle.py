@@ -8,6 +8,7 @@ import stat
 import subprocess
 import tarfile
 import zipfile
+from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -26,6 +27,7 @@ from deploy.bundle import (
     _sign,
     build_edge_wheel,
     build_installer,
+    check_wheels,
     gather,
     lock_path,
     make_bundle,
@@ -86,6 +88,27 @@ def test_a_whole_bundle_is_the_same_again_and_the_boards_is_small(workshop, tmp_
     assert one.path.read_bytes() == two.path.read_bytes()
     if name == "jetpack5":
         assert one.path.stat().st_size < MAX_JETPACK5_BYTES
+
+
+@pytest.mark.parametrize(
+    ("name", "match"),
+    [
+        ("driver-1.0-py3-none-any.whl", ""),
+        ("driver-1.0-cp38-cp38-manylinux_2_17_aarch64.manylinux2014_aarch64.whl", ""),
+        ("driver-1.0-cp38-cp38-linux_aarch64.whl", ""),
+        ("driver-1.0-cp37-abi3-manylinux_2_28_aarch64.whl", ""),
+        ("driver-1.0-cp311-cp311-manylinux_2_17_aarch64.whl", "not for Python 3.8 on aarch64"),
+        ("driver-1.0-cp38-cp38-manylinux_2_17_x86_64.whl", "not for Python 3.8 on aarch64"),
+        ("driver-1.0-cp38-cp38-manylinux_2_35_aarch64.whl", "not for Python 3.8 on aarch64"),
+        ("NumPy-9.0-py3-none-any.whl", "has a numpy of its own"),
+        ("phil_edge_runtime-9.0-py3-none-any.whl", "has a phil-edge-runtime of its own"),
+        ("driver.whl", "Invalid wheel filename"),
+    ],
+)
+def test_a_wheel_that_the_board_cannot_run_or_has_is_refused(name, match):
+    expected = pytest.raises(UserError, match=match) if match else contextlib.nullcontext()
+    with expected:
+        check_wheels([Path("made") / name], TARGETS["jetpack5"])
 
 
 def test_other_bytes_are_another_version(workshop):
