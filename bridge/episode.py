@@ -185,7 +185,7 @@ class EpisodeRunner:
             applied = [float(value) for value in action.ravel()]
             result.actions.append(applied)
             self._applied = (applied, bool(decision.brake_reason))
-            result.reward += _finite("reward", reward)
+            result.reward += finite("reward", reward)
             # An environment need not report accelerations; then they count as zero.
             lateral_mps2.append(abs(_number(info, "lateral_acceleration_mps2")))
             longitudinal_mps2.append(abs(_number(info, "longitudinal_acceleration_mps2")))
@@ -266,11 +266,11 @@ def _speed_mps(info: dict[str, Any]) -> float | None:
 
 
 def _number(info: dict[str, Any], name: str) -> float:
-    return _finite(name, info.get(name, 0.0))
+    return finite(name, info.get(name, 0.0))
 
 
-def _finite(name: str, value: Any) -> float:
-    """Return the number; the wire and the report can carry no other than finite ones."""
+def finite(name: str, value: Any) -> float:
+    """The number; UserError where it is not finite: neither wire nor report can carry it."""
     number = float(value)
     if not math.isfinite(number):
         raise UserError(f"the environment's {name} is {number}, not a finite number")

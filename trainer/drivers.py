@@ -81,7 +81,8 @@ class OnnxDriver(Driver):
 
 def is_expert(word: str) -> bool:
     """Whether this is the word expert, or ``module:Class`` of one."""
-    return word == "expert" or (bool(re.fullmatch(r"[\w.]+:\w+", word)) and CONSTANT not in word)
+    a_class = re.fullmatch(r"[\w.]+:\w+", word) and not word.startswith(CONSTANT)
+    return word == "expert" or bool(a_class)
 
 
 def load_driver(

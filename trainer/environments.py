@@ -19,7 +19,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
-from bridge.report import FAILED, GOAL, UNKNOWN
+from bridge.episode import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Driver, Expert, Reason
@@ -205,8 +205,7 @@ class Adapted:
         truncated = bool(truncated) or (not self._limited and self._steps >= MOST_STEPS)
         info = _said(info)
         if terminated or truncated:
-            told = {True: GOAL, False: FAILED, None: UNKNOWN}[info.get("is_success")]
-            info["outcome"] = str(info.get("outcome") or told)
+            info["outcome"] = outcome_of(info)
         return self._seen(observation), float(reward), bool(terminated), truncated, info
 
     @property

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from bridge.episode import finite
 from bridge.network import LatencySpec, Link, parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import counted
+from edge_runtime.util import UserError, counted
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
@@ -126,6 +127,9 @@ def evaluate(
 
     Raises UserError: nothing there that drives, or in another environment.
     """
+    if condition not in CONDITIONS or runs < 1:
+        known = f"condition is one of {', '.join(CONDITIONS)}, and runs at least 1"
+        raise UserError(f"{known}: {condition}, {runs}")
     policy, spec = fspath(policy), parse_spec(latency)
     scenario = scenario_of(scenario or _trained_in(policy))
     env = make_environment(scenario, condition)
@@ -179,11 +183,13 @@ class Drive:
         self.observation, reward, terminated, truncated, info = self.env.step(action)
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
-        result.reward += float(reward)
-        self._lateral.append(abs(info["lateral_acceleration_mps2"]))
-        self._longitudinal.append(abs(info["longitudinal_acceleration_mps2"]))
+        result.reward += finite("reward", reward)
+        for name, seen in (("lateral", self._lateral), ("longitudinal", self._longitudinal)):
+            name = f"{name}_acceleration_mps2"
+            seen.append(abs(finite(name, info[name])))
         if self.over:
-            result.outcome, result.distance_m = info["outcome"], float(info["distance_m"])
+            result.outcome = info["outcome"]
+            result.distance_m = finite("distance_m", info["distance_m"])
             result.steps = len(result.actions)
             result.time_s = result.steps * self.env.control_period_s
             result.lateral_acceleration_mps2 = float(np.mean(self._lateral))

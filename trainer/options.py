@@ -7,10 +7,10 @@ import math
 import re
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from bridge.network import GRAMMAR
 from edge_runtime import util
@@ -19,7 +19,6 @@ from edge_runtime.util import UserError
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS
 
-Part = TypeVar("Part")
 Group = argparse.ArgumentParser | argparse._ArgumentGroup
 
 
@@ -69,14 +68,6 @@ def add_time_limit(parser: Group, what: str) -> None:
 def deadline_s(minutes: float | None, clock: Callable[[], float] = time.monotonic) -> float:
     """When the minutes from now are over, as of ``clock``; infinity without a limit."""
     return math.inf if minutes is None else clock() + 60.0 * minutes
-
-
-def until(end_s: float, parts: Iterable[Part]) -> Iterator[Part]:
-    """The parts that begin by then, as of ``time.monotonic()``, and the first in any case."""
-    for part in parts:
-        yield part
-        if time.monotonic() > end_s:
-            return
 
 
 def add_fields(parser: Group, config: Any, *names: str) -> None:

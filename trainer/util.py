@@ -222,17 +222,12 @@ def die_with_parent() -> None:
 
 
 @cache
-def source_revision() -> str:
-    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
+def source_revision(directory: Path = Path(__file__).parent) -> str:
+    """A repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
 
     As it was when first asked for: what is committed later is not what this process runs. Results
     that a run has just written make no other source.
     """
-    return revision_of(Path(__file__).parent)
-
-
-def revision_of(directory: Path) -> str:
-    """The revision of the repository that a directory belongs to, as it is now."""
     commit = _git(directory, "rev-parse", "HEAD")
     if commit is None:
         return "unknown"

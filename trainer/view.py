@@ -59,7 +59,6 @@ EXAMPLE = examples(
 )
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
-STEPS_TOGETHER = 50  # Numbers are handed over with a picture, or when there are this many
 MOST_WAITING = 500
 """Entries, some 50 s of pictures. A view that is slower loses some; the loop loses nothing."""
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
@@ -211,8 +210,6 @@ class Watcher:
         self._step += 1
         if self._pace.due(time.monotonic()):
             self.hand_over(seen.observation, _shown(self._run.env))
-        elif len(self._entries) >= STEPS_TOGETHER:
-            self.hand_over()
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
         """Take an episode's end."""

@@ -127,6 +127,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{len(done)} of {len(wanted)} units were there already{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
-    if names == [GUIDANCE] and store.results.exists():
+    if names == [GUIDANCE] and store.find(possible)[0]:
         print(f"wrote {write_guidance(store, arguments.seeds)}")
     return 1 if ends[FAILED] else 0

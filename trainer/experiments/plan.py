@@ -17,7 +17,7 @@ from edge_runtime.util import UserError, read_bytes
 from trainer.environments import COMMAND_NOISE, CONDITIONS, expert_of, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
-from trainer.learner.config import ALGORITHMS, Algorithm, starting_from
+from trainer.learner.config import ALGORITHMS, Algorithm
 from trainer.training.config import BIASED as BIASED_GUIDANCE
 from trainer.training.config import PRESETS, RunConfig
 
@@ -308,8 +308,8 @@ def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
         checkpoint_every=plan.checkpoint_every,
         threads=1,
         learner=replace(
-            starting_from(start.learner, ALGORITHMS[unit.algorithm]),
-            **{**plan.learner, **setting.learner},
+            start.learner,
+            **{**ALGORITHMS[unit.algorithm].settings, **plan.learner, **setting.learner},
         ),
         **setting.run,
     )
@@ -374,16 +374,6 @@ def testing(unit: Unit, plan: Plan) -> dict[str, Any]:
     where, human = unit.environment, unit.scripted_human
     scenes = {name: behaviour(where, name, human) for name in unit.conditions}
     return {"runs": plan.of(unit.scenario).test_runs, "noise_std": COMMAND_NOISE, "scenes": scenes}
-
-
-def training_id(unit: Unit, plan: Plan, humans: Path) -> str:
-    """Names the directory in which a unit is trained: tests that change do not touch it."""
-    return digest(deciding(unit, plan, humans))
-
-
-def unit_id(unit: Unit, plan: Plan, humans: Path) -> str:
-    """Names a unit's record: a short hash of all that decides it."""
-    return digest({**deciding(unit, plan, humans), "testing": testing(unit, plan)})
 
 
 def digest(values: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -90,31 +90,28 @@ class Store:
     humans: Path  # Directory with a human model for each scenario
 
     def id(self, unit: Unit) -> str:
-        """The id of the unit's record."""
-        return plan.unit_id(unit, self.plan, self.humans)
+        """The id of the unit's record: a short hash of all that decides it."""
+        decides = plan.deciding(unit, self.plan, self.humans)
+        return plan.digest({**decides, "testing": plan.testing(unit, self.plan)})
 
     def records_file(self, scenario: str) -> Path:
         """The records of a scenario, a line each."""
         return self.results / f"{scenario}.jsonl"
 
     def run_dir(self, unit: Unit) -> Path:
-        """Where the unit is trained; its actor stays there."""
-        return (
-            self.runs
-            / f"{'-'.join(map(str, unit))}-{plan.training_id(unit, self.plan, self.humans)}"
-        )
+        """Where the unit is trained, and its actor stays; tests that change do not touch it."""
+        name = plan.digest(plan.deciding(unit, self.plan, self.humans))
+        return self.runs / f"{'-'.join(map(str, unit))}-{name}"
 
     def lock_file(self, unit: Unit) -> Path:
         """Beside the unit's directory."""
         run_dir = self.run_dir(unit)
         return run_dir.with_name(f"{run_dir.name}.lock")
 
-    @contextmanager
-    def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
+    def lock(self, unit: Unit, patience_s: float = 0.0) -> AbstractContextManager[bool]:
         """Hold a unit against other processes; gives whether that was possible."""
         make_directory(self.runs)
-        with util.held(self.lock_file(unit), patience_s) as mine:
-            yield mine
+        return util.held(self.lock_file(unit), patience_s)
 
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
         """All records of a scenario, current or not; none where there is no file.

@@ -5,6 +5,7 @@ The person is the scripted expert, or a real one in recorded sittings.
 
 import argparse
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -86,11 +87,13 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
             for _ in range(config.episodes)
         )
     with ProgressBar("human model", config.episodes) as bar:
-        for episode in options.until(end_s, episodes):
+        for episode in episodes:
             shown = {"demonstrations": str(episode.demonstrations), "loss": f"{episode.loss:.3f}"}
             if episode.outcome:
                 shown |= {"interventions": str(episode.interventions), "outcome": episode.outcome}
             bar.advance(shown)
+            if time.monotonic() > end_s:
+                break
     if bar.done < config.episodes:
         print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
     # In proportion: a part of the episodes has shown a part of the examples, in a part of the time.

@@ -5,7 +5,6 @@ All three know the true state. The activation conditions are those that section 
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +40,12 @@ class Crossing:
             for s_m in np.arange(0.0, config.goal_m + 10.0, TABLE_STEP_M)
         ]
         self._covered_x = np.array(stretch)
-        self._first_cell = int(np.argmax(np.isfinite(self._covered_x[:, 0])))
-        """Where the ego car first reaches into the lane."""
 
     def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
         """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
-        time_s, s_m, _ = self._ego_motion(horizon_s, plan)
+        s_m, _ = self._ego_motion(horizon_s, plan)
+        time_s = np.linspace(0.0, (len(s_m) - 1) * self.env.config.control_period_s, len(s_m))
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
-        if cells[-1] < self._first_cell:
-            return True  # The ego car does not get as far as the lane.
         rear_x, front_x = self._covered_x[cells].T
         # All cars at once; the shape holds without any, too.
         cars = [(car.position[0], car.speed, car.LENGTH) for car in self.env.traffic]
@@ -59,7 +55,7 @@ class Crossing:
 
     def state_after(self, horizon_s: float, plan: PedalPlan) -> tuple[float, float]:
         """How far along the path the ego car is after ``horizon_s`` (m), and its speed (m/s)."""
-        _, s_m, speed_mps = self._ego_motion(horizon_s, plan)
+        s_m, speed_mps = self._ego_motion(horizon_s, plan)
         return float(s_m[-1]), speed_mps
 
     def in_lane(self, s_m: float) -> bool:
@@ -67,10 +63,8 @@ class Crossing:
         cell = min(int(s_m / TABLE_STEP_M), len(self._covered_x) - 1)
         return bool(np.isfinite(self._covered_x[cell, 0]))
 
-    def _ego_motion(
-        self, horizon_s: float, plan: PedalPlan
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Times ahead (s), arc lengths reached (m), an entry a control period; the last speed."""
+    def _ego_motion(self, horizon_s: float, plan: PedalPlan) -> tuple[NDArray[np.float64], float]:
+        """Arc lengths reached (m), an entry a control period from now; and the last speed."""
         c, dt_s = self.env.config, self.env.config.control_period_s
         steps, held = round(horizon_s / dt_s), round(plan.hold_s / dt_s)
         held_mps2 = plan.pedal * (c.throttle_mps2 if plan.pedal > 0 else c.brake_mps2)
@@ -86,7 +80,7 @@ class Crossing:
             elif plan.then_mps is not None and speed_mps < plan.then_mps:
                 speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
             positions.append(s_m)
-        return _instants(steps, dt_s), np.array(positions), speed_mps
+        return np.array(positions), speed_mps
 
     def _footprint(self, s_m: float) -> Rectangle:
         pose = self.env.path.pose(s_m)
@@ -94,11 +88,6 @@ class Crossing:
         # In the bend the tracked car points inwards by the slip angle.
         slip_rad = math.asin(0.5 * length_m * self.env.path.curvature(s_m))
         return Rectangle(pose.x, pose.y, pose.heading - slip_rad, length_m, width_m)
-
-
-@cache
-def _instants(steps: int, dt_s: float) -> NDArray[np.float64]:
-    return np.linspace(0.0, steps * dt_s, steps + 1)
 
 
 def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[float, float]:

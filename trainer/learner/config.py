@@ -114,11 +114,6 @@ and the others are what came after it."""
 PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
 
 
-def starting_from(start: LearnerConfig, row: Algorithm) -> LearnerConfig:
-    """The hyper-parameters with which a row starts, where all others start from ``start``."""
-    return replace(start, **row.settings)
-
-
 def find_algorithm(name: str) -> Algorithm:
     """The row of this name: of the table, of an installed package, or ``module:ROW``.
 

@@ -9,7 +9,7 @@ layers: pictures of any size those of `Convolutions`, numbers themselves, severa
 theirs.
 
 Nearly all products are in the convolutions and in what the first connected layer makes of the
-picture: ``embed``. It follows the ``torch.autocast`` around it, and is computed once a picture for
+picture: `Picture`. It follows the ``torch.autocast`` around it, and is computed once a picture for
 all that is asked of it; the rest is small, and always in single precision.
 """
 
@@ -25,7 +25,7 @@ from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from trainer.learner.kernel import trunk_features
+from trainer.learner.kernel import FEATURES, FILTERS, FRAME, SIDE, trunk_features
 
 CPU_INFO = Path("/proc/cpuinfo")
 _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|amx_bf16|bf16)\b")
@@ -43,23 +43,10 @@ def multiplies_bfloat16(device_type: str) -> bool:
         return False
 
 
-FRAME_ROWS, FRAME_COLUMNS = 45, 80
-FILTERS = (6, 16)
-KERNEL = 6
 HIDDEN = (256, 128, 64)
 
 
-def _side_after_pools(side: int) -> int:
-    for _ in FILTERS:
-        side = (side - KERNEL + 1) // 2
-    return side
-
-
-FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME_COLUMNS)
-"""Length of a picture's feature vector (1,792)."""
-
-
-PICTURES = Box(0, 255, (2, FRAME_ROWS, FRAME_COLUMNS), np.uint8)
+PICTURES = Box(0, 255, (2, *FRAME), np.uint8)
 """The paper's observation: frames [t-1, t]."""
 UNBOUNDED = 1e6  # A bound beyond this is none: a number is not divided by it
 SMALL_SIDE = 8  # A picture is halved until it is no larger
@@ -93,8 +80,8 @@ class Trunk(nn.Module):
     def __init__(self, frames: int = 2) -> None:
         super().__init__()
         self.frames = frames
-        self.conv1 = nn.Conv2d(frames, FILTERS[0], KERNEL)
-        self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], KERNEL)
+        self.conv1 = nn.Conv2d(frames, FILTERS[0], SIDE)
+        self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], SIDE)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -225,17 +212,11 @@ class Actor(nn.Module):
         self.picture = Picture(frames, space=space)
         self.head = Head(action_size)
 
-    def embed(self, *seen: Tensor) -> Tensor:
-        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80], or a tensor an entry."""
-        return self.picture(*seen)
-
-    def score(self, embedded: Tensor) -> Tensor:
-        """The action before tanh squashes it, [batch, n]."""
-        return self.head(embedded)
-
     def forward(self, *seen: Tensor) -> Tensor:
-        """The action [batch, n] in [-1, 1] from what ``embed`` takes."""
-        return torch.tanh(self.score(self.embed(*seen)))
+        """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80], or a tensor an
+        entry.
+        """
+        return torch.tanh(self.head(self.picture(*seen)))
 
     @torch.no_grad()
     def act(self, observations: NDArray[Any]) -> NDArray[np.float32]:
@@ -268,17 +249,9 @@ class Critic(nn.Module):
         self.norm = nn.LayerNorm(HIDDEN[0]) if normalised else nn.Identity()
         self.head = Head(1, normalised)
 
-    def embed(self, *seen: Tensor) -> Tensor:
-        """float32 [batch, 256] from what an actor's ``embed`` takes, whatever the action."""
-        return self.picture(*seen)
-
     def value(self, embedded: Tensor, action: Tensor) -> Tensor:
-        """Q, shape [batch], from an embedded picture [batch, 256] and actions [batch, n]."""
+        """Q, shape [batch], from what ``picture`` gave [batch, 256] and actions [batch, n]."""
         return self.head(self.norm(embedded) + self.action(action)).squeeze(1)
-
-    def forward(self, frames: Tensor, action: Tensor) -> Tensor:
-        """Q, shape [batch], from frames uint8 [batch, 2, 45, 80] and actions [batch, n]."""
-        return self.value(self.embed(frames), action)
 
 
 class CriticPair(nn.Module):

@@ -206,11 +206,10 @@ class Batch:
     human: NDArray[np.bool_]  # Delta of the first step: whether the human acted, [n]
     probabilities: NDArray[np.float64]
     """p(i), the probability with which each was drawn (eq. 20), [n]."""
-    spans: NDArray[np.int64] | int = 1  # Steps from s to s', [n]; or as many in all rows
-    overruled: NDArray[np.float32] | None = None
+    spans: NDArray[np.int64]  # Steps from s to s', [n]
+    overruled: NDArray[np.float32]
     """What the policy would have done where the human acted, else the action, [n, action size]."""
-    penalised: NDArray[np.bool_] | None = None
-    """Whether the overruled action is penalised (eq. 17), [n]; None: in no row."""
+    penalised: NDArray[np.bool_]  # Whether the overruled action is (eq. 17), [n]
     foreseen: Batch | None = None
     """Others, whose ``next_frames`` are what an overruled action would have led to, or None."""
 

@@ -34,6 +34,10 @@ def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
     return algorithm.penalty and config.penalty_on == OVERRULED_ACTION
 
 
+NETWORKS = ("actor", "critics", "target_actor", "target_critics")
+OPTIMISERS = ("actor_optimiser", "critic_optimiser")
+
+
 class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
@@ -90,7 +94,7 @@ class TD3Learner:
     def doubt(self, frames: NDArray[Any], action: NDArray[np.float32]) -> float:
         """How much the two critics differ about an action in one observation: |Q_1 - Q_2|."""
         seen, actions = tensors(frames[None], self.device), self._tensor(action[None])
-        one, other = (critic.value(critic.embed(*seen), actions) for critic in self.critics.pair)
+        one, other = (critic.value(critic.picture(*seen), actions) for critic in self.critics.pair)
         return float((one - other).abs())
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
@@ -105,10 +109,10 @@ class TD3Learner:
         human = self._tensor(batch.human)
         targets = self._targets(batch)
         with self._precision():
-            pictures = [critic.embed(*seen) for critic in self.critics.pair]
-            own_picture = self.actor.embed(*seen)
+            pictures = [critic.picture(*seen) for critic in self.critics.pair]
+            own_picture = self.actor.picture(*seen)
         critic_loss, errors, value = self._critic_loss(batch, pictures, actions, targets, beta)
-        score = self.actor.score(own_picture)
+        score = self.actor.head(own_picture)
         own_actions = torch.tanh(score)
         policy, cloning = self._actor_losses(pictures[0].detach(), own_actions, actions, human)
         priorities = self._priorities(errors, seen, actions, human, own_actions.detach())
@@ -144,24 +148,14 @@ class TD3Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, noise and counters: all that a resumed run needs."""
-        return {
-            "actor": self.actor.state_dict(),
-            "critics": self.critics.state_dict(),
-            "target_actor": self.target_actor.state_dict(),
-            "target_critics": self.target_critics.state_dict(),
-            "actor_optimiser": self.actor_optimiser.state_dict(),
-            "critic_optimiser": self.critic_optimiser.state_dict(),
-            "noise": self.noise.get_state(),
-            "updates": self.updates,
-        }
+        parts = {name: getattr(self, name).state_dict() for name in (*NETWORKS, *OPTIMISERS)}
+        return {**parts, "noise": self.noise.get_state(), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
-        for name in ("actor", "critics", "target_actor", "target_critics"):
-            getattr(self, name).load_state_dict(state[name])
-        # Optimisers keep the very tensors that they are given.
-        self.actor_optimiser.load_state_dict(copy.deepcopy(state["actor_optimiser"]))
-        self.critic_optimiser.load_state_dict(copy.deepcopy(state["critic_optimiser"]))
+        for name in (*NETWORKS, *OPTIMISERS):
+            # Optimisers keep the very tensors that they are given.
+            getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 
@@ -206,9 +200,9 @@ class TD3Learner:
     def _targets(self, batch: Batch) -> Tensor:
         c, seen = self.config, tensors(batch.next_frames, self.device)
         with self._precision():
-            own_picture = self.target_actor.embed(*seen)
-            pictures = [critic.embed(*seen) for critic in self.target_critics.pair]
-        next_actions = torch.tanh(self.target_actor.score(own_picture))
+            own_picture = self.target_actor.picture(*seen)
+            pictures = [critic.picture(*seen) for critic in self.target_critics.pair]
+        next_actions = torch.tanh(self.target_actor.head(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
         )
@@ -234,8 +228,7 @@ class TD3Learner:
             equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
         )
         loss, errors, mean = first + second, targets - values[0].detach(), values[0].detach().mean()
-        if self._charges_overruled and batch.penalised is not None and batch.penalised.any():
-            assert batch.overruled is not None
+        if self._charges_overruled and batch.penalised.any():
             penalised = self._tensor(batch.penalised)
             overruled = self._values(pictures, self._tensor(batch.overruled))
             first, second = (
@@ -247,7 +240,6 @@ class TD3Learner:
             missed = (c.intervention_penalty - overruled[0].detach()) * penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
         if self.algorithm.proxy_values and batch.human.any():
-            assert batch.overruled is not None
             overruled = self._values(pictures, self._tensor(batch.overruled))
             for pair in zip(values, overruled, strict=True):
                 loss = loss + equations.proxy_value_loss(*pair, human)
@@ -275,12 +267,11 @@ class TD3Learner:
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
         """The human's action before the overruled one, where the latter would have led to."""
-        assert foreseen.overruled is not None
         seen = tensors(self._shift(foreseen.next_frames), self.device)
         with self._precision():
-            picture = self.actor.embed(*seen)
+            picture = self.actor.picture(*seen)
         actions, pair = (
-            torch.tanh(self.actor.score(picture)),
+            torch.tanh(self.actor.head(picture)),
             (foreseen.actions, foreseen.overruled),
         )
         preferred, overruled = map(self._tensor, pair)
@@ -303,7 +294,7 @@ class TD3Learner:
             critic = self.target_critics.first
             # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
             with self._precision():
-                picture = critic.embed(*(entry.index_select(0, looked_at) for entry in seen))
+                picture = critic.picture(*(entry.index_select(0, looked_at) for entry in seen))
             advantage[looked_at] = equations.q_advantage(
                 critic.value(picture, actions[looked_at]),
                 critic.value(picture, own_actions[looked_at]),

@@ -95,7 +95,7 @@ class Coach:
         self._mastered = mastered
 
     def show(self, cost: Mapping[str, float]) -> Coaching | None:
-        """What is to be shown; None where there is nothing yet. ``cost`` as ``View.cost``."""
+        """What is to be shown; None where there is nothing yet. ``cost`` as ``Sitting.cost``."""
         if not self.learning and not self.episodes:
             return None
         alone = self.curve[-1][1] if self.curve else None

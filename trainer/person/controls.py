@@ -15,6 +15,7 @@ import numpy as np
 from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment
 
+RESERVED = {"p", "r", "q", "backspace", "space"}  # The wishes, and holding without driving
 Amount = float | tuple[float, ...]  # An action in [-1, 1]: one number where there is one
 
 
@@ -75,4 +76,6 @@ def controls_of(scenario: str) -> Controls:
         name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(action, rest))
         for name, action in env.keys.items()
     }
+    if taken := sorted(RESERVED & keys.keys()):
+        raise UserError(f"a person cannot drive {scenario}: its keys {', '.join(taken)} have a use")
     return Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))

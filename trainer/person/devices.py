@@ -20,7 +20,7 @@ from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.coach import Coaching
 from trainer.person.controls import Amount, amount, controls_of, vector
-from trainer.person.interface import LET_GO, WISH_HELP, WISHES, Moving, Reading, View, Wish
+from trainer.person.interface import WISH_HELP, WISHES, Moving, Reading, View, Wish
 from trainer.person.profile import SHIPPED, Profile, read_profile
 from trainer.scenarios.picture import draw_scene
 
@@ -179,7 +179,7 @@ class JoystickHands:
     def read(self, now_s: float) -> Reading:
         """What axes and buttons say; nothing of a device that is gone."""
         if self._joystick is None:
-            return LET_GO
+            return Reading(controls_of(self._scenario).rest)
         # Asking for a button that the device does not have is an error in SDL.
         count = self._joystick.get_numbuttons()
         holding = [number for number in self._profile.buttons.get("hold", ()) if number < count]
@@ -251,8 +251,8 @@ class Window:
         self._state(view)
         self._bars(view)
         self._coach(view.coach)
-        for row, line in enumerate((*view.help, view.progress)):
-            colour = "text" if row < len(view.help) else "dim"
+        for row, line in enumerate((*self.help, view.progress)):
+            colour = "text" if row < len(self.help) else "dim"
             self._text(line, (MARGIN, 588 + 21 * row), colour)
         room = self._window.get_size()
         size = _fitted(*room)

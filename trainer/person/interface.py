@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -86,13 +86,9 @@ class View:
     late_ticks: int = 0  # Control periods of this sitting that began too late
     paused: bool = False
     progress: str = ""  # One line on the learner; empty without one
-    cost: Mapping[str, float] = field(default_factory=dict)
-    """What the person has given so far: ``human_s`` at the wheel, ``takeovers``, and ``failures``,
-    the episodes that missed the goal."""
     coach: Coaching | None = None  # Episodes, learning curve and advice; None: nothing yet
     message: str = ""
     """What is going on besides driving: "saving", "episode ended: goal"; mostly empty."""
-    help: tuple[str, ...] = ()  # The device's keys, one line each
     picture: NDArray[np.uint8] | None = None
     """What the environment draws, [height, width, 3], where it has no scene."""
 
@@ -104,7 +100,6 @@ class Person(Protocol):
     than a few milliseconds.
     """
 
-    help: tuple[str, ...]  # What to press for what, one short line each
     moving: Moving
 
     @property
@@ -115,7 +110,7 @@ class Person(Protocol):
         """
 
     def poll(self, now_s: float) -> Reading:
-        """What the person does at ``now_s`` (``time.monotonic``); ``LET_GO`` without a device."""
+        """What the person does at ``now_s`` (``time.monotonic``); without a device, rest."""
 
     def show(self, view: View) -> None:
         """Show the newest view, unless there is no time for it."""

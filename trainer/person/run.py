@@ -17,8 +17,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from bridge.report import DISCARDED, GOAL
 from edge_runtime.files import make_directory
@@ -32,7 +33,7 @@ from trainer.person.interface import Person, open_person
 from trainer.person.recording import DIRECTORY, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
-from trainer.training.delayed import DelayedPolicy, Store, ticks_late
+from trainer.training.delayed import ticks_late
 from trainer.training.learning import Action, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
 from trainer.training.run import TrainingRun, divergence_said
@@ -77,6 +78,82 @@ def summary(training: PersonRun) -> str:
     )
 
 
+class UnhurriedLearning(LearningThread):
+    """``LearningThread`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
+
+    What is stored is kept back until ``release``: only at an episode's end is it known whether the
+    person discards it.
+    """
+
+    def __init__(self, *settings: Any) -> None:
+        super().__init__(*settings)
+        self._actor = copy.deepcopy(self.learner.actor).eval()
+        self._kept: list[Callable[[], None]] = []
+        self.in_thread(_step_aside)
+
+    def act(self, observation: Observation) -> Action:
+        """The action of the actor's copy, float32 [action size]."""
+        return self._actor.act(observation[None])[0]
+
+    def begin(self, beta: float) -> None:
+        """Start an update on what is stored, unless the last one is still under way."""
+        if self._tidy():
+            super().begin(beta)
+
+    def finish(self) -> float:
+        """Nothing is waited for: 0 seconds."""
+        return 0.0
+
+    def start_episode(self, observation: Observation) -> None:
+        """As a ``LearningThread``, at the release."""
+        self._kept.append(partial(super().start_episode, observation))
+
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """As a ``LearningThread``, at the release."""
+        self._kept.append(partial(super().add, *transition, **guidance))
+
+    def release(self, discarded: bool) -> None:
+        """Store what was taken since the last call, or forget it."""
+        kept, self._kept = self._kept, []
+        if not discarded:
+            self.settle()
+            for store in kept:
+                store()
+
+    def end_episode(self, progress: float) -> dict[str, Any]:
+        """As a ``LearningThread``, after the update that is under way."""
+        self.settle()
+        return super().end_episode(progress)
+
+    def state_dict(self) -> dict[str, Any]:
+        """As a ``LearningThread``, after the update that is under way."""
+        self.settle()
+        return super().state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        super().load_state_dict(state)
+        self._copy_actor()
+
+    def settle(self) -> None:
+        """Wait for the update that is under way."""
+        # In short waits: a signal that another thread took does not wake the main thread.
+        while not self._tidy():
+            time.sleep(LOOK_S)
+
+    def _tidy(self) -> bool:
+        """Finish an update that is done; False where one is not."""
+        if self.updating:
+            return False
+        if self._begun is not None:
+            super().finish()
+            self._copy_actor()
+        return True
+
+    def _copy_actor(self) -> None:
+        self._actor.load_state_dict(self.learner.actor.state_dict())
+
+
 class PersonRun(TrainingRun):
     """``TrainingRun`` in a sitting; what an episode has shown is stored at its end.
 
@@ -84,6 +161,9 @@ class PersonRun(TrainingRun):
     recorded after its checkpoint. ``person`` is closed with the run; ``speed``: simulated seconds
     in one of the person's.
     """
+
+    learning_kind = UnhurriedLearning
+    learning: UnhurriedLearning
 
     def __init__(
         self, config: RunConfig, run_dir: Path, person: Person, resume: bool, speed: float
@@ -105,8 +185,6 @@ class PersonRun(TrainingRun):
         self.sitting.coach = coach
         self.behind_the_scenes = BehindTheScenes(config)
         self.guide = PersonGuide(self.sitting)
-        self.kept_back = KeptBack(self.learning)
-        self.policy = DelayedPolicy(self.kept_back, self.env, self.network)
         self.env = self.sitting
 
     def train(
@@ -134,7 +212,7 @@ class PersonRun(TrainingRun):
         self.sitting.episode = self.episode
         metrics = super().advance()
         metrics.outcome = self.sitting.rest(metrics.outcome)
-        self.kept_back.release(discarded=metrics.outcome == DISCARDED)
+        self.learning.release(discarded=metrics.outcome == DISCARDED)
         metrics.total_steps = self.learning.added
         self.sitting.progress = (
             f"{counted(self.learning.added, 'step')} stored, {self.sitting.human_steps} yours in "
@@ -157,9 +235,6 @@ class PersonRun(TrainingRun):
         if self.learning.added < warmup:
             return f"not learning yet ({self.learning.added} of {warmup} steps)"
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
-
-    def _around(self, learning: LearningThread) -> LearningThread:
-        return cast(LearningThread, UnhurriedLearning(learning))
 
     def _make_guide(self) -> Guide | None:
         return None  # The sitting is opened when all else is known to work.
@@ -224,6 +299,7 @@ class PersonRun(TrainingRun):
             self._penalises,
             ticks_late(self.network, self.env.control_period_s),
         )
+        self.learning.release(discarded=False)
 
 
 def check_settings(config: RunConfig) -> None:
@@ -235,8 +311,9 @@ def check_settings(config: RunConfig) -> None:
         raise UserError(f"{config.algorithm} asks a scripted human or its model, and no person yet")
     if config.delay_known:
         raise UserError("a person's recordings hold no actions under way: no delay_known")
-    if config.guided_share != 1:
-        raise UserError("a person watches every episode: guided_share is 1")
+    if config.guided_share != 1 or config.guided_until_episode or config.guided_until_step:
+        always = "guided_share is 1, guided_until_episode and guided_until_step are 0"
+        raise UserError(f"a person watches every episode: {always}")
     for name in PRETENDED:
         if getattr(config, name):
             raise UserError(f"a person's actions are not replaced: {name} is 0")
@@ -260,90 +337,6 @@ class PersonGuide:
         applied = self._sitting.decide(observation, amount(policy_action))
         action = vector(applied.action)
         return Intervention(action, "person", applied.first) if applied.human else None
-
-
-class KeptBack:
-    """A ``Store`` that passes an episode's transitions on to ``store`` when it is told to."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._calls: list[Callable[[], None]] = []
-
-    def start_episode(self, observation: Observation) -> None:
-        """As ``Store.start_episode``, later."""
-        self._calls.append(lambda: self._store.start_episode(observation))
-
-    def add(self, *transition: Any, **guidance: Any) -> None:
-        """As ``Store.add``, later."""
-        self._calls.append(lambda: self._store.add(*transition, **guidance))
-
-    def release(self, discarded: bool) -> None:
-        """Store what was taken since the last call, or forget it."""
-        calls, self._calls = self._calls, []
-        for store in () if discarded else calls:
-            store()
-
-
-class UnhurriedLearning:
-    """``LearningThread`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
-
-    All else is the inner learner's own, and waits for the update that is under way.
-    """
-
-    def __init__(self, inner: LearningThread) -> None:
-        self._inner = inner
-        self._actor = copy.deepcopy(inner.learner.actor).eval()
-        inner.in_thread(_step_aside)
-
-    def __getattr__(self, name: str) -> Any:
-        self.settle()
-        return getattr(self._inner, name)
-
-    @property
-    def added(self) -> int:
-        """Transitions stored since the run began."""
-        return self._inner.added
-
-    def act(self, observation: Observation) -> Action:
-        """The action of the actor's copy, float32 [action size]."""
-        return self._actor.act(observation[None])[0]
-
-    def begin(self, beta: float) -> None:
-        """Start an update on what is stored, unless the last one is still under way."""
-        if self._tidy():
-            self._inner.begin(beta)
-
-    def finish(self) -> float:
-        """Nothing is waited for: 0 seconds."""
-        return 0.0
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
-        self.settle()
-        self._inner.load_state_dict(state)
-        self._copy_actor()
-
-    def close(self) -> None:
-        """Stop the updates' thread."""
-        self._inner.close()
-
-    def settle(self) -> None:
-        """Wait for the update that is under way."""
-        # In short waits: a signal that another thread took does not wake the main thread.
-        while not self._tidy():
-            time.sleep(LOOK_S)
-
-    def _tidy(self) -> bool:
-        """Finish an update that is done; False where one is not."""
-        if self._inner.updating:
-            return False
-        if self._inner.begun:
-            self._inner.finish()
-            self._copy_actor()
-        return True
-
-    def _copy_actor(self) -> None:
-        self._actor.load_state_dict(self._inner.learner.actor.state_dict())
 
 
 def _step_aside() -> None:

@@ -11,12 +11,10 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec import structs
 
 from bridge.fork import ForkedEnvironment, add_place, find_fork
@@ -29,7 +27,7 @@ from trainer.human.guide import Action, Driver, Observation
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
 from trainer.person.controls import Amount, amount, vector
-from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
+from trainer.person.interface import HUMANS, Person, Reading, View, add_person, open_person
 from trainer.person.recording import Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
@@ -101,8 +99,8 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
         return make_environment(asked.scenario), seed_of
     recorded, step = find_fork(asked.recording, asked)
-    own = recorded.environment(asked.scenario if ":" in asked.scenario else None)
-    name = scenario_of(recorded.origin.environment)
+    given = asked.scenario if ":" in asked.scenario else None  # No file names what is imported.
+    own, name = recorded.environment(given), scenario_of(given or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
     return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed
@@ -297,10 +295,8 @@ class Sitting:
             late_ticks=self.pacer.late,
             paused=self._paused,
             progress=self.progress,
-            cost=dict(self.cost),
             coach=self.coach.show(self.cost),
             message=message,
-            help=self.person.help,
         )
         self.person.show(view)
 
@@ -354,7 +350,7 @@ class Sitting:
         """Nothing of an episode has happened yet."""
         self._seed, self._number = seed, 0
         self._take_over, self._intent = TakeOver(), Intent(self.person.moving, self._rest)
-        self._reading, self._read_ns = LET_GO, 0
+        self._reading, self._read_ns = Reading(self._rest), 0
         self._applied = Applied(self._rest, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None
         self._human_steps = self._interventions = 0
@@ -365,8 +361,6 @@ class Sitting:
         """Ask the hands, and heed what they wish."""
         self._read_ns = time.time_ns()
         self._reading = self.person.poll(time.monotonic())
-        if np.size(self._reading.action) != np.size(self._rest):  # of hands that are off
-            self._reading = replace(self._reading, action=self._rest)
         wishes = self._reading.wishes
         self.stop |= "quit" in wishes
         self._restart |= "restart" in wishes

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from trainer.person.controls import Amount, amount, distance
-from trainer.person.interface import LET_GO, WISHES, Control, Moving, Reading, Wish
+from trainer.person.interface import WISHES, Control, Moving, Reading, Wish
 
 SILENCE_S = 0.5  # A driver who is not heard for this long has let go
 MAX_SLEW = 0.5
@@ -101,7 +101,8 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     at_ms: Annotated[float, msgspec.Meta(ge=0.0, le=1e15)]
     """The page's clock, sent back at once, so that the page knows the round trip."""
-    action: Share | Annotated[tuple[Share, ...], msgspec.Meta(max_length=MOST_ACTIONS)]
+    action: Share | Annotated[tuple[Share, ...], msgspec.Meta(max_length=MOST_ACTIONS)] | None
+    """None: hands off."""
     engaged: bool
     by_moving: bool = False  # Whether moving ``action`` takes over, too: a steering wheel
     wishes: Annotated[tuple[Wish, ...], msgspec.Meta(max_length=len(WISHES))] = ()
@@ -117,11 +118,11 @@ class Seat:
     """
 
     def __init__(self, rest: Amount = 0.0) -> None:
-        self._rest = rest
+        self._rest, self._off = rest, Reading(rest)
         self._lock = threading.Lock()
         self._pages: list[object] = []
         self._wishes: set[Wish] = set()
-        self._said = LET_GO
+        self._said = self._off
         self._tap: Reading | None = None
         """Pressed since the last poll: a tap shorter than a control period counts for one."""
         self._hands_were_off = False
@@ -159,12 +160,13 @@ class Seat:
             self._heard_s = now_s
             self._wishes |= set(said.wishes)
             # Nothing is held, and a wheel that takes over by moving is at rest.
-            resting = not said.by_moving or distance(said.action, self._rest) <= Moving.rest
+            action = self._rest if said.action is None else said.action
+            resting = not said.by_moving or distance(action, self._rest) <= Moving.rest
             self._hands_were_off |= resting and not said.engaged
             if not self._hands_were_off:
                 return False
             pressed = said.engaged and not self._said.engaged
-            self._said = Reading(said.action, said.engaged, by_moving=said.by_moving)
+            self._said = Reading(action, said.engaged, by_moving=said.by_moving)
             if pressed:
                 self._tap = self._said
             return True
@@ -172,14 +174,14 @@ class Seat:
     def poll(self, now_s: float) -> Reading:
         """What the driver does at ``now_s``; each wish once."""
         with self._lock:
-            said = self._said if now_s - self._heard_s <= SILENCE_S else LET_GO
-            if said is not LET_GO and not said.engaged and self._tap is not None:
+            said = self._said if now_s - self._heard_s <= SILENCE_S else self._off
+            if said is not self._off and not said.engaged and self._tap is not None:
                 said = self._tap
             self._tap = None
             wishes, self._wishes = frozenset(self._wishes), set()
             return Reading(said.action, said.engaged, wishes, said.by_moving)
 
     def _let_go(self) -> None:
-        self._said, self._tap = LET_GO, None
+        self._said, self._tap = self._off, None
         self._hands_were_off = False
         self._heard_s = float("-inf")

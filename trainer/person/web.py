@@ -149,7 +149,7 @@ class Cockpit:
     def show(self, view: View) -> None:
         """Show the newest view to every page."""
         self._shown += 1
-        self._tell(self._take_view, self._shown, view, time.monotonic())
+        self._tell(self._take_view, self._shown, view)
 
     def close(self) -> None:
         """Tell the pages that it is over, and end the thread."""
@@ -184,8 +184,8 @@ class Cockpit:
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
 
-    def _take_view(self, number: int, view: View, shown_s: float) -> None:
-        self._newest = (number, encode_view(view, number, shown_s))
+    def _take_view(self, number: int, view: View) -> None:
+        self._newest = (number, encode_view(view, number, self.help))
         for page in self._pages:
             page.wake.set()
 
@@ -254,7 +254,8 @@ class Cockpit:
                 return WSCloseCode.UNSUPPORTED_DATA
             try:
                 said = INPUT.decode(message.data)
-                distance(said.action, self.controls.rest)
+                if said.action is not None:
+                    distance(said.action, self.controls.rest)
             except (msgspec.MsgspecError, ValueError):  # or as many numbers as it has not
                 return WSCloseCode.POLICY_VIOLATION
             counts = self.seat.hear(page, said, time.monotonic())
@@ -298,8 +299,8 @@ def _encode(kind: str, **fields: Any) -> str:
     return _ENCODER.encode({"kind": kind, **fields}).decode()
 
 
-def encode_view(view: View, number: int, shown_s: float) -> str:
-    """View ``number``, from 1, which the loop gave at ``shown_s`` (``time.monotonic``).
+def encode_view(view: View, number: int, help: tuple[str, ...]) -> str:
+    """View ``number``, from 1; ``help`` says what to press for what, one line each.
 
     ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show; ``picture`` is
     base64 of a JPEG.
@@ -312,7 +313,7 @@ def encode_view(view: View, number: int, shown_s: float) -> str:
         Image.fromarray(view.picture).save(jpeg, "JPEG")
         fields["picture"] = jpeg.getvalue()
     ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
-    return _encode("view", number=number, shown_s=shown_s, ground=ground, **fields)
+    return _encode("view", number=number, help=help, ground=ground, **fields)
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:

@@ -32,7 +32,7 @@ from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import Layout, ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 from trainer.person.controls import controls_of
-from trainer.person.interface import LET_GO, Reading
+from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
@@ -252,7 +252,7 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_experts_rows_and_keys_are_found_by_name(capsys):
+def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
     env = make_environment(ROVER)
     env.reset(seed=0)
     for expert in (expert_of(env), expert_of(env, f"{__name__}:Careful")):
@@ -274,6 +274,9 @@ def test_experts_rows_and_keys_are_found_by_name(capsys):
     assert controls.rest == pytest.approx((-0.5, -1.0))
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)
     assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
+    monkeypatch.setattr(Rover, "keys", {"KeyQ": (0.0, 0.0)})
+    with pytest.raises(UserError, match="its keys q have a use"):  # It would end the sitting.
+        controls_of.__wrapped__(ROVER)
 
 
 def test_the_package_is_light_before_something_is_asked_for():
@@ -284,14 +287,15 @@ def test_the_package_is_light_before_something_is_asked_for():
 
 def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     env, hands = make_environment(ROVER), Reading((1.0, 0.5), engaged=True)
-    person = Puppet([LET_GO] * 3 + [hands] * 5)
+    off = Reading(controls_of(ROVER).rest)
+    person = Puppet([off] * 3 + [hands] * 5, then=off)
     sitting = Sitting(person, Recorder(tmp_path), env, speed=QUICK)
     drive(sitting, constant_driver(0.0, 2), abs, 1)
     sitting.close()
     steps = list(read_steps(sitting.recorder.path))
     assert [step.action for step in steps[2:5]] == [(0.0, 0.0), (0.5, 0.5), (1.0, 0.5)]
     assert steps[4].next_observation.tobytes() == steps[5].observation.tobytes()
-    assert json.loads(encode_view(person.views[4], 1, 0.0))["picture"]
+    assert json.loads(encode_view(person.views[4], 1, ()))["picture"]
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
     assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
     assert np.isfinite(model.learn(2))

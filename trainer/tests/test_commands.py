@@ -13,8 +13,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import public_pem
 from trainer.__main__ import main
-from trainer.options import add_time_limit, deadline_s, until
-from trainer.training.command import settings
+from trainer.options import add_time_limit, deadline_s
+from trainer.training.command import SETTINGS
 from trainer.training.config import RunConfig
 from trainer.util import save_torch
 
@@ -213,18 +213,6 @@ def test_minutes_count_from_now_and_none_is_no_limit():
     assert deadline_s(parser.parse_args([]).max_minutes) == math.inf
 
 
-@pytest.mark.parametrize(("left_s", "wanted"), [(math.inf, [0, 1, 2]), (-1.0, [0])])
-def test_nothing_is_begun_after_the_deadline(left_s, wanted):
-    begun = []
-
-    def parts():
-        for part in range(3):
-            begun.append(part)
-            yield part
-
-    assert list(until(time.monotonic() + left_s, parts())) == begun == wanted
-
-
 def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_path, capsys):
     words = "human --max-minutes 1e-6 --updates-per-episode 1 --refining-updates 100 --out"
     status, _, said = call(capsys, *words.split(), str(tmp_path))
@@ -241,7 +229,7 @@ def test_the_settings_are_listed_with_defaults_and_meanings_and_the_commands(cap
     assert status == 0
     assert max(map(len, out.splitlines())) <= 98
     assert "  batch_size=128                    transitions in a minibatch (table A5: N)\n" in out
-    assert [name for name in settings() if f"  {name}=" not in out] == []
+    assert [name for name in SETTINGS if f"  {name}=" not in out] == []
     # A bare command prints its help.
     status, out, _ = call(capsys)
     assert (status, "experiment" in out) == (0, True)

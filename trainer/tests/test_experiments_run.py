@@ -130,7 +130,7 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 class TestIds:
     def test_what_decides_changes_the_id_and_nothing_else_does(self, store, tmp_path, monkeypatch):
         def id_of(unit=GUIDED, where=store, **changes):
-            return planned.unit_id(unit, replace(TINY, **changes), where.humans)
+            return replace(where, plan=replace(TINY, **changes)).id(unit)
 
         elsewhere, nowhere = store_in(tmp_path / "elsewhere"), store_in(tmp_path / "nowhere")
         human = write_human(store)
@@ -160,7 +160,7 @@ class TestIds:
             assert later & {*found["config"], *found["switches"]} == names
         # Tests do not name the training.
         plans = (replace(TINY, test_runs=number) for number in (2, 9))
-        assert len({planned.training_id(UNIT, each, tmp_path) for each in plans}) == 1
+        assert len({replace(store, plan=each).run_dir(UNIT) for each in plans}) == 1
 
     def test_a_scene_that_does_another_thing_is_another_scene(self):
         nominal = planned.behaviour("left_turn", "nominal")

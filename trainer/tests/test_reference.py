@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.learner.config import ALGORITHMS, PHIL, Algorithm, LearnerConfig, starting_from
+from trainer.learner.config import ALGORITHMS, PHIL, Algorithm, LearnerConfig
 from trainer.learner.td3 import TD3Learner
 from trainer.tests.reference import ReferenceLearner
 from trainer.tests.test_td3 import SMALL, make_batch, same_weights, weights_of
@@ -52,7 +52,7 @@ def check(config: LearnerConfig, algorithm: Algorithm, humans: int = 4) -> None:
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm(name):
-    check(starting_from(SMALL, ALGORITHMS[name]), ALGORITHMS[name])
+    check(replace(SMALL, **ALGORITHMS[name].settings), ALGORITHMS[name])
 
 
 @pytest.mark.parametrize(

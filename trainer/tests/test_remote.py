@@ -144,7 +144,7 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
     end = VehicleEnd(Car(), parse_spec(spec), 0, frames(0))
     for tick in range(8):
         end.tick(frames(tick), answer)
-    assert end.answered_step == 7 - ticks
+    assert end._link.hold.newest_step == 7 - ticks
 
 
 def test_without_a_network_nothing_is_between():

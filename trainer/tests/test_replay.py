@@ -72,7 +72,7 @@ def test_a_batch_holds_what_was_stored_and_not_yet_forgotten(episodes, capacity,
     if len(buffer) == 0:
         return
     batch = sample(buffer)
-    spans = np.broadcast_to(1 if batch.spans is None else batch.spans, 64)
+    spans = np.broadcast_to(batch.spans, 64)
     for row, (before, now) in enumerate(batch.frames):
         older, rest, goal = source.stored[number(now)]
         assert number(now) in list(source.stored)[-len(buffer) :]

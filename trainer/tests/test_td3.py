@@ -10,7 +10,7 @@ from trainer.learner import networks
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import FEATURES, Actor, Critic, Picture
 from trainer.learner.replay import Batch
-from trainer.learner.td3 import TD3Learner
+from trainer.learner.td3 import NETWORKS, TD3Learner
 from trainer.tests.reference import ReferenceLearner
 
 SMALL = LearnerConfig(precision="float32", saturation_weight=0.0, tau=1e-3, picture_shift=0)
@@ -38,7 +38,7 @@ def make_batch(seed: int = 0, humans: int = 4, size: int = 12, foreseen: bool = 
 def weights_of(learner: TD3Learner | ReferenceLearner) -> dict[str, torch.Tensor]:
     return {
         name: torch.cat([p.detach().flatten() for p in getattr(learner, name).parameters()])
-        for name in ("actor", "critics", "target_actor", "target_critics")
+        for name in NETWORKS
     }
 
 
@@ -122,10 +122,10 @@ def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is
     learner = TD3Learner(config, PHIL, seed=0)
     for _ in range(150):
         learner.update(batch)
-    frames = torch.from_numpy(batch.frames.copy())
+    frames, critic = torch.from_numpy(batch.frames.copy()), learner.critics.first
     for action, worth in ((-0.5, 1.0), (0.5, -2.0)):
         with torch.no_grad():
-            value = learner.critics.first(frames, torch.full((8, 1), action))
+            value = critic.value(critic.picture(frames), torch.full((8, 1), action))
         torch.testing.assert_close(value, torch.full((8,), worth), atol=0.3, rtol=0)
 
 

@@ -101,11 +101,12 @@ def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
     commit = git("rev-parse", "HEAD")
     for path in (*written, paper / "fig7.png"):
         path.write_text("a run has written")
-    assert util.revision_of(code.parent) == commit
+    revision_of = util.source_revision.__wrapped__
+    assert revision_of(code.parent) == commit
     for path in (human, code):
         path.write_text("changed")
-        assert util.revision_of(code.parent) == f"{commit}-dirty"
+        assert revision_of(code.parent) == f"{commit}-dirty"
         path.write_text("as committed")
     # Outside of a repository it is unknown, and a process keeps the one that it began with.
-    assert util.revision_of(tmp_path.parent) == "unknown"
+    assert revision_of(tmp_path.parent) == "unknown"
     assert util.source_revision() is util.source_revision()

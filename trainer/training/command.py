@@ -12,7 +12,7 @@ import textwrap
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import count
 from os import PathLike
@@ -29,7 +29,7 @@ from edge_runtime.util import UserError, counted, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
 from trainer.environments import scenario_of
-from trainer.learner.config import ALGORITHMS, LearnerConfig, find_algorithm, starting_from
+from trainer.learner.config import ALGORITHMS, LearnerConfig, find_algorithm
 from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.pictures import write_learning_curve
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
@@ -50,11 +50,11 @@ OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threa
 """What an option of its own decides."""
 DEVICES = ("cpu", "cuda")
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
-LEARNERS = tuple(field.name for field in fields(LearnerConfig))
-OWN = tuple(
-    field.name for field in fields(RunConfig) if field.name not in (*OPTIONS, *EXTENT, "learner")
-)
-"""The run's own settings for ``--set``, besides the learner's."""
+SETTINGS: dict[str, Any] = {
+    **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
+    **asdict(DEFAULTS.learner),
+}
+"""Every setting that ``--set`` may change, with its default."""
 EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
 _STDERR = 2
 _ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
@@ -195,7 +195,7 @@ def train(
         latency=str(parse_spec(latency)),
         device=device,
         threads=threads,
-        learner=starting_from(start.learner, find_algorithm(algorithm)),
+        learner=replace(start.learner, **find_algorithm(algorithm).settings),
     )
     options.set_threads(threads)
     if isinstance(settings, Mapping):
@@ -329,16 +329,10 @@ class _Set(argparse.Action):
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
-def settings() -> dict[str, Any]:
-    """Every setting that ``--set`` may change, with its default."""
-    own = {name: getattr(DEFAULTS, name) for name in OWN}
-    return own | {name: getattr(DEFAULTS.learner, name) for name in LEARNERS}
-
-
 def setting_lines() -> Iterator[str]:
     """Every setting as it is typed by default, and what it means."""
     said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
-    for name, default in settings().items():
+    for name, default in SETTINGS.items():
         typed = str(default).lower() if isinstance(default, bool) else str(default)
         begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
         yield textwrap.fill(said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent)
@@ -352,17 +346,16 @@ def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     name, given, text = assignment.partition("=")
     if not given:
         raise UserError(f"--set {assignment}: expected NAME=VALUE")
-    known = settings()
-    if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
+    if name not in SETTINGS:
+        near = difflib.get_close_matches(name, SETTINGS, 1)
         guess = f"did you mean {near[0]}?" if near else "--set alone lists them"
         raise UserError(f"--set {assignment}: there is no setting {name!r}; {guess}")
-    kind = type(known[name])
+    kind = type(SETTINGS[name])
     try:
         value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
     except (ValueError, KeyError):
         raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
-    if name in LEARNERS:
+    if hasattr(config.learner, name):
         return replace(config, learner=replace(config.learner, **{name: value}))
     return replace(config, **{name: value})
 

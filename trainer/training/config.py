@@ -117,7 +117,10 @@ class RunConfig:
         """The same as a file for ``--config``."""
         values = self.as_dict()
         parts = values, values.pop("learner")
-        own, learner = ([f"{n} = {json.dumps(v)}" for n, v in part.items()] for part in parts)
+        own, learner = (
+            [f"{n} = {json.dumps(v, ensure_ascii=False)}" for n, v in part.items()]
+            for part in parts
+        )
         return "\n".join([*own, "", "[learner]", *learner, ""])
 
     @property

@@ -92,11 +92,6 @@ class VehicleEnd:
         self.braking = False
         """The vehicle brakes: no command has come for 2 T, or the command is a safe stop."""
 
-    @property
-    def answered_step(self) -> int:
-        """The tick whose state the obeyed command answers; -1 before the first command."""
-        return self._link.hold.newest_step
-
     def tick(self, observation: Observation, policy: Policy) -> Action:
         """What the vehicle does, float32 [action size], once the policy has answered what arrives.
 

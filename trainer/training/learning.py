@@ -81,11 +81,6 @@ class LearningThread:
         return self.replay.added
 
     @property
-    def begun(self) -> bool:
-        """Whether ``begin`` was called and ``finish`` not yet."""
-        return self._begun is not None
-
-    @property
     def updating(self) -> bool:
         """Whether ``finish`` would wait now."""
         return self._begun is not None and not self._begun[1].done()

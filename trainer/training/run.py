@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,10 @@ from trainer.environments import check_foresight, expert_of, foresee, layout_of,
 from trainer.human.guide import STUCK, Asking, Guide, HumanGuide, Inattentive, Intervention, Trigger
 from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
-from trainer.learner.td3 import TD3Learner
+from trainer.learner.td3 import NETWORKS, TD3Learner
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
 from trainer.training.delayed import DelayAware, DelayedPolicy
-from trainer.training.learning import Action, LearningThread
+from trainer.training.learning import LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
@@ -32,8 +32,6 @@ from trainer.training.metrics import (
     read_metrics,
     totals,
 )
-
-NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 
 
 @contextmanager
@@ -49,13 +47,6 @@ def divergence_said(episode: int) -> Iterator[None]:
             f"the training diverged in episode {episode + 1}: {error}; a smaller "
             "--set actor_learning_rate or critic_learning_rate may help"
         ) from None
-
-
-def finite_action(action: Action) -> Action:
-    """The action; FloatingPointError where it is none: no car is to be driven by it."""
-    if not np.isfinite(action).all():
-        raise FloatingPointError("its actions are no longer finite")
-    return action
 
 
 def check_weights(learner: TD3Learner) -> None:
@@ -78,11 +69,10 @@ class Seen:
     speed_mps: float  # After the step
 
 
-OnStep = Callable[[Seen], None]
-
-
 class TrainingRun:
     """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
+
+    learning_kind: ClassVar[type[LearningThread]] = LearningThread
 
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
@@ -98,8 +88,8 @@ class TrainingRun:
         if aware:
             seen = aware.space, aware.layout
         switches = config.learner, self.algorithm
-        self.learning = self._around(
-            LearningThread(*switches, config.seed, action_size, config.device, *seen)
+        self.learning = self.learning_kind(
+            *switches, config.seed, action_size, config.device, *seen
         )
         self.validation = Validation(config, run_dir, self.learning, aware)
         self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
@@ -108,7 +98,7 @@ class TrainingRun:
         self.gate: Asking | None = None  # Where the robot asks for help
         self.guide = self._make_guide()
         self.episode = self.steps = 0
-        self.on_step: OnStep | None = None
+        self.on_step: Callable[[Seen], None] | None = None
         """Called at the end of each control period, where the run is watched."""
         self.quitting = False  # The episode under way is to be the last of this call
         if resume:
@@ -198,7 +188,7 @@ class TrainingRun:
         path = self.run_dir / CHECKPOINT_FILE
         try:
             self._restore(util.load_torch(path))
-        except (KeyError, TypeError, RuntimeError) as error:
+        except (LookupError, TypeError, RuntimeError) as error:
             raise UserError(f"{path} does not fit this run") from error
 
     def _restore(self, state: dict[str, Any]) -> None:
@@ -213,10 +203,6 @@ class TrainingRun:
     def _must_stop(self, deadline_s: float) -> bool:
         """Whether the episode just driven is the last of this call."""
         return time.monotonic() > deadline_s
-
-    def _around(self, learning: LearningThread) -> LearningThread:
-        """The learner, or what a subclass puts around it."""
-        return learning
 
     def _make_guide(self) -> Guide | None:
         if not self.algorithm.guided:
@@ -248,6 +234,7 @@ class TrainingRun:
         ended = False
         while not ended:
             observation, ended, info = self._step(observation, guided, metrics)
+        learned = self.learning.end_episode(self.progress)
         return replace(
             metrics,
             total_steps=self.steps + metrics.steps,
@@ -256,7 +243,7 @@ class TrainingRun:
             distance_m=float(info["distance_m"]),
             outcome=info["outcome"],
             exploration_std=self._exploration_std(),
-            **self.learning.end_episode(self.progress),
+            **learned,
         )
 
     def _step(
@@ -325,7 +312,9 @@ class TrainingRun:
         return replace(intervention, action=wrong.astype(np.float32))
 
     def _explore(self, observation: NDArray[Any]) -> NDArray[np.float32]:
-        action = finite_action(self.learning.act(observation))
+        action = self.learning.act(observation)
+        if not np.isfinite(action).all():  # No car is to be driven by it.
+            raise FloatingPointError("its actions are no longer finite")
         c = self.config.learner
         self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
         noise = equations.exploration_noise(

@@ -118,9 +118,9 @@ def _cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "phil-hil"
 
 
-_FRAME = (45, 80)
-_FILTERS1, _FILTERS2, _SIDE = 6, 16, 6
-_FEATURES = 1792
+FRAME = (45, 80)
+FILTERS, SIDE = (6, 16), 6  # Of both convolutions; and the side of their kernels
+FEATURES = 1792  # 16 filters of 7 x 16: what two convolutions and poolings leave of a picture
 
 
 def trunk_features(
@@ -173,15 +173,15 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
     if torch.compiler.is_compiling() or torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
         return False
     shapes = (
-        (_FILTERS1, frames.shape[1], _SIDE, _SIDE),
-        (_FILTERS1,),
-        (_FILTERS2, _FILTERS1, _SIDE, _SIDE),
-        (_FILTERS2,),
+        (FILTERS[0], frames.shape[1], SIDE, SIDE),
+        (FILTERS[0],),
+        (FILTERS[1], FILTERS[0], SIDE, SIDE),
+        (FILTERS[1],),
     )
     found = [(each.dtype, each.device.type, tuple(each.shape)) for each in parameters]
     return (
         (frames.dtype, frames.device.type) == (torch.uint8, "cpu")
-        and frames.shape[1:] in ((1, *_FRAME), (2, *_FRAME))
+        and frames.shape[1:] in ((1, *FRAME), (2, *FRAME))
         and found == [(torch.float32, "cpu", shape) for shape in shapes]
         and load() is not None
     )
@@ -189,7 +189,7 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
 
 def _in_place(frames: Tensor) -> Tensor:
     """The frames, copied only if a picture's own frames do not lie one after the other."""
-    rows, columns = _FRAME
+    rows, columns = FRAME
     return frames if frames.stride()[1:] == (rows * columns, columns, 1) else frames.contiguous()
 
 
@@ -216,7 +216,7 @@ def _forward(
         _channels_innermost(weight2),
         bias2.contiguous(),
     )
-    features = torch.empty(frames.shape[0], _FEATURES)
+    features = torch.empty(frames.shape[0], FEATURES)
     library.trunk_forward(
         *_pictures(frames),
         *(tensor.data_ptr() for tensor in given),
@@ -251,10 +251,10 @@ class _Trunk(torch.autograd.Function):
         frames, weight2, *saved = ctx.saved_tensors
         given = (_channels_innermost(weight2), *saved, gradients[0].contiguous())
         results = (
-            torch.empty(_FILTERS1, _SIDE, _SIDE, frames.shape[1]),
-            torch.empty(_FILTERS1),
-            torch.empty(_FILTERS2, _SIDE, _SIDE, _FILTERS1),
-            torch.empty(_FILTERS2),
+            torch.empty(FILTERS[0], SIDE, SIDE, frames.shape[1]),
+            torch.empty(FILTERS[0]),
+            torch.empty(FILTERS[1], SIDE, SIDE, FILTERS[0]),
+            torch.empty(FILTERS[1]),
         )
         library.trunk_backward(
             *_pictures(frames),

@@ -3,7 +3,7 @@
 // The action is what pushes to the plus less what pushes to the minus; a stick or a wheel is both
 // in one axis, a pair of pedals is two.
 
-import { list, mix, shares, ways } from "./hands.js";
+import { list, mix, OFF, shares, ways } from "./hands.js";
 
 const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
 const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
@@ -50,7 +50,7 @@ export class Gamepads {
     this.changed = changed;
     this.scenario = this.controls = null;
     this.pad = null;
-    this.said = { action: 0, engaged: false, by_moving: false };
+    this.said = OFF;
     for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
       form[name].addEventListener("input", () => this.choose());
       form[name].addEventListener("change", () => form[name].blur()); // the arrow keys drive again
@@ -66,7 +66,7 @@ export class Gamepads {
     const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
     if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
     this.pad = pad;
-    const said = pad ? this.said_by(pad) : { action: 0, engaged: false, by_moving: false };
+    const said = pad ? this.said_by(pad) : OFF;
     const before = this.said;
     this.said = said;
     const was = list(before.action);

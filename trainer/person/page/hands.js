@@ -8,6 +8,7 @@ const WISHES = { KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "qu
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 const keyOf = (code) => code.replace(/^(Arrow|Key|Digit)/, "").toLowerCase();
+export const OFF = { action: null, engaged: false, by_moving: false };
 export const list = (action) => [].concat(action ?? 0);
 const plain = (values) => (values.length === 1 ? values[0] : values);
 
@@ -152,7 +153,7 @@ export class Pad {
   }
 
   now() {
-    if (!this.controls) return { action: 0, engaged: false, by_moving: false };
+    if (!this.controls) return OFF;
     const action = mix(this.controls, shares(this.at));
     return { action, engaged: this.finger !== null, by_moving: false };
   }

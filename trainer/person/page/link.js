@@ -1,5 +1,7 @@
 // The WebSocket: says what the hands do, hears views and echoes, and comes back when it is lost.
 
+import { OFF } from "./hands.js";
+
 const HEARTBEAT_MS = 100;
 const LEAST_MS = 1000 / 60; // between two inputs
 const SILENCE_MS = 500; // the trainer counts this as letting go, and so does the page
@@ -86,7 +88,7 @@ export class Link {
   // A hold counts only after hands off. What is held when a page is first there was pressed for it;
   // after a lost connection the hands themselves must let go.
   greet() {
-    this.send({ action: 0, engaged: false, by_moving: false });
+    this.send(OFF);
     this.dirty = true;
   }
 

@@ -11,9 +11,8 @@ from edge_runtime.tests.harness import wait_until
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person.alone import BehindTheScenes, Check
-from trainer.person.run import KeptBack, PersonRun, UnhurriedLearning
+from trainer.person.run import PersonRun, UnhurriedLearning
 from trainer.training.config import RunConfig
-from trainer.training.learning import LearningThread
 
 CONFIG = LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1)
 SOON_S = 30.0
@@ -25,20 +24,20 @@ def frames(value: int):
 
 
 @pytest.fixture
-def learning(one_thread):
-    inner = LearningThread(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
-    unhurried = UnhurriedLearning(inner)
+def unhurried(one_thread):
+    unhurried = UnhurriedLearning(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
     unhurried.start_episode(frames(0))
     for value in range(3):
         unhurried.add(ACTION, float(value), frames(value + 1), False, False)
-    yield inner, unhurried
+    unhurried.release(discarded=False)
+    yield unhurried
     unhurried.close()
 
 
 @pytest.fixture
-def gate(learning, monkeypatch):
+def gate(unhurried, monkeypatch):
     """Updates are held up until it is open."""
-    learner, gate = learning[0].learner, SimpleNamespace(open=threading.Event(), begun=0)
+    learner, gate = unhurried.learner, SimpleNamespace(open=threading.Event(), begun=0)
     update = learner.update
 
     def held_up(batch, beta=0.0):
@@ -50,65 +49,60 @@ def gate(learning, monkeypatch):
     return gate
 
 
-def test_while_an_update_hangs_everything_goes_on(learning, gate):
-    inner, unhurried = learning
+def test_while_an_update_hangs_everything_goes_on(unhurried, gate):
     before = unhurried.act(frames(7))
     unhurried.begin(0.0)
     for _ in range(5):
         np.testing.assert_array_equal(unhurried.act(frames(7)), before)
         unhurried.begin(0.0)
         assert unhurried.finish() == 0.0
-    assert inner.updating
+    assert unhurried.updating
     assert gate.begun <= 1
     gate.open.set()
     unhurried.settle()
     assert np.any(unhurried.act(frames(7)) != before)
 
 
-def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learning, gate):
-    _, unhurried = learning
-    episode = KeptBack(unhurried)
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurried, gate):
     unhurried.begin(0.0)
     for discarded, reward in ((True, 9.0), (False, 3.0)):
-        episode.start_episode(frames(10))
-        episode.add(ACTION, reward, frames(11), False, True)
-        episode.add(-ACTION, reward + 1.0, frames(12), True, False)
+        unhurried.start_episode(frames(10))
+        unhurried.add(ACTION, reward, frames(11), False, True)
+        unhurried.add(-ACTION, reward + 1.0, frames(12), True, False)
         assert unhurried.added == 3
         if discarded:
-            episode.release(discarded)
+            unhurried.release(discarded)
     threading.Timer(0.05, gate.open.set).start()
-    episode.release(discarded=False)
-    episode.release(discarded=False)
+    unhurried.release(discarded=False)
+    unhurried.release(discarded=False)
     state = unhurried.state_dict()["replay"]
     assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert state["human"].tolist() == [False, False, False, True, False]
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_the_next_update_begins_when_the_last_is_done(learning, gate):
-    inner, unhurried = learning
+def test_the_next_update_begins_when_the_last_is_done(unhurried, gate):
     gate.open.set()
     for _ in range(3):
         unhurried.begin(0.0)
-        wait_until(lambda: not inner.updating, "the update's end")
+        wait_until(lambda: not unhurried.updating, "the update's end")
     unhurried.settle()
     assert gate.begun == 3
 
 
-def test_what_an_update_raises_comes_out(learning, monkeypatch):
-    inner, unhurried = learning
-    monkeypatch.setattr(inner.learner, "update", Mock(side_effect=RuntimeError("no more memory")))
+def test_what_an_update_raises_comes_out(unhurried, monkeypatch):
+    fail = Mock(side_effect=RuntimeError("no more memory"))
+    monkeypatch.setattr(unhurried.learner, "update", fail)
     unhurried.begin(0.0)
     with pytest.raises(RuntimeError, match="no more memory"):
         unhurried.settle()
 
 
-def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
-    _, unhurried = learning
+def test_a_restored_learner_acts_as_the_one_that_was_saved(unhurried):
     unhurried.begin(0.0)
     unhurried.settle()
     state, action = unhurried.state_dict(), unhurried.act(frames(7))
-    other = UnhurriedLearning(LearningThread(CONFIG, ALGORITHMS["phil_td3"], 5, 1))
+    other = UnhurriedLearning(CONFIG, ALGORITHMS["phil_td3"], 5, 1)
     assert np.any(other.act(frames(7)) != action)
     other.load_state_dict(state)
     np.testing.assert_array_equal(other.act(frames(7)), action)

@@ -25,7 +25,7 @@ def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=No
 
 def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_path):
     readings = [LET_GO, LET_GO, hold(-1.0), hold(-1.0), hold(-1.0), LET_GO, LET_GO, LET_GO, LET_GO]
-    _, steps, views, _ = drive_and_read(tmp_path, readings)
+    _, steps, views, sitting = drive_and_read(tmp_path, readings)
     assert [s.action for s in steps[:9]] == [0.5, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0, 0.5, 0.5]
     assert [s.human for s in steps[:9]] == [False] * 2 + [True] * 5 + [False] * 2
     assert [s.first for s in steps[:9]] == [False] * 2 + [True] + [False] * 6
@@ -38,7 +38,7 @@ def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_pat
     for step, view in zip(steps, driven[1:], strict=False):
         assert (view.applied_action, view.control) == (step.action, step.control)
     given = 0.1 * sum(step.human for step in steps)
-    assert views[-1].cost == {"human_s": pytest.approx(given), "takeovers": 1, "failures": 0}
+    assert sitting.cost == {"human_s": pytest.approx(given), "takeovers": 1, "failures": 0}
 
 
 def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):

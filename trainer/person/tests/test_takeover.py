@@ -111,6 +111,15 @@ def test_after_a_silence_the_hands_must_be_off_once_and_a_wheel_at_rest(seat, of
     assert seat.poll(late_s + 0.2).action == 0.8
 
 
+def test_hands_that_are_off_say_the_environments_rest():
+    seat = Seat(rest=-1.0)
+    seat.sit_down(1)
+    assert seat.poll(0.0) == Reading(-1.0)
+    seat.hear(1, Input(at_ms=0.0, action=None, engaged=False, by_moving=True), 0.0)
+    assert seat.poll(0.0) == Reading(-1.0, by_moving=True)
+    assert seat.hear(1, HOLD, 0.1), "the wheel was at rest"
+
+
 def test_a_tap_between_two_polls_counts_for_one_and_a_hold_ends_with_its_release(seat):
     take_over(seat)
     seat.hear(1, OFF, 0.05)
