@@ -173,6 +173,8 @@ def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -
     except ViewerGone as gone:
         why = viewer.last_words(END_S) or gone.why
         viewer.end()
+        with contextlib.suppress(ViewerGone):  # The first cause is the one to tell.
+            viewer.leave(recording)
         raise ViewerGone(why) from None
     finally:
         try:

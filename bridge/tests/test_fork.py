@@ -17,6 +17,7 @@ import numpy as np
 import onnx
 import pytest
 
+from bridge.bisect import first_change
 from bridge.environments import describe, make_environment
 from bridge.fork import ForkedDrive, RecordedEpisode
 from bridge.messages import Origin
@@ -281,9 +282,22 @@ def bisected(path: Path, runs: Path) -> dict:
 STOPS, GOES = -1.0, 0.4  # From 2 s on in the recorded drive 1 the first waits, the other arrives
 
 
-@pytest.mark.parametrize("planted", [1, 5, 12, 19])
-def test_bisection_finds_the_policy_that_was_planted(tmp_path, monkeypatch, planted):
+@pytest.mark.parametrize("goes", [True, False])
+@pytest.mark.parametrize("planted", range(1, 20))
+def test_bisection_finds_every_place(planted, goes):
+    tried = set()
+
+    def arrives(number):
+        tried.add(number)
+        return (number >= planted) == goes
+
+    assert first_change(20, arrives) == (planted, True)
+    assert len(tried) <= 9
+
+
+def test_bisection_finds_the_policy_that_was_planted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    planted = 12
     runs = policies(tmp_path / "run", [STOPS] * planted + [GOES] * (20 - planted))
     found = bisected(LEFT_TURN, runs)
     names = [f"after_{number:03d}.onnx" for number in (planted - 1, planted)]

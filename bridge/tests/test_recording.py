@@ -205,6 +205,7 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
         wait_until(lambda: len(states_in(recording)) > 10, "a second")
         for options in ([], ["--out", str(folder / "other.mcap")]):  # Not while it grows.
             assert bridge_status(["repair", str(recording), *options]) == 2
+        time.sleep(1.2)  # Just after a flush there would be nothing to lose.
         run.process.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.process.wait()

@@ -76,6 +76,12 @@ def test_install_upgrade_back_and_away(board: Board):
         shown = board.status()
         assert (shown["current"], shown["previous"]) == (two.manifest.version, one.manifest.version)
         assert shown["service"] == "active"
+        broken = board.root / "releases" / one.manifest.version
+        broken /= "site-packages/edge_runtime/safety.py"
+        whole = broken.read_bytes()
+        broken.write_bytes(b"")
+        refused(board.run("rollback"), one.manifest.version, "is damaged")
+        broken.write_bytes(whole)
         assert board.run("rollback", "--settle", "0.2").returncode == 0
         assert drives(3) == 0.1
     assert board.status()["current"] == one.manifest.version

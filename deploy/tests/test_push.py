@@ -65,19 +65,23 @@ def push(far, board, workshop):
     return pushed
 
 
-@pytest.mark.parametrize("name", ["install.pyz", "trust.pub", "-q.tar", "two words;id.tar"])
 def test_a_push_installs_a_bundle_of_any_name_and_leaves_nothing_behind(
-    far, board, push, workshop, name, capfd
+    far, board, push, workshop, capfd
 ):
-    made, bundle = workshop.make(0.1), far / name
-    bundle.write_bytes(made.path.read_bytes())
-    Path(f"{bundle}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
-    assert push("phil@board", bundle, "--service", "none") == 0
-    assert f"current: {made.manifest.version}" in capfd.readouterr().out
+    made = workshop.make(0.1)
+    for name in ("install.pyz", "trust.pub", "-q.tar", "two words;id.tar"):
+        bundle = far / name
+        bundle.write_bytes(made.path.read_bytes())
+        Path(f"{bundle}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
+        (far / "log").write_text("")
+        assert push("phil@board", bundle, "--service", "none") == 0
+        said = capfd.readouterr().out
+        assert f"verified {made.manifest.version}" in said
+        assert f"current: {made.manifest.version}" in said
+        assert list((far / "home").iterdir()) == []
+        log = (far / "log").read_text().splitlines()
+        assert [line.split()[0] for line in log] == PROGRAMS
     assert board.status()["current"] == made.manifest.version
-    assert list((far / "home").iterdir()) == []
-    log = (far / "log").read_text().splitlines()
-    assert [line.split()[0] for line in log] == PROGRAMS
 
 
 def test_a_dry_run_says_each_step_and_does_none(far, board, push, workshop, capsys):
