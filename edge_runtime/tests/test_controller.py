@@ -345,12 +345,7 @@ def test_a_vehicle_without_the_policys_action_is_refused():
     with pytest.raises(UserError, match="do not meet"):
         shared_limits([PEDAL], {"pedal": ActionLimit(2.0, 3.0, 1.0)})
     vehicle = {"steering": ActionLimit(1.0, 3.0, 1.0)}
-    assert shared_limits([STEERING], vehicle)["steering"] == (
-        1.0,
-        1.0,
-        1.0,
-        None,
-    )  # they meet there
+    assert shared_limits([STEERING], vehicle)["steering"] == (1.0, 1.0, 1.0, None)  # they meet
     controller = make(actions=(STEERING,), vehicle=vehicle)
     begin(controller, 0, 0.0, 0.0)
     assert controller.tick(0.2).action == [1.0]  # where it holds is within them from the start

@@ -9,13 +9,14 @@ from typing import Any, List
 from unittest.mock import MagicMock
 
 import pytest
+import zenoh
 
 from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.reach import look
 from edge_runtime.run import say_what_is_missing
-from edge_runtime.tests.harness import HEALTH
+from edge_runtime.tests.harness import HEALTH, wait_until
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 
@@ -69,6 +70,17 @@ def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, cla
         presence.look()
         assert give_way.call_count == times_given
     assert len(presence.known) == rivals
+
+
+def test_a_token_that_could_not_be_declared_is_tried_again(session):
+    session.info.routers_zid.return_value = ["router"]
+    declare = session.liveliness().declare_token
+    declare.side_effect = [zenoh.ZError("not now"), MagicMock(), MagicMock()]
+    presence = Presence(session, "k", lambda: session, lambda: None)
+    presence.thread.start()
+    wait_until(lambda: declare.call_count == 3, "the second try")
+    presence.undeclare()
+    assert not presence.thread.is_alive()
 
 
 def test_nobody_there_is_nobody_else(session):

@@ -109,10 +109,12 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     python38 = find_python38()
     if python38 is None:
         pytest.skip("no Python 3.8 on PATH or under ~/.pyenv")
-    subprocess.run([python38, "-m", "venv", str(tmp_path / "board")], check=True)
+    create = [python38, "-m", "venv", "--without-pip", str(tmp_path / "board")]
+    subprocess.run(create, check=True)
     python = str(tmp_path / "board" / "bin" / "python")
     # Most of what is installed is never imported here: what is, Python compiles by itself.
-    pip(python, "install", "--no-compile", "--only-binary=:all:", wheel, "-r", LOCK)
+    install = ("install", "--no-compile", "--only-binary=:all:", wheel, "-r", LOCK)
+    pip(python38, "--python", python, *install)
     signed = make_policy("mean")
     flags = (signed.path, "--public-key", signed.public_key)
     checked = run(python, "-m", "edge_runtime", "check", *flags, cwd=tmp_path)

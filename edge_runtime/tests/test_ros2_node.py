@@ -95,7 +95,7 @@ def test_the_second_library_and_ours_understand_each_other(message):
     assert 0 <= len(theirs) - len(ours) < 4
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(
     MESSAGES, st.sampled_from([b"", b"\0\0\0\0", b"\0\1\0\0"]), st.binary(max_size=1200), st.data()
 )

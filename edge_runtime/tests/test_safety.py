@@ -103,19 +103,14 @@ def test_the_fifth_fresh_state_recovers(mode, before, rearmed, without, with_veh
         assert rules.classify_fresh(safety, True, needs_rearm) is Event.FINAL
 
 
-def test_silence_begins_after_two_periods_and_one_lost_state_is_none():
-    safety = note_arrival(Safety(T), "a", 10.0)
-    assert rules.is_silent(Safety(T), 0.0)
-    assert [rules.is_silent(safety, now_s) for now_s in (10.21, 10.221)] == [False, True]
-    # A state exactly as old as the limit is still in time.
-    assert not rules.is_silent(Safety(T, last_fresh_s=0.0), 2.2 * T)
-
-
 def test_only_what_drives_may_be_silent_for_as_long_as_it_rides():
     for mode, silent_s in ((STANDBY, 0.22), (DRIVE, 0.72), (STOP, 0.22)):
         safety = note_arrival(Safety(T, mode, ride_s=0.5), "a", 0.0)
         assert round(safety.answer_s, 9) == 0.22
         assert [rules.is_silent(safety, silent_s + by_s) for by_s in (-1e-6, 1e-6)] == [False, True]
+    assert rules.is_silent(Safety(T), 0.0)
+    # A state exactly as old as the limit is still in time.
+    assert not rules.is_silent(Safety(T, last_fresh_s=0.0), 2.2 * T)
 
 
 def test_the_readme_shows_the_table():  # written out a second time, from the contract

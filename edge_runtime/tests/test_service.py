@@ -145,7 +145,8 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     settings = tmp_path / "edge.toml"
     settings.write_text("log_format = 'json'\ncpus = [4095]\n")
     environment = {"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "400000"}
-    flags = [*make_policy().flags, "--connect", free_endpoint(), "--config", str(settings)]
+    endpoint = free_endpoint()
+    flags = [*make_policy().flags, "--connect", endpoint, "--config", str(settings)]
     with EdgeProcess(*flags, environment=environment) as edge:
         assert edge.ready_line.startswith("ready ")
         assert systemd.next() == "READY=1\nSTATUS=standby"
@@ -161,7 +162,8 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
     assert "this process may use" in lines[0]["help"]
-    assert "connection refused" in lines[1]["why"]
+    nobody = f"nobody listens on port {endpoint.split(':')[1]} of 127.0.0.1 (connection refused)"
+    assert lines[1]["why"] == nobody
     assert lines[2]["accepted"] == 0
 
 
@@ -296,7 +298,7 @@ def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
     assert control.health().vehicle_fault == "the battery is hot"
 
 
-def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
+def test_tens_of_thousands_of_states_leave_the_memory_as_it_is(running):
     control, link, _ = running(Notifier({}))
 
     def send(steps: range) -> int:
@@ -309,11 +311,11 @@ def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
         return sys.getallocatedblocks()
 
     settled = send(range(5_000))
-    # The windows of latencies may still fill; one object kept for each state would be 95,000.
-    assert send(range(5_000, 100_000)) - settled < 10_000
+    # The windows of latencies may still fill; an object kept for each tenth state would be 3,000.
+    assert send(range(5_000, 35_000)) - settled < 3_000
     health = control.health()
-    assert health.accepted == 100_000
-    assert health.rejected == {"malformed": 10_000, "duplicate": 10_000}
+    assert health.accepted == 35_000
+    assert health.rejected == {"malformed": 3_500, "duplicate": 3_500}
     assert health.superseded > 0
 
 

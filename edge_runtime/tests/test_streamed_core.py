@@ -153,16 +153,6 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig)
     assert rig.speed_mps > 0
 
 
-def test_without_a_fresh_command_it_stops_within_the_promise(rig):
-    last_s = rig.driving().core._wished_s
-    assert rig.core.late_at_s == last_s + 0.24 < last_s + 0.25  # the stream ticks then, too
-    count = len(rig.asked)
-    rig.step(100)
-    assert rig.core.late_at_s == math.inf
-    stopped_s = next(time_s for time_s, speed_mps in rig.asked[count:] if speed_mps == 0)
-    assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
-
-
 @pytest.mark.parametrize(
     ("action", "speed_mps", "words"),
     [
@@ -270,6 +260,8 @@ def test_the_core_goes_where_the_table_says(rig, state, event):
         assert core._wish is core_wish
 
 
+DRIVES: list = [("enable",), ("tick", 6), ("command", 1.0, 0.0, None), ("tick", 1)]
+"""Chance alone hardly ever moves it."""
 WILD = st.floats(allow_nan=False, allow_infinity=False)
 HAPPENINGS = st.one_of(
     st.tuples(st.just("tick"), st.integers(1, 20)),
@@ -282,18 +274,19 @@ HAPPENINGS = st.one_of(
 
 
 @pytest.mark.parametrize("make_rig", [HunterRig, Ros2Rig])
-@example([("enable",), ("tick", 6), ("command", 6e307, 0.0, None), ("tick", 1)])  # inf * 0 s
+@example([("command", 6e307, 0.0, None), ("tick", 1)])  # inf * 0 s
 @given(st.lists(HAPPENINGS, max_size=60))
 def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(make_rig, happenings):
     rig, commanded_s, may_move = make_rig("congestion"), -1e9, False
-    for what, *values in happenings:
+    for what, *values in [*DRIVES, *happenings]:
         if what == "tick":
             for _ in range(*values):
-                count = len(rig.asked)
+                count, before = len(rig.asked), rig.core.state
                 rig.step()
                 for speed_mps in filter(None, rig.speeds(count)):
                     assert may_move
-                    assert rig.core.state is State.ENABLED
+                    # What the vehicle then said may have stopped it in the same step.
+                    assert State.ENABLED in (before, rig.core.state)
                     assert 0.0 < speed_mps <= SPEC.max_speed_mps
                     assert rig.now_s - commanded_s <= 0.25 + STREAM_S
         elif what == "command":

@@ -185,6 +185,7 @@ def test_all_that_end_a_process_are_interrupts(all_at_default):
     ending = util.ending_signals()
     assert {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM} <= ending
     assert {signal.SIGUSR1, signal.SIGALRM, signal.SIGABRT, signal.SIGPIPE} <= ending
+    assert signal.SIGRTMIN in ending
     assert not {signal.SIGCHLD, signal.SIGCONT, signal.SIGTSTP, signal.SIGSEGV} & ending
     with sigterm_as_interrupt():
         for number in ending:

@@ -70,6 +70,10 @@ class BrokenVehicle(MockVehicle):
         self._ask("brake" if latch else "stand")
         super().brake(now_s, latch)
 
+    def close(self):
+        self.asked.append("close")
+        super().close()
+
     def _ask(self, what):
         self.asked.append(what)
         if self.broken == "command":
@@ -99,24 +103,38 @@ def runner(vehicle):
     runner.close()
 
 
-def test_a_driver_that_raises_is_silent_and_its_thread_lives_on(vehicle, runner):
+@pytest.mark.parametrize(
+    ("name", "wrong", "right"),
+    [
+        ("broken", "feedback", ""),
+        ("odd", {"speed_mps": None}, {}),
+        ("odd", {"action": {"pedal": "full"}}, {}),
+        ("odd", {"faults": 3}, {}),
+    ],
+)
+def test_a_driver_that_raises_or_reports_nonsense_is_silent_and_its_thread_lives_on(
+    vehicle, runner, name, wrong, right
+):
     wait_until(lambda: runner.heard, "feedback")
-    vehicle.broken = "feedback"
-    wait_until(lambda: runner.faults, "the fault")
-    assert runner.fault(runner.silent_at_s + 0.001) == SILENT
-    vehicle.broken = ""
-    count = len(runner.heard)
-    wait_until(lambda: len(runner.heard) > count, "feedback again")
-
-
-@pytest.mark.parametrize("odd", [{"speed_mps": None}, {"action": {"pedal": "full"}}, {"faults": 3}])
-def test_a_report_that_is_none_is_silence_and_the_brake_still_comes(vehicle, runner, odd):
-    wait_until(lambda: runner.heard, "feedback")
-    vehicle.odd = odd
+    setattr(vehicle, name, wrong)
     wait_until(lambda: runner.faults, "the fault")
     assert runner.fault(runner.silent_at_s + 0.001) == SILENT
     runner.command(make_command(mode=SAFE_STOP))
     wait_until(lambda: vehicle.asked == ["brake"], "the brake")
+    setattr(vehicle, name, right)
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count, "feedback again")
+
+
+def test_a_driver_that_raises_at_a_re_arm_still_reports_and_brakes(vehicle, runner):
+    vehicle.broken = "command"
+    runner.enable()
+    wait_until(lambda: vehicle.asked == ["enable"], "the attempt")
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count + 1, "feedback")
+    vehicle.broken = ""
+    runner.command(make_command(mode=SAFE_STOP))
+    wait_until(lambda: vehicle.asked[-1] == "brake", "the brake")
 
 
 def test_a_report_in_numbers_of_numpy_is_one(vehicle, runner):
@@ -168,7 +186,7 @@ def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
     vehicle.released.set()
     runner._thread.join(10.0)
     runner.close()
-    assert vehicle.asked == ["brake"]
+    assert vehicle.asked == ["brake", "close"]
 
 
 def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
@@ -365,6 +383,9 @@ def test_it_follows_commands_and_brakes_by_itself_without_them():
     assert driving.action["steering"] == pytest.approx(0.5, abs=1e-3)
     for after_s, brakes in ((0.2, False), (0.21, True)):
         assert vehicle.feedback(1.9 + after_s).self_braking == brakes
+    vehicle.control_period_s = 0.5
+    assert [vehicle.feedback(1.9 + late_s).self_braking for late_s in (0.99, 1.01)] == [False, True]
+    vehicle.control_period_s = T
     stopped = vehicle.feedback(10.0)
     assert stopped.speed_mps == 0.0
     assert stopped.action == pytest.approx({"pedal": -1.0, "steering": 0.5}, abs=1e-3)

@@ -68,11 +68,7 @@ WHOLE = {
         ("carts:", {}, "cannot be loaded"),
         ("carts:number", {}, "carts:number is no edge_runtime.vehicles.base.Vehicle"),
         ("carts:Half", {}, "no whole Vehicle: it lacks brake, close, command, feedback"),
-        (
-            "carts:Boundless",
-            {},
-            "cart: its limits must be like {'pedal': ActionLimit.*not {",
-        ),
+        ("carts:Boundless", {}, "cart: its limits must be like {'pedal': ActionLimit.*not {"),
         ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
         ("milk_cart", {"port": "ttyS9"}, "milk_cart cannot be opened: .*no such port"),
         ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`; known are dead_time_s"),
@@ -125,18 +121,6 @@ def test_a_streamed_command_holds_for_two_periods_of_the_policy(make, period_s, 
     rig.enabled().core.command(PEDAL, rig.now_s)
     assert rig.core.late_at_s == pytest.approx(rig.now_s + holds_s)
     assert rig.core._heard.silence_s == pytest.approx(2 * period_s)
-
-
-def test_the_mock_holds_a_command_for_two_periods_of_the_policy():
-    vehicle = MockVehicle()
-    vehicle.control_period_s = 0.5
-    vehicle.enable(0.0)
-    vehicle.command(PEDAL, 0.0)
-    assert [vehicle.feedback(at_s).self_braking for at_s in (0.3, 0.99, 1.01)] == [
-        False,
-        False,
-        True,
-    ]
 
 
 class Noting(MockVehicle):
