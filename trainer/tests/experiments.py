@@ -16,7 +16,7 @@ from trainer.experiments.run import Store
 from trainer.human.model import HumanModel, HumanModelConfig
 
 TINY = replace(
-    QUICK, steps=dict.fromkeys(SCENARIOS, 290), learner={"batch_size": 4, "warmup_steps": 80}
+    QUICK, steps=dict.fromkeys(SCENARIOS, 290), learner={"batch_size": 4, "warmup_steps": 240}
 )
 UNIT = Unit("left_turn", "per_td3", "normal", 1)
 """No human guides it."""

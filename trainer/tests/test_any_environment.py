@@ -15,6 +15,7 @@ from gymnasium.spaces import Box, Dict
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import evaluate, export, train
+from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
 from trainer.environments import (
     Adapted,
@@ -237,10 +238,7 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     directory = str(run.directory)
     words = ["--config", f"{directory}/config.toml", "--episodes", "5", "--resume"]
     words += ["--out", directory]
-    done = subprocess.run(
-        [sys.executable, "-m", "trainer", "train", *words], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    assert main(["train", *words]) == 0
     assert len(run.metrics) == 5
 
 

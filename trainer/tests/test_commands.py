@@ -54,10 +54,6 @@ WRONG = [
     *(f"picture expert --out {words}" for words in (
         "{tmp}/p.png --time -1", "/dev/null/p.png",
     )),
-    *(f"{words} --out ''" for words in (
-        "train", "drive", "human", "evaluate expert", "export {tmp}", "plot {tmp}",
-        "picture expert", "bench",
-    )),
     "train --out {tmp}/file/x", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
     "plot {tmp} --out {tmp}/c.pdf", "plot {tmp} --out {tmp}/c.txt", "view {tmp} --save ''",
     "picture {tmp}/nobody --out {tmp}/p.png", "human --out {tmp}/file", "bench --threads -1",

@@ -1,5 +1,8 @@
+import contextlib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -11,7 +14,7 @@ from edge_runtime.util import UserError
 from trainer import drivers
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes, drive_together
+from trainer.evaluation import CONDITIONS, Drive, drive_episodes, drive_together, evaluate
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 
@@ -86,12 +89,32 @@ def brightness(observations):
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
-@pytest.mark.parametrize("condition", ["nominal", "noise"])
-@pytest.mark.parametrize("lanes", [1, 3, 8])
-def test_side_by_side_is_one_after_the_other(scenario, condition, lanes):
-    env, drive, seeds = make_environment(scenario), brightness.act_together, range(5)
-    wanted, nominal = (drive_episodes(env, brightness, seeds, it) for it in (condition, "nominal"))
-    assert (wanted == nominal) == (condition == "nominal")
-    envs = [make_environment(scenario) for _ in range(lanes)]
-    assert drive_together(envs, drive, seeds, condition) == wanted
-    assert drive_together(envs, drive, [], condition) == []
+def test_side_by_side_is_one_after_the_other(scenario):
+    env, seeds, driven = make_environment(scenario), range(5), []
+    for condition in ("nominal", "noise"):
+        wanted = drive_episodes(env, brightness, seeds, condition)
+        for lanes in (3, 8):  # Fewer than episodes, and more.
+            envs = [make_environment(scenario) for _ in range(lanes)]
+            assert drive_together(envs, brightness.act_together, seeds, condition) == wanted
+            assert drive_together(envs, brightness.act_together, [], condition) == []
+        driven.append(wanted)
+    assert driven[0] != driven[1]
+
+
+def test_an_evaluation_is_behind_its_network():
+    (alone,), (late,) = (
+        evaluate("constant:1", "left_turn", runs=1, latency=spec).episodes
+        for spec in ("none", "300ms")
+    )
+    assert (alone.actions[0], late.actions[0], late.actions[-1]) == ([1.0], [0.0], [1.0])
+
+
+def test_noise_is_a_twentieth_of_the_commands_domain():
+    env: Any = SimpleNamespace(reset=lambda seed: (0, {}), step=Mock(side_effect=StopIteration))
+    done = []
+    for seed in range(400):
+        with contextlib.suppress(StopIteration):
+            Drive(env, seed, CONDITIONS["noise"].noise_std).step(np.zeros(1, np.float32))
+        done.append(float(env.step.call_args.args[0][0]))
+    assert np.std(done) == pytest.approx(0.1, rel=0.1)
+    assert CONDITIONS["nominal"].noise_std == CONDITIONS["dense"].noise_std == 0.0

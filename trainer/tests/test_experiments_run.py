@@ -46,6 +46,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert record["totals"]["steps"] == ends[-1] >= TINY.steps["left_turn"]
     assert record["tested_actor_at_step"] in record["validation"]["at_step"]
     assert record["human"] is None
+    assert not any(record["training"]["human_steps"] + record["training"]["takeovers"])
     assert record["computed"]["processor"]
     # It says what was trained: enough to train it again by hand.
     config = planned.run_config(UNIT, TINY, straight.humans).as_dict()
@@ -60,11 +61,11 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
 
 
 def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
-    """The whole command, killed at a checkpoint as a power cut would."""
+    """A process, killed at a checkpoint as by a power cut."""
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
         "from trainer.experiments import run as running; "
-        f"running.run_units([running.Task(UNIT, store_in(Path({str(tmp_path)!r})))], 1)"
+        f"running.compute(running.Task(UNIT, store_in(Path({str(tmp_path)!r}))))"
     )
     command = [sys.executable, "-c", code]
     process = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
@@ -82,13 +83,16 @@ def test_two_processes_share_one_file_of_records_and_a_failure_is_one_units(stor
     write_human(store)
     bad, alone = GUIDED._replace(scenario="congestion"), GUIDED._replace(seed=0)
     write_human(store, bad.scenario).write_bytes(b"no human")
-    units = [bad, GUIDED, alone._replace(algorithm=planned.HUMAN_MODEL)]
+    floor = alone._replace(algorithm=planned.CONSTANT)
+    units = [bad, floor, alone._replace(algorithm=planned.HUMAN_MODEL)]
     ends = running.run_units([running.Task(unit, store) for unit in units], 2)
     assert ends == {running.FINISHED: 2, running.FAILED: 1}
     assert list(store.records("left_turn")) == sorted(units[1:])
     assert set(store.find(units)[0]) == set(units[1:])
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
     assert str(bad) in line
+    record = store.records("left_turn")[floor]
+    assert record["success_of"][f"{record['action']:g}"] == max(record["success_of"].values())
 
 
 def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
@@ -110,11 +114,12 @@ def test_a_unit_is_not_trained_again_but_tests_that_change_are_driven_with_its_a
     assert {len(ours["tests"][condition]["outcome"]) for condition in CONDITIONS} == {5}
 
 
-def test_the_floor_is_searched_and_driven(store):
-    unit = planned.Unit("left_turn", planned.CONSTANT, planned.NORMAL, 0)
-    assert running.compute(running.Task(unit, store)) == running.FINISHED
-    record = store.records("left_turn")[unit]
-    assert record["success_of"][f"{record['action']:g}"] == max(record["success_of"].values())
+def test_the_records_that_are_kept_are_of_todays_settings(tmp_path):
+    humans = ROOT / "results/humans/paper"
+    store = running.Store(planned.PLAN, ROOT / "results/paper", tmp_path, humans)
+    done, others = store.find(planned.units_of(["all"], 5, None))
+    assert done
+    assert not others
 
 
 @pytest.mark.parametrize("damage", ["{", "{}", '{"id": "a", "unit": {}, "tests": {}}', "3"])

@@ -31,6 +31,12 @@ def exported() -> Export:
     return export_policy(make_actor(), LABEL, {"gamma": 0.95})
 
 
+@pytest.fixture(autouse=True)
+def few_observations(exported, monkeypatch):
+    """Of an export in a test; the one that they share had all."""
+    monkeypatch.setattr(export_module, "PARITY_OBSERVATIONS", 20)
+
+
 def test_the_file_is_what_the_contract_says(exported):
     model = onnx.load_from_string(exported.model)
     assert model.ir_version == 8
@@ -79,9 +85,11 @@ def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, t
     assert not (tmp_path / "policy.onnx.sig").exists()
 
 
-def test_an_envelope_goes_into_the_export_of_the_network_that_it_was_measured_with(tmp_path):
+def test_an_envelope_goes_into_the_export_of_the_network_that_it_was_measured_with(
+    exported, tmp_path
+):
     path, limits = tmp_path / "policy.onnx", dict.fromkeys(ACCURACY, 7.0)
-    write_policy(export_policy(make_actor(), LABEL, {}).model, path, None)
+    write_policy(exported.model, path, None)
     envelope = {
         "policy_id": "as it was measured", "env": "left_turn", "condition": "nominal",
         "promised_success": 0.95, "confidence": 0.95, "limits": limits, "joint": 1.0,

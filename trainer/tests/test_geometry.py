@@ -3,7 +3,6 @@ import math
 
 import numpy as np
 import pytest
-from highway_env.road.lane import CircularLane, StraightLane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,28 +70,6 @@ def test_the_path_is_smooth_and_turns_left_by_a_quarter():
     assert steps == pytest.approx([0.01] * len(steps), rel=1e-3)
     assert poses[0].heading - poses[-1].heading == pytest.approx(math.pi / 2)
     assert (poses[-1].x, poses[-1].y) == pytest.approx((-4 - 5.57, -2.0), abs=0.02)
-
-
-def _highway_lanes(end_m: float) -> list[StraightLane | CircularLane]:
-    """The path as highway-env's own lanes."""
-    centre, radius_m = (path.centre_x, path.centre_y), path.radius_m
-    exit_start = (path.centre_x, path.centre_y - radius_m)
-    exit_end = (exit_start[0] - (end_m - path.straight_m - path.arc_m), exit_start[1])
-    return [
-        StraightLane((path.start_x, path.start_y), (path.start_x, path.centre_y)),
-        CircularLane(centre, radius_m, 0.0, -0.5 * math.pi, clockwise=False),
-        StraightLane(exit_start, exit_end),
-    ]
-
-
-def test_highway_lanes_follow_the_path():
-    s_m = 0.0
-    for lane in _highway_lanes(end_m=21.0):
-        middle = lane.position(0.5 * lane.length, 0.0)
-        pose = path.pose(s_m + 0.5 * lane.length)
-        assert tuple(middle) == pytest.approx((pose.x, pose.y), abs=1e-6)
-        s_m += lane.length
-    assert s_m == pytest.approx(21.0)
 
 
 view = pictures.Rasteriser(left_m=-20.0, top_m=-11.25, metres_per_pixel=0.5)

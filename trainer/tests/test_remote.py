@@ -147,13 +147,6 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
     assert end._link.hold.newest_step == 7 - ticks
 
 
-def test_without_a_network_nothing_is_between():
-    for spec, there in (("none", False), ("1ms", True)):
-        between = DelayedPolicy(Kept(), Car(), parse_spec(spec))
-        between.start(frames(0), 0)
-        assert isinstance(between._vehicle_end, VehicleEnd) is there
-
-
 class Told:
     """Keeps what a policy that knows the delay is told, and what is stored of it."""
 

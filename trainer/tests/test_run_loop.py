@@ -12,7 +12,6 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.network import parse_spec
 from edge_runtime.util import UserError
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.human.guide import Intervention
@@ -132,6 +131,7 @@ def trained(directory, length=1, outcome="goal", human_steps=(), reason="collisi
     config = replace(CONFIG, **changes, learner=replace(LEARNER, **learner))
     run = scripted_run(directory, config, length, outcome, human_steps, reason)
     run.told = []
+    run.save = lambda: None  # A checkpoint of 13 MB that nobody reads.
     run.train(run.told.append)
     return run
 
@@ -214,8 +214,9 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
 
 
 def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
-    run = scripted_run(tmp_path, CONFIG, length=7, human_steps=(4, 5))
-    run.policy = DelayedPolicy(run.learning, run.env, parse_spec("up.loss=100%"))
+    config = replace(CONFIG, latency="up.loss=100%")
+    run = scripted_run(tmp_path, config, length=7, human_steps=(4, 5))
+    run.policy = DelayedPolicy(run.learning, run.env, run.network)
     run.train()
     assert run.env.braked == [False, False, True, False, False, True, True]
 

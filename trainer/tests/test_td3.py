@@ -94,21 +94,6 @@ def test_an_update_sees_shifted_pictures():
     assert plain.policy != shifted.policy
 
 
-def test_same_seed_same_weights_and_a_restored_learner_goes_on_alike():
-    first, second = (TD3Learner(SMALL, PHIL, seed=7) for _ in range(2))
-    for seed in range(3):
-        first.update(make_batch(seed))
-        second.update(make_batch(seed))
-    restored = TD3Learner(SMALL, PHIL, seed=99)
-    restored.load_state_dict(first.state_dict())
-    for learner in (first, second, restored):
-        learner.update(make_batch(9))
-        learner.decay_learning_rates(0.5)
-        learner.update(make_batch(10))
-    assert same_weights(first, second)
-    assert same_weights(first, restored)
-
-
 def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is_not():
     batch = replace(
         make_batch(size=8, humans=8),
@@ -120,7 +105,7 @@ def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is
     )
     config = replace(SMALL, critic_learning_rate=2e-3, intervention_penalty=-2.0)
     learner = TD3Learner(config, PHIL, seed=0)
-    for _ in range(150):
+    for _ in range(60):
         learner.update(batch)
     frames, critic = torch.from_numpy(batch.frames.copy()), learner.critics.first
     for action, worth in ((-0.5, 1.0), (0.5, -2.0)):
