@@ -1,7 +1,7 @@
 """The campaigns: what they say of their rows, each driven once, and a rig of real processes."""
 
 import json
-from itertools import chain, repeat
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -13,7 +13,14 @@ from hil_tests import campaign as reports
 from hil_tests import sweep
 from hil_tests.__main__ import main
 from hil_tests.faults.rig import free_bus
-from hil_tests.processes import POLICY, operator, trusting
+from hil_tests.processes import (
+    POLICY,
+    CommandTimeoutError,
+    Process,
+    operator,
+    trusting,
+    wait_until,
+)  # fmt: skip
 
 DELAY = sweep.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = sweep.Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
@@ -95,6 +102,8 @@ def test_a_row_joins_its_parts():
     assert row["ticks_without_new_command"] == 0.1
     assert row["latency_ms"] == {"p50": 1.0, "p99": 130.0}
     assert row["rejected"] == {"stale": 4}
+    assert (row["tick_overruns"], row["episode_time_s"]) == (2, 2.0)
+    assert row["surviving_distance_m"]["value"] == 20.0
 
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
@@ -120,21 +129,42 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
     assert drive_network.call_count == 1
 
 
-def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
-    edges: list[str] = []
-    limits_s = chain((0.1,), repeat(120.0))
-    start, wait = sweep.Process.__init__, sweep.Process.wait
+def test_a_drive_is_driven_anew_or_in_halves_and_not_for_ever(monkeypatch):
+    task = sweep.Task(POLICY, "any", "left_turn", "nominal", 1, 3)
+    answers: list[Any] = []
+    driven: list[tuple[int, int]] = []
 
-    def note(self, *words, **options):
-        edges.extend(words[:1] if words[0] == "edge_runtime" else ())
-        start(self, *words, **options)
+    def rig(_, part):
+        driven.append(part[1:])
+        if isinstance(answer := answers.pop(0), Exception):
+            raise answer
+        report = report_of(part.seed, ["goal"] * part.runs)
+        return {**report, "success_rate": 1.0, "wall_clock_stalls": answer}
 
-    monkeypatch.setattr(sweep.Process, "__init__", note)
-    monkeypatch.setattr(sweep.Process, "wait", lambda self, _limit_s: wait(self, next(limits_s)))
-    task = sweep.Task(POLICY, "any", "left_turn", "nominal", 1, 1)
-    (found,) = sweep.drive_network(task, sweep.Part("none", 1, 1))
-    assert len(found["episodes"]) == 1
-    assert len(edges) == 2
+    monkeypatch.setattr(sweep, "run_rig", rig)
+    for passing in (CommandTimeoutError("hangs"), UserError("port 1 is in use")):
+        driven.clear()
+        answers[:] = [passing, 1, 0, 0]
+        found = sweep.drive_network(task, sweep.Part("none", 1, 3))
+        assert driven == [(1, 3), (1, 3), (1, 2), (3, 1)]
+        assert [each["seed"] for part in found for each in part["episodes"]] == [1, 2, 3]
+    for bad, said in (([1] * 9, "too little processor time"), ([UserError("no such")], "no such")):
+        answers[:] = bad
+        with pytest.raises(UserError, match=said):
+            sweep.drive_network(task, sweep.Part("none", 1, 1))
+    with (
+        pytest.raises(CommandTimeoutError, match=r"did not end within 0\.1 s"),
+        Process("http.server", "0", "--bind", "127.0.0.1") as process,
+    ):
+        process.wait(0.1)
+    assert process.has_ended
+
+
+def test_a_process_has_crashed_where_nobody_ended_it():
+    with Process("json.tool", "nowhere") as failed, Process("http.server", "0") as ended:
+        wait_until(lambda: failed.has_ended, "its end")
+        ended.end()
+        assert (failed.crashed(), ended.crashed()) == (True, False)
 
 
 def test_an_environment_that_knows_no_success_has_no_campaign(monkeypatch, tmp_path):

@@ -2,8 +2,9 @@
 
 import fnmatch
 import threading
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -102,6 +103,23 @@ def test_a_process_that_is_gone_is_a_failed_try_and_ends_no_campaign():
     outcome = Outcome()
     assert not _try(ROW, gone, 3, outcome)
     assert outcome.failures == ["try 3: the chassis is gone"]
+
+
+def test_what_a_rig_saw_counts(tmp_path, monkeypatch):
+    seen = observe.Timeline(states=STATES, commands=[command(action=[1.01])], unreadable=1)
+    rig = MagicMock(timeline=seen, crashes=["edge"])
+    rig.__enter__.return_value = rig
+    monkeypatch.setattr("hil_tests.faults.run.Rig", Mock(return_value=rig))
+    found = run_row(ROW, (), TASK, tmp_path, 1, lambda name: None, threading.Event())
+    assert (len(found.unsafe), found.crashes) == (2, ["edge"])
+
+
+def test_a_slower_policy_has_more_time(monkeypatch):
+    later_s = observe.later_s(msgspec.structs.replace(TASK, control_period_s=0.3))
+    assert later_s == pytest.approx(0.4)
+    for reaction_s, recovery_s, late in ((0.649, 1.999, 0), (0.651, 2.001, 1)):
+        found = report_row(ROW, Outcome(tries=[Try(reaction_s, recovery_s)]), later_s)
+        assert (found["reactions_late"], found["recoveries_late"]) == (late, late)
 
 
 def test_a_campaign_that_has_ended_begins_no_try(tmp_path):

@@ -527,7 +527,7 @@ class Pair:
         self.mock.switch(name, on, self.now_s)
 
 
-@pytest.mark.parametrize("phase", range(6))
+@pytest.mark.parametrize("phase", range(0, 6, 2))
 @pytest.mark.parametrize("name", rules.FAULTS)
 def test_a_fault_stops_it_is_named_and_only_enabling_moves_it_again(name, phase):
     pair = Pair().enabled().run(1.5 + phase * 0.0171)

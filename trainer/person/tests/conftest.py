@@ -6,11 +6,10 @@ from contextlib import closing
 
 import pytest
 
+from trainer.person import devices
 from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
-from trainer.tests.conftest import one_thread
-
-__all__ = ["browser", "cockpit", "one_thread", "opened", "runner"]
+from trainer.tests.test_commands import call
 
 FAKE_PADS = """
 globalThis.pads = {};
@@ -48,6 +47,18 @@ def browser(runner):
     context = open_browser([FAKE_PADS])
     yield runner.run(context.__aenter__())
     runner.run(context.__aexit__(None, None, None))
+
+
+@pytest.fixture
+def sit_down(monkeypatch, tmp_path, capsys, one_thread):
+    """Run a command with somebody else at the keyboard; its status, stdout and stderr."""
+
+    def sit_down(person, *command):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
+        return call(capsys, *command, "--speed", "1000")
+
+    return sit_down
 
 
 @pytest.fixture

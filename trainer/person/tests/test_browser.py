@@ -119,34 +119,34 @@ LONG_ADVICE = advise([Episode(0, "collision", 0.0, 0)] * 10, None, {})
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
-@pytest.mark.parametrize("size", TOUCHED, ids=str)
-async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, size, scenario):
-    width, height = size
-    viewport = {"width": width, "height": height}
-    async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
-        await page.goto(cockpit.url)
-        said = Coaching(LONG_ADVICE, "", "", [], [], 0.0, [])
-        cockpit.show(replace(first_view(scenario), coach=said))
-        await until(page, f"{READY} && document.getElementById('advice').textContent")
-        boxes = await page.evaluate(
-            "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
-            "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
-        )
-        for box in boxes.values():
-            assert box["left"] >= 0
-            assert box["right"] <= width
-            assert box["bottom"] <= height
-        assert boxes["pad"]["width"] >= 240
-        assert boxes["pad"]["height"] >= 190
-        assert boxes["scene"]["width"] >= 0.55 * width
-        pad, road = boxes["pad"], boxes["scene"]
-        assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
+async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, scenario):
+    said = Coaching(LONG_ADVICE, "", "", [], [], 0.0, [])
+    async with open_browser(is_mobile=True, has_touch=True) as page:
+        for width, height in TOUCHED:
+            await page.set_viewport_size({"width": width, "height": height})
+            await page.goto(cockpit.url)  # Laid out anew.
+            cockpit.show(replace(first_view(scenario), coach=said))
+            await until(page, f"{READY} && document.getElementById('advice').textContent")
+            boxes = await page.evaluate(
+                "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
+                "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
+            )
+            for box in boxes.values():
+                assert box["left"] >= 0, (width, height)
+                assert box["right"] <= width, height
+                assert box["bottom"] <= height, width
+            pad, road = boxes["pad"], boxes["scene"]
+            assert pad["width"] >= 240, (width, height)
+            assert pad["height"] >= 190, (width, height)
+            assert road["width"] >= 0.55 * width, height
+            beside = pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
+            assert beside, (width, height)
 
 
-@pytest.mark.parametrize("name", ["policy", "human", "applied"])
-async def test_colours_are_those_of_every_view(browser, name):
-    shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
-    assert await browser.evaluate(shown) == f"rgb{BY_NAME[name]}"
+async def test_colours_are_those_of_every_view(browser):
+    for name in ("policy", "human", "applied"):
+        shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
+        assert await browser.evaluate(shown) == f"rgb{BY_NAME[name]}"
 
 
 async def test_a_gamepads_triggers_drive_while_its_button_is_held(browser, cockpit):

@@ -10,7 +10,6 @@ import pytest
 from bridge.report import STOPPED
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
 from trainer.environments import make_environment
-from trainer.person import devices
 from trainer.person.interface import LET_GO, Reading
 from trainer.person.recording import find_recordings, read_steps
 from trainer.person.tests.people import (
@@ -95,18 +94,6 @@ def test_without_a_screen_it_says_what_to_do(capfd, tmp_path, monkeypatch, drive
     assert "--human web needs none" in refusal(capfd, "drive", "--out", str(tmp_path / "rec"))
 
 
-@pytest.fixture
-def sit_down(monkeypatch, tmp_path, capsys, one_thread):
-    """Run a command with somebody else at the keyboard; its status, stdout and stderr."""
-
-    def sit_down(person, *command):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
-        return call(capsys, *command, "--speed", "1000")
-
-    return sit_down
-
-
 TRAIN_HERE = ("train", "--human", "keyboard", "--out", "run")
 
 
@@ -178,7 +165,13 @@ def demonstrated(index: int):
 def test_a_human_model_learns_what_the_hands_did(capsys, tmp_path, monkeypatch, one_thread):
     monkeypatch.chdir(tmp_path)
     letting_go = recorded_step(1, 8, control="returning", human=True, human_action=0.0)
-    record(Path("a"), [*map(demonstrated, range(8)), letting_go, recorded_step(1, 9)])
+    thrown_away = [
+        recorded_step(1, n, episode=1, step=n - 10, control="human", human=True, first=n == 10,
+                      outcome="discarded" if n == 11 else "")
+        for n in (10, 11)
+    ]  # fmt: skip
+    whole = [*map(demonstrated, range(8)), letting_go, recorded_step(1, 9)]
+    record(Path("a"), [*whole, *thrown_away])
     record(Path("b"), [demonstrated(0)])
     status, out, errors = call(
         capsys, *["human", "--from", "a", "b", "--episodes", "3", "--out", "me"]
@@ -190,24 +183,6 @@ def test_a_human_model_learns_what_the_hands_did(capsys, tmp_path, monkeypatch, 
     driver, _ = load_driver("me", make_environment("left_turn"))
     assert driver.act(np.full((2, 45, 80), 200, np.uint8))[0] > 0.3
     assert driver.act(np.full((2, 45, 80), 20, np.uint8))[0] < -0.3
-
-
-THREE_EPISODES = [
-    recorded_step(
-        1, index, episode=index // 2, step=index % 2, control="human", human=True,
-        first=index % 2 == 0, outcome="discarded" if index == 5 else "",
-    )
-    for index in range(6)
-]  # fmt: skip
-"""Of two steps each, all the person's; the last episode was thrown away."""
-
-
-def test_what_was_thrown_away_is_not_imitated(capsys, tmp_path, one_thread):
-    record(tmp_path / "rec", THREE_EPISODES)
-    command = ("human", "--from", str(tmp_path / "rec"), "--episodes", "1")
-    status, out, _ = call(capsys, *command, "--out", str(tmp_path / "me"))
-    assert status == 0
-    assert "from 4 demonstrated steps" in out
 
 
 def test_a_person_is_not_imitated_in_what_they_threw_away(sit_down):

@@ -20,7 +20,6 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import write_policy
 from trainer.__main__ import main as trainer
 from trainer.drivers import BEST_FILE
-from trainer.person import devices
 from trainer.person.interface import LET_GO
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.person.tests.people import QUIT, Puppet, hold
@@ -28,7 +27,7 @@ from trainer.tests.test_commands import call, refusal
 from trainer.util import load_torch, save_torch
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]
-FORK = ["drive", "--human", "keyboard", "--speed", "1000", "--from", "drive.mcap", "--at", "0.95s"]
+FORK = ["drive", "--human", "keyboard", "--from", "drive.mcap", "--at", "0.95s"]
 
 
 @pytest.fixture
@@ -47,17 +46,6 @@ def recorded(tmp_path, monkeypatch, one_thread) -> RecordedEpisode:
         ForkedDrive(begun, environment, 0, policy, out=out).run()
         out.finish(dropped=0)
     return read_episode(Path("drive.mcap"), None, None)
-
-
-@pytest.fixture
-def sit_down(recorded, monkeypatch, capsys):
-    """Run a command with somebody else at the keyboard; its status, stdout and stderr."""
-
-    def sit_down(person, *command):
-        monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
-        return call(capsys, *command)
-
-    return sit_down
 
 
 def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(

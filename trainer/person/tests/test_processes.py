@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import shutil
 import subprocess
@@ -25,7 +24,6 @@ from trainer.person.tests.browser import (
     PERSON_DRIVES,
     POLICY_DRIVES,
     address,
-    find_chromium,
     open_browser,
     quit_sitting,
     until,
@@ -192,12 +190,7 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
 APPLIED = "document.querySelector('.bar.applied output').textContent"
 
 
-@pytest.mark.skipif(
-    find_chromium() is None, reason="no Chromium (Debian: apt-get install chromium)"
-)
-def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
-    pytest.importorskip("playwright")
-
+def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path, runner):
     async def sit(url):
         async with open_browser() as page:
             await page.goto(url)
@@ -210,7 +203,7 @@ def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
 
     web = Training(tmp_path / "run", "--human", "web", "--set", "warmup_steps=8")
     with closing(web) as training:
-        asyncio.run(sit(address(training.process)))
+        runner.run(sit(address(training.process)))
         status, errors = training.end()
     assert status == 0, errors
     steps = all_in_replay(training.run_dir)

@@ -110,7 +110,7 @@ def test_a_restored_learner_acts_as_the_one_that_was_saved(unhurried):
     other.close()
 
 
-def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either():
+def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):
     behind = BehindTheScenes(RunConfig())
     for _ in range(2):
         behind.begin(Check(Actor(), 1, 0.0, {}))
@@ -118,6 +118,7 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
         wait_until(lambda: not behind.busy, "the answer's absence")
         assert behind.take() is None
     behind.close()
+    assert capsys.readouterr().err.count("no validation beside the drive") == 1
 
 
 @pytest.mark.parametrize(

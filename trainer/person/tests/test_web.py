@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from contextlib import ExitStack, closing, suppress
+from pathlib import Path
 from unittest.mock import Mock
 from urllib.parse import urlsplit
 
@@ -50,7 +51,8 @@ async def test_what_a_page_holds_or_wishes_is_polled_and_its_closing_is_letting_
     assert not cockpit.present
 
 
-async def test_a_page_that_falls_silent_has_let_go_and_is_disconnected(cockpit):
+async def test_a_page_that_falls_silent_has_let_go_and_is_disconnected(cockpit, monkeypatch):
+    monkeypatch.setattr(web, "GONE_S", 0.6)
     async with page(cockpit) as link:
         await say(link)
         await say(link, True, 1.0)
@@ -157,15 +159,9 @@ async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
     assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
     assert headers["Referrer-Policy"] == "no-referrer"
     assert "default-src 'self'" in headers["Content-Security-Policy"]
-    served = (
-        "cockpit.js",
-        "coach.js",
-        "hands.js",
-        "link.js",
-        "gamepad.js",
-        "scene.js",
-        "cockpit.css",
-    )
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    assert (headers["Cache-Control"], headers["X-Content-Type-Options"]) == ("no-store", "nosniff")
+    served = [path.name for path in (Path(web.__file__).parent / "page").glob("*.[jc]s*")]
     for name in (*served, "server.py", "..%2fserver.py"):
         assert (await status_of(cockpit.url + name))[0] == (200 if name in served else 404), name
     assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
