@@ -38,7 +38,7 @@ demo: $(STAMP)  ## train with a human's guidance, export, and drive through a se
 # Tests often wait for processes, so that two cores serve three workers. A test's networks are small:
 # where each process computes with all cores, threads only wait for each other.
 test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
