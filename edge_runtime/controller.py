@@ -120,11 +120,11 @@ class Controller:
         armed_at_start: bool = True,
         task: str = "",
         ride: Optional[Ride] = None,
-        link: Optional[LinkQuality] = None,
+        link_quality: Optional[LinkQuality] = None,
     ) -> None:
         self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
         self._ride = ride
-        self.link = link  # of a policy with an envelope; the shell notes what comes and goes
+        self.link_quality = link_quality  # of a policy with an envelope; the shell feeds it
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._policy_is_dead = False
@@ -252,7 +252,7 @@ class Controller:
         if rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
-        if self.link is not None and (refusal := self.link.refusal()):
+        if self.link_quality is not None and (refusal := self.link_quality.refusal()):
             return refusal
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)
@@ -276,7 +276,7 @@ class Controller:
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
-        if self.link is not None and self.link.outside:
+        if self.link_quality is not None and self.link_quality.outside:
             return Event.OUTSIDE
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 

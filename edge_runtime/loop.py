@@ -59,7 +59,7 @@ class ControlLoop:
         self._policy, self._controller, self._link = policy, controller, link
         self._vehicle, self._notifier = vehicle, notifier
         self._hold, self._rearm_command = hold, rearm_command
-        self._link_quality = controller.link
+        self._link_quality = controller.link_quality
         self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
         self._board = BoardWatch()
         self._logged_rejection_s: Dict[str, float] = {}  # by reason

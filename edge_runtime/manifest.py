@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Envelope, Reason, Rejection
+from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Reason, Rejection, Versioned
 
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 2
@@ -119,7 +119,7 @@ def decode_manifest(text: str) -> Manifest:
     """The manifest of a policy file. Raises UserError where it is none, or none we can drive."""
     try:
         # The schema first: another schema's fields need not fit.
-        schema = msgspec.json.decode(text.encode(), type=Envelope).schema
+        schema = msgspec.json.decode(text.encode(), type=Versioned).schema
         if schema != MANIFEST_SCHEMA:
             found = f"the manifest has schema {schema}, this runtime reads {MANIFEST_SCHEMA}"
             raise UserError(f"{found}; export the policy again")

@@ -189,14 +189,14 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 Message = Union[State, Command, Feedback, Health]
 
 
-class Envelope(msgspec.Struct):
+class Versioned(msgspec.Struct):
     """What every version of a message has."""
 
     schema: int
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
-_ENVELOPE = msgspec.msgpack.Decoder(Envelope)
+_VERSIONED = msgspec.msgpack.Decoder(Versioned)
 _DECODERS: Dict[Any, Any] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
 }
@@ -263,7 +263,7 @@ def _decode(
         return Rejection(Reason.OVERSIZED, detail)
     try:
         # The schema first: another schema's fields need not fit, and that is no malformed message.
-        schema = _ENVELOPE.decode(payload).schema
+        schema = _VERSIONED.decode(payload).schema
         if schema != SCHEMA:
             return Rejection(Reason.SCHEMA, f"schema {schema}, this side speaks {SCHEMA}")
         message: _M = _DECODERS[kind].decode(payload)

@@ -23,7 +23,7 @@ from bridge.episode import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Driver, Expert, Reason
-from trainer.learner.replay import PAPERS, Layout
+from trainer.learner.replay import FRAMES_LAYOUT, Layout
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.environment import Scene
 
@@ -90,7 +90,7 @@ def task_of(env: Any) -> Task:
 
 def layout_of(env: Any) -> Layout:
     """How the environment's observations lie in an array."""
-    return PAPERS if env.scenario in SCENARIOS else env.layout
+    return FRAMES_LAYOUT if env.scenario in SCENARIOS else env.layout
 
 
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:

@@ -47,7 +47,7 @@ from edge_runtime.cli import examples, sigterm_as_interrupt
 from edge_runtime.util import UserError, counted
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS, Reason
-from trainer.learner.networks import PICTURES
+from trainer.learner.networks import FRAMES_SPACE
 from trainer.person.controls import Amount, amount, vector
 from trainer.person.recording import Step, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
@@ -384,7 +384,7 @@ class TrainingLog:
                 self._draw_road(read_scene(entry.scene))
             elif entry.scene is not None:
                 self._recording.log("road", rr.Image(entry.scene, color_model="RGB"))
-            if entry.frames.shape == PICTURES.shape:
+            if entry.frames.shape == FRAMES_SPACE.shape:
                 for name, frame in zip(("before", "now"), entry.frames, strict=True):
                     self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
 

@@ -442,7 +442,7 @@ class Quality:
 
 def test_outside_the_envelope_it_stops_and_is_not_armed():
     link = Quality()
-    controller = make(needs_rearm=True, link=link)
+    controller = make(needs_rearm=True, link_quality=link)
     play(controller, [FIRST])
     link.outside = link.why = "too late"
     play(controller, [*states(0.1, 3, "outside_envelope"), (0.35, "rearm", "too late")])
@@ -456,7 +456,7 @@ def test_outside_the_envelope_it_stops_and_is_not_armed():
 
 def test_without_a_vehicle_it_waits_outside_and_drives_on_inside():
     link = Quality()
-    controller = make(link=link)
+    controller = make(link_quality=link)
     play(controller, [FIRST])
     link.outside = "too late"
     play(controller, states(0.1, 20, "outside_envelope"))

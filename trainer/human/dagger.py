@@ -139,8 +139,8 @@ class HumanTraining:
         """One episode; the number of take-overs, and the outcome."""
         c = self.config
         # One episode in so many; with a share of 0 none is.
-        demonstrated = c.demonstrated_share and episode % c.demonstrated_share == (
-            c.demonstrated_share - 1
+        demonstrated = c.demonstrate_every and episode % c.demonstrate_every == (
+            c.demonstrate_every - 1
         )
         seed = episode_seed(self.seed, Purpose.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)

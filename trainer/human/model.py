@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_runtime.util import UserError
 from trainer.environments import make_environment
 from trainer.human.guide import Driver
-from trainer.learner.networks import PICTURES, Actor, tensors
+from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
 from trainer.util import FROM_ONE, Purpose, check_ranges, load_torch, random_stream, save_torch
 
 MODEL_FILE = "human_model.pt"
@@ -37,7 +37,7 @@ class HumanModelConfig:
     """Table A7: maximum episode number of its training."""
     updates_per_episode: int = 60
     """Gradient steps after each episode. Not in the paper."""
-    demonstrated_share: int = 2
+    demonstrate_every: int = 2
     """The person drives the whole of one episode in this many, from the second on; 0: never.
     Interventions alone, the paper's only source, show little of what right driving looks like
     when nothing goes wrong."""
@@ -68,9 +68,9 @@ class HumanModel(Driver):
         config: HumanModelConfig,
         seed: int,
         action_size: int = 1,
-        space: Space[Any] = PICTURES,
+        space: Space[Any] = FRAMES_SPACE,
     ) -> None:
-        self.config, self._pictures = config, space.shape == PICTURES.shape
+        self.config, self._pictures = config, space.shape == FRAMES_SPACE.shape
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames, space)

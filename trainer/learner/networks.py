@@ -46,7 +46,7 @@ def multiplies_bfloat16(device_type: str) -> bool:
 HIDDEN = (256, 128, 64)
 
 
-PICTURES = Box(0, 255, (2, *FRAME), np.uint8)
+FRAMES_SPACE = Box(0, 255, (2, *FRAME), np.uint8)
 """The paper's observation: frames [t-1, t]."""
 UNBOUNDED = 1e6  # A bound beyond this is none: a number is not divided by it
 SMALL_SIDE = 8  # A picture is halved until it is no larger
@@ -159,7 +159,7 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
     assert isinstance(space, Box)
     if not is_picture(space.dtype, space.shape):
         return Numbers(space)
-    return Trunk(frames) if space.shape == PICTURES.shape else Convolutions(space.shape)
+    return Trunk(frames) if space.shape == FRAMES_SPACE.shape else Convolutions(space.shape)
 
 
 class Picture(nn.Module):
@@ -170,7 +170,9 @@ class Picture(nn.Module):
     ``more_inputs`` of that layer, beside the features, count in its initial weights.
     """
 
-    def __init__(self, frames: int = 2, more_inputs: int = 0, space: Space[Any] = PICTURES) -> None:
+    def __init__(
+        self, frames: int = 2, more_inputs: int = 0, space: Space[Any] = FRAMES_SPACE
+    ) -> None:
         super().__init__()
         self.frames = frames
         self.trunk = make_trunk(space, frames)
@@ -207,7 +209,9 @@ class Head(nn.Module):
 class Actor(nn.Module):
     """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4)."""
 
-    def __init__(self, action_size: int = 1, frames: int = 2, space: Space[Any] = PICTURES) -> None:
+    def __init__(
+        self, action_size: int = 1, frames: int = 2, space: Space[Any] = FRAMES_SPACE
+    ) -> None:
         super().__init__()
         self.picture = Picture(frames, space=space)
         self.head = Head(action_size)
@@ -239,7 +243,7 @@ class Critic(nn.Module):
         frames: int = 2,
         action_bound: float = 0.0,
         normalised: bool = False,
-        space: Space[Any] = PICTURES,
+        space: Space[Any] = FRAMES_SPACE,
     ) -> None:
         super().__init__()
         self.picture = Picture(frames, action_size, space)

@@ -74,7 +74,7 @@ class Layout(NamedTuple):
     """It is [older, newer], and its newer half is the older one of the next observation."""
 
 
-PAPERS = Layout((2, 45, 80), np.dtype(np.uint8), stacked=True)
+FRAMES_LAYOUT = Layout((2, 45, 80), np.dtype(np.uint8), stacked=True)
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
 Lost = list[int]
@@ -87,7 +87,7 @@ class RingIndex:
     ``capacity`` is in transitions. An observation that is not stacked counts as a picture.
     """
 
-    def __init__(self, capacity: int, layout: Layout = PAPERS) -> None:
+    def __init__(self, capacity: int, layout: Layout = FRAMES_LAYOUT) -> None:
         self.capacity, self.stacked = capacity, layout.stacked
         self.frame_slots = int(capacity * FRAMES_PER_TRANSITION) + 3
         shape = layout.shape[1:] if layout.stacked else layout.shape
@@ -242,7 +242,7 @@ class ReplayBuffer:
         steps: int = 1,
         gamma: float = 1.0,
         overruled_value: float | None = None,
-        layout: Layout = PAPERS,
+        layout: Layout = FRAMES_LAYOUT,
         human_share: float = 0.0,
         foresees: bool = False,
     ) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from trainer.learner import equations, networks
 from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
-from trainer.learner.networks import PICTURES, Actor, CriticPair, tensors
+from trainer.learner.networks import FRAMES_SPACE, Actor, CriticPair, tensors
 from trainer.learner.replay import Batch
 
 
@@ -53,7 +53,7 @@ class TD3Learner:
         seed: int,
         action_size: int = 1,
         device: str = "cpu",
-        space: Space[Any] = PICTURES,
+        space: Space[Any] = FRAMES_SPACE,
     ) -> None:
         self.config, self.algorithm, self.device = config, algorithm, torch.device(device)
         if self.device.type == "cuda":

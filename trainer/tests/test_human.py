@@ -75,7 +75,7 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
 
 
 def test_someone_takes_over_from_a_model_that_never_looks_and_every_step_is_labelled(monkeypatch):
-    config = replace(LABELLED, episodes=2, demonstrated_share=0)
+    config = replace(LABELLED, episodes=2, demonstrate_every=0)
     training = HumanTraining(LeftTurnEnv(), config, seed=5)
     monkeypatch.setattr(training.model, "act", lambda observation: FULL)
     episodes = list(training.episodes())
@@ -84,7 +84,7 @@ def test_someone_takes_over_from_a_model_that_never_looks_and_every_step_is_labe
 
 
 def test_episodes_are_demonstrated_or_watched_in_turn(monkeypatch):
-    config = replace(LABELLED, episodes=4, demonstrated_share=2)
+    config = replace(LABELLED, episodes=4, demonstrate_every=2)
     training = HumanTraining(LeftTurnEnv(), config, seed=5)
     looks: list[int] = []
     watch = training.guide.watch

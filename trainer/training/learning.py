@@ -18,8 +18,8 @@ from gymnasium.spaces import Space
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
-from trainer.learner.networks import PICTURES
-from trainer.learner.replay import PAPERS, Batch, Layout, ReplayBuffer
+from trainer.learner.networks import FRAMES_SPACE
+from trainer.learner.replay import FRAMES_LAYOUT, Batch, Layout, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.util import Purpose, random_stream
 
@@ -46,8 +46,8 @@ class LearningThread:
         seed: int,
         action_size: int,
         device: str = "cpu",
-        space: Space[Any] = PICTURES,
-        layout: Layout = PAPERS,
+        space: Space[Any] = FRAMES_SPACE,
+        layout: Layout = FRAMES_LAYOUT,
     ) -> None:
         self.config = config
         self.learner = TD3Learner(config, algorithm, seed, action_size, device, space)
