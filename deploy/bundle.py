@@ -232,10 +232,12 @@ def _drivers_in(path: Path) -> set[str]:
 
 def check_wheels(wheels: Sequence[Path], target: Target) -> None:
     """Raise UserError for a wheel that the target cannot run, or whose package it has anyway."""
-    version = tuple(map(int, target.python.split(".")))
-    platforms = [*_platforms(target), f"linux_{target.machine}"]  # As built on the board itself.
+    version, most = tuple(map(int, target.python.split("."))), int(target.glibc.split(".")[1])
+    known = [*(f"manylinux_2_{minor}" for minor in range(most + 1)), "linux"]  # built on the board
+    platforms = [*_platforms(target), *(f"{name}_{target.machine}" for name in known)]
     fits = set(cpython_tags(version, platforms=platforms))
-    fits.update(compatible_tags(version, platforms=platforms))
+    interpreter = f"cp{version[0]}{version[1]}"
+    fits.update(compatible_tags(version, interpreter, platforms))
     own = {canonicalize_name(pin.name) for pin in read_lock(lock_path(target))} | {EDGE_PACKAGE}
     for path in wheels:
         try:
@@ -243,7 +245,8 @@ def check_wheels(wheels: Sequence[Path], target: Target) -> None:
         except InvalidWheelFilename as error:
             raise UserError(f"wheel {path}: {error}") from None
         if not tags & fits:
-            raise UserError(f"wheel {path} is not for Python {target.python} on {target.machine}")
+            board = f"Python {target.python} on {target.machine} with glibc {target.glibc}"
+            raise UserError(f"wheel {path} does not fit {board}")
         if name in own:
             raise UserError(f"wheel {path}: the bundle has a {name} of its own")
 

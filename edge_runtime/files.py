@@ -110,10 +110,10 @@ def lock_file(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
 
 
-def try_to_lock_file(descriptor: int, how: int = fcntl.LOCK_EX) -> bool:
+def try_to_lock_file(descriptor: int) -> bool:
     """The same without waiting; False where another process holds the file."""
     try:
-        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # No locks here: then nobody can hold one.
@@ -142,8 +142,12 @@ class Hold:
         """Whether commands must stay here. Never waits."""
         if self._stream is None:
             return False
-        if not try_to_lock_file(self._stream.fileno(), fcntl.LOCK_SH):
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
             return True
+        except OSError:  # No locks here, so nobody can hold one; or but for now: it asks again.
+            return False
         self._stream.close()
         self._stream = None
         return False

@@ -32,6 +32,7 @@ _POLL_S = 0.1
 # Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
 _FIRST_LOOKS_S = 0.3
 _LOOK_S = 1.0
+_CONNECT_S = 0.2
 _JOIN_S = 0.5
 _LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
 
@@ -107,7 +108,7 @@ class Link:
     @property
     def rivals(self) -> int:
         """How many other runtimes were seen under this vehicle id."""
-        return len(self._presence.known) if self._presence else 0
+        return self._presence.rivals if self._presence else 0
 
     def send(self, topic: str, message: Message) -> None:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
@@ -149,8 +150,8 @@ def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
     query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
 
 
-def require_free(open_client: OpenClient, vehicle_id: str) -> None:
-    """Raise UserError where another runtime has this vehicle id.
+def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
+    """Whether a router answers. Raises UserError where another runtime has this vehicle id.
 
     Two peers do not hear each other through a router, so a client asks it. The token of a process
     that was just killed may stay for a lease: one that is found must outlast it.
@@ -162,6 +163,7 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> None:
         found = _ask(open_client, selector)
     if found:
         raise taken(vehicle_id)
+    return found is not None
 
 
 def taken(vehicle_id: str) -> UserError:
@@ -173,35 +175,41 @@ def taken(vehicle_id: str) -> UserError:
 
 
 class Presence:
-    """Declares the tokens whenever the routers that this session sees have changed.
+    """Declares the tokens, and again whenever the routers that this session sees have changed.
 
-    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before. It
-    has a thread of its own, because all of this may wait for the network and the watchdog must not.
-    `give_way` is called, perhaps more than once, where an elder claim than this one's is found.
+    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before.
+    It has a thread of its own, because all of this may wait for the network and the watchdog
+    must not. `give_way` is called, once, where an elder claim than this one's is found.
     """
 
     def __init__(
         self, session: zenoh.Session, alive_key: str, open_client: OpenClient, give_way: Callable
     ) -> None:
-        self.claim = ""  # None before the first router
-        self.known: Set[str] = set()
+        self.rivals = 0
         self._session, self._key, self._open_client = session, alive_key, open_client
-        self._give_way = give_way
+        self._give_way: Optional[Callable] = give_way
+        self._known: Set[str] = set()
         self._seen_before: Set[str] = set()
         self._looks = 0
-        self._routers: List[str] = []
+        self._routers = self._seen_routers()
         self._tokens: List[Any] = []
+        self._declare()
         self._stopping = threading.Event()
         self.thread = threading.Thread(target=self._run, name="presence", daemon=True)
 
     def refresh(self) -> bool:
-        """Declare the tokens if other routers are there than the last time."""
+        """Declare the tokens again if other routers are there than the last time."""
         before, self._routers = self._routers, self._seen_routers()
         if not self._routers or self._routers == before:
             return False
-        for token in self._tokens:
+        tokens, self._tokens = self._tokens, []
+        for token in tokens:
             token.undeclare()
-        self._declare()
+        try:
+            self._declare()
+        except zenoh.ZError:
+            self._routers = []  # so that it is tried again
+            raise
         return True
 
     def look(self) -> None:
@@ -209,13 +217,15 @@ class Presence:
         found = _ask(self._open_client, f"{self._key}/*") or []
         claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
         seen_twice = claims & self._seen_before
-        for claim in sorted(seen_twice - self.known):
-            self.known.add(claim)
+        for claim in sorted(seen_twice - self._known):
+            self._known.add(claim)
+            self.rivals += 1
             log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
         self._seen_before = claims
         self._looks += 1
-        if any(claim < self.claim for claim in seen_twice):
-            self._give_way()
+        if self._give_way is not None and any(claim < self.claim for claim in seen_twice):
+            give_way, self._give_way = self._give_way, None
+            give_way()
 
     def undeclare(self) -> None:
         """Stop looking and take the tokens away."""
@@ -248,8 +258,14 @@ class Presence:
                     pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
                     next_look_s = time.monotonic() + pause_s
             except zenoh.ZError as error:
-                log.event("error", "presence_failed", detail=error)
-                self._routers = []  # so the tokens are declared once more
+                log.event("error", "token_not_declared", detail=error)
+
+
+def wait_for_router(session: zenoh.Session) -> None:
+    """Wait 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
+    end_s = time.monotonic() + _CONNECT_S
+    while not session.info.routers_zid() and time.monotonic() < end_s:
+        time.sleep(0.002)
 
 
 def _ask(open_client: OpenClient, selector: str) -> Optional[List[str]]:

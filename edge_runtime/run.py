@@ -17,7 +17,7 @@ import zenoh
 from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, shared_limits
-from edge_runtime.link import Link, require_free, taken
+from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
@@ -174,7 +174,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             from edge_runtime.files import Hold
 
             hold = Hold(config.hold)
-        require_free(open_client, config.vehicle_id)
+        has_router = require_free(open_client, config.vehicle_id)
         session = connected(mode="peer")
         undo.callback(session.close)  # An open one would hang the process at its exit.
         link = Link(session, config.vehicle_id, policy.manifest)
@@ -196,6 +196,8 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         if runner is not None:
             runner.start(armed)
         loop.start()
+        if has_router:
+            wait_for_router(session)
         link.appear(open_client, loop.stop)
         if policy.trust != VERIFIED:
             log.event("warning", "policy_not_verified", trust=policy.trust)
@@ -204,10 +206,10 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             f" connect={config.connect} policy_id={policy.policy_id}",
             flush=True,
         )
-        # Where there is a router, its first state may take as long.
+        # One that is linked already has some time for its first state.
         first_s = time.monotonic() + (_WAITING_PERIOD_S if session.info.routers_zid() else 0.0)
-        waiting = (loop.has_heard, why, over, first_s)
-        threading.Thread(target=say_what_is_missing, args=waiting, daemon=True).start()
+        say = partial(say_what_is_missing, loop.has_heard, why, over, first_s)
+        threading.Thread(target=say, name="waiting", daemon=True).start()
         notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")
         if not stop.came:
             loop.run()

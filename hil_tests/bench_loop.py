@@ -1,6 +1,6 @@
 """``python -m hil_tests bench``: the loop against the least that could answer, and what it costs.
 
-Two processes answer the same states: the edge runtime, and `floor` below. Their blocks take
+Two processes answer the same states: the edge runtime, and `bench_floor.py`. Their blocks take
 turns, so that the machine disturbs both alike. Then the runtime's memory, idle load and start.
 """
 
@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
-import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,9 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
-import msgspec
 import numpy as np
-import onnxruntime
 import zenoh
 
 from bridge.ports import add_options
@@ -102,7 +97,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             starts_s.append(ours.rouse() - begun_s)
             if len(starts_s) < STARTS:
                 edge.end()
-        words = ("hil_tests.bench_loop", arguments.policy, endpoint, FLOOR)
+        words = ("hil_tests.bench_floor", arguments.policy, endpoint, FLOOR)
         stack.enter_context(Process(*words, ready="ready"))
         for contender in (ours, floor):
             contender.rouse()
@@ -294,45 +289,3 @@ def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str, str]]:
 
 def _bar(bar: str, met: bool) -> str:
     return f"{bar}  {'met' if met else 'MISSED'}"
-
-
-def floor(policy: str, connect: str, vehicle_id: str) -> None:
-    """Be the least that could answer a state, until SIGTERM.
-
-    A Zenoh callback, onnxruntime on the frames, and a put of a command: no validation, no watchdog,
-    no limits.
-    """
-    end = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: end.set())
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    network = onnxruntime.InferenceSession(policy, options, providers=["CPUExecutionProvider"])
-    decode = msgspec.msgpack.Decoder(wire.State).decode
-
-    def on_state(sample: zenoh.Sample) -> None:
-        state = decode(bytes(sample.payload))
-        frames = np.frombuffer(state.observation["frames"], np.uint8).reshape(1, 2, 45, 80)
-        (actions,) = network.run(["action"], {"frames": frames})
-        command = wire.Command(
-            session=state.session, episode=state.episode, step=state.step, mode=wire.DRIVE,
-            action=actions[0].tolist(), policy_id="0" * 64, received_ns=state.sent_ns,
-            inference_ns=0, sent_ns=state.sent_ns,
-        )  # fmt: skip
-        publisher.put(wire.encode(command))
-
-    with (
-        open_session(connect=connect, mode="peer") as session,
-        session.declare_publisher(
-            wire.key(vehicle_id, "command"),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-        ) as publisher,
-        session.declare_subscriber(wire.key(vehicle_id, "state"), on_state),
-    ):
-        print("ready", flush=True)
-        end.wait()
-
-
-if __name__ == "__main__":
-    floor(*sys.argv[1:])

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
             verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
             print(verdict, flush=True)
     finally:
-        with contextlib.suppress(Exception):  # its own rule has said it
+        with contextlib.suppress(Exception):  # the last rule says it, where it came so far
             bench.vehicle.close()
         log.close()
     print(f"{bench.vehicle.name}: {len(RULES) - broken} rules kept, {broken} broken")

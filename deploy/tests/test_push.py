@@ -68,9 +68,8 @@ def push(far, board, workshop):
 def test_a_push_installs_a_bundle_of_any_name_and_leaves_nothing_behind(
     far, board, push, workshop, capfd
 ):
-    made = workshop.make(0.1)
-    for name in ("install.pyz", "trust.pub", "-q.tar", "two words;id.tar"):
-        bundle = far / name
+    for number, name in enumerate(("install.pyz", "trust.pub", "-q.tar", "two words;id.tar")):
+        made, bundle = workshop.make(number / 10), far / name
         bundle.write_bytes(made.path.read_bytes())
         Path(f"{bundle}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
         (far / "log").write_text("")
@@ -81,7 +80,7 @@ def test_a_push_installs_a_bundle_of_any_name_and_leaves_nothing_behind(
         assert list((far / "home").iterdir()) == []
         log = (far / "log").read_text().splitlines()
         assert [line.split()[0] for line in log] == PROGRAMS
-    assert board.status()["current"] == made.manifest.version
+        assert board.status()["current"] == made.manifest.version
 
 
 def test_a_dry_run_says_each_step_and_does_none(far, board, push, workshop, capsys):

@@ -45,6 +45,7 @@ class Rig:
         core.follow_period(T)
         self.obeys = self.talks = True
         self.speed_mps = self.inner_rad = 0.0
+        self.sent_in = core.state
         self.sent = []  # each frame or message with its time
         self.asked = []  # each speed with its time
 
@@ -53,7 +54,9 @@ class Rig:
         for _ in range(count):
             if action is not None and self.ticks % 5 == 0:
                 self.core.command(action, self.now_s, scenario_speed_mps)
-            self.exchange(self.core.tick(self.now_s))
+            due = self.core.tick(self.now_s)
+            self.sent_in = self.core.state  # what the vehicle then says may change it
+            self.exchange(due)
             self.ticks += 1
             self.now_s = 100.0 + self.ticks * STREAM_S
         return self

@@ -94,7 +94,7 @@ def test_a_ride_is_one_period_to_one_second(max_s):
 def test_a_ride_is_no_longer_than_a_second_at_any_rate():
     limits = shared_limits([PEDAL], {})
     assert Ride(1.0, 0.3, limits, plays=True).periods == 3
-    with pytest.raises(UserError, match="use 0.3 to 1 s, or 0 for off"):
+    with pytest.raises(UserError, match=r"use 0\.3 to 1 s, or 0 for off"):
         Ride(1.2, 0.3, limits, plays=True)
 
 

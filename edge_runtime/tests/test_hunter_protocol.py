@@ -68,7 +68,7 @@ def test_every_count_survives_decoding_and_encoding(frame, data):
     raw = data.draw(st.binary(min_size=frame.length, max_size=frame.length))
     message = decode(frame.can_id, raw)
     assert type(message) is frame.message
-    assert len(message) == len(frame.worth)
+    assert len(message) == len(frame.worth) == len(struct.unpack(frame.layout, raw))
     zeroed = struct.pack(frame.layout, *struct.unpack(frame.layout, raw))
     assert encode(frame, message) == zeroed
 

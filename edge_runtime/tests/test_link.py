@@ -38,7 +38,7 @@ def declared(session: Any) -> List[str]:
 
 def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
     presence = Presence(session, "k", lambda: session, lambda: None)
-    claims = []
+    claims = [presence.claim]
     for routers in ([], ["b", "a"], ["a", "b"], [], ["c"], ["c"]):
         session.info.routers_zid.return_value = routers
         if presence.refresh():
@@ -54,33 +54,20 @@ def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
     ("claims", "given", "rivals"),
     [
         # At first an elder one may be the leftover of a lost connection.
-        (["0000000000000001-elder"] * 3, [0, 1, 2], 1),
+        (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
         ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
     ],
 )
 def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, claims, given, rivals):
     give_way = MagicMock()
     presence = Presence(session, "k", lambda: session, give_way)
-    session.info.routers_zid.return_value = ["router"]
-    presence.refresh()
     for claim, times_given in zip(claims, given):
         keys = [f"k/{presence.claim}", f"k/{claim}"]
         replies = [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
         session.liveliness().get.return_value = replies
         presence.look()
         assert give_way.call_count == times_given
-    assert len(presence.known) == rivals
-
-
-def test_a_token_that_could_not_be_declared_is_tried_again(session):
-    session.info.routers_zid.return_value = ["router"]
-    declare = session.liveliness().declare_token
-    declare.side_effect = [zenoh.ZError("not now"), MagicMock(), MagicMock()]
-    presence = Presence(session, "k", lambda: session, lambda: None)
-    presence.thread.start()
-    wait_until(lambda: declare.call_count == 3, "the second try")
-    presence.undeclare()
-    assert not presence.thread.is_alive()
+    assert presence.rivals == rivals
 
 
 def test_nobody_there_is_nobody_else(session):
@@ -88,9 +75,22 @@ def test_nobody_there_is_nobody_else(session):
     presence = Presence(session, "k", fail, fail)
     for _ in range(2):
         presence.look()
-    assert presence.known == set()
-    for open_client in (fail, lambda: session):
-        require_free(open_client, "hunter01")
+    assert presence.rivals == 0
+    assert not require_free(fail, "hunter01")
+    assert require_free(lambda: session, "hunter01")
+
+
+def test_tokens_that_could_not_be_declared_are_tried_again(session):
+    declare = session.liveliness().declare_token
+    presence = Presence(session, "k", lambda: session, lambda: None)
+    before = list(presence._tokens)
+    session.info.routers_zid.return_value = ["router"]
+    declare.side_effect = [zenoh.ZError("not now"), MagicMock(), MagicMock()]
+    presence.thread.start()
+    wait_until(lambda: declare.call_count == 5, "the second try")
+    presence.undeclare()
+    assert not presence.thread.is_alive()
+    assert [token.undeclare.call_count for token in before] == [2, 2]  # one mock, once each
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Files that a command reads: regular, of a sane size, and nested no deeper than can be read."""
 
+import fcntl
 import json
 import os
 import signal
@@ -105,7 +106,12 @@ def test_a_hold_where_the_file_system_has_no_locks_holds_nothing(tmp_path, monke
     path = tmp_path / "hold"
     path.touch()
     hold = Hold(str(path))
-    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
+    with monkeypatch.context() as patch:
+        patch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
+        assert not hold.is_on()
+    with path.open("rb") as installer:  # It was but for a moment.
+        fcntl.flock(installer, fcntl.LOCK_EX)
+        assert hold.is_on()
     assert not hold.is_on()
 
 

@@ -52,7 +52,8 @@ class StreamedVehicle(Vehicle):
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
         make: Any = cls
         vehicle: StreamedVehicle = make(given, given.similarity(cls.name, manifest))
-        vehicle._core.follow_period(manifest.control_period_s)  # it listens before it is enabled
+        with vehicle._lock:  # it listens before it is enabled
+            vehicle._core.follow_period(manifest.control_period_s)
         return vehicle
 
     @classmethod
@@ -144,8 +145,9 @@ class Stream:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
-        self._thread.start()
+        """Begin; nothing where it has begun."""
+        if self._thread.ident is None:
+            self._thread.start()
 
     def wake(self) -> None:
         """Send now: somebody brakes."""
@@ -161,7 +163,8 @@ class Stream:
         """End the thread; one that hangs in `send` is left alone."""
         self._stopping = True
         self._wake.set()
-        self._thread.join(_JOIN_S)
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
 
     def gaps_ms(self) -> Dict[str, float]:
         """Quantiles of the times between two sendings, as words for the log; none, none."""

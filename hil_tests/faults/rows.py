@@ -152,8 +152,9 @@ def sleep_until(time_s: float) -> None:
 
 
 LASTS_S = 1.0
-STALL_PERIODS = 6
-"""Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once."""
+STALLED_S = 0.6
+"""Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once. A
+T of more than 0.24 s needs a longer one."""
 BRIGHT_S = 0.5
 STARVED_S = 2.0
 SETTLED_S = 0.5
@@ -232,7 +233,7 @@ def link_stalled(rig: Rig, number: int) -> Try:
     rig.link.stall()
     stop = rig.logged_stop(begin_s)
     last_s = rig.link.last_state_s
-    sleep_until(begin_s + STALL_PERIODS * rig.period_s)
+    sleep_until(begin_s + max(STALLED_S, 2.5 * rig.period_s))  # longer than silence
     ended_s = time.monotonic()
     rig.link.restore()
     recovered_s = rig.recovered_after_s(ended_s)

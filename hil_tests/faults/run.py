@@ -179,10 +179,11 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
 def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, Any]:
     """A row of the report: spreads of the times, how many were late, and what was wrong.
 
-    Its limits are those of the row, later by ``later_s``: `observe.later_s`.
+    For another T than 0.1 s a reaction may take ``later_s`` longer, which is the difference of 2 T,
+    and a recovery that of the five states that it takes.
     """
     limit_s = None if row.reaction_limit_s is None else row.reaction_limit_s + later_s
-    recovery_limit_s = row.recovery_limit_s  # It holds five states, and 2 T are 2 of them.
+    recovery_limit_s = row.recovery_limit_s
     if recovery_limit_s is not None:
         recovery_limit_s += 2.5 * later_s
     reactions = [t.reaction_s for t in outcome.tries if t.reaction_s is not None]

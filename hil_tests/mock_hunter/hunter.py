@@ -101,8 +101,9 @@ def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> P
     for name, value in (changes or {}).items():
         if name not in TUNABLE:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
-        least = "at least" if name == "dead_time_s" else "above"
-        if not (0.0 < value < math.inf or (least == "at least" and value == 0.0)):
+        may_be_zero = name == "dead_time_s"
+        if not (0.0 < value < math.inf or (may_be_zero and value == 0.0)):
+            least = "at least" if may_be_zero else "above"
             raise UserError(f"parameter {name} must be {least} 0 and finite, not {value}")
     return replace(MODELS[model], **(changes or {}))
 

@@ -161,7 +161,10 @@ def test_a_drive_is_driven_anew_or_in_halves_and_not_for_ever(monkeypatch):
 
 
 def test_a_process_has_crashed_where_nobody_ended_it():
-    with Process("json.tool", "nowhere") as failed, Process("http.server", "0") as ended:
+    with (
+        Process("json.tool", "nowhere") as failed,
+        Process("http.server", "0", "--bind", "127.0.0.1") as ended,
+    ):
         wait_until(lambda: failed.has_ended, "its end")
         ended.end()
         assert (failed.crashed(), ended.crashed()) == (True, False)

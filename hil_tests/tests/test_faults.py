@@ -114,7 +114,7 @@ def test_what_a_rig_saw_counts(tmp_path, monkeypatch):
     assert (len(found.unsafe), found.crashes) == (2, ["edge"])
 
 
-def test_a_slower_policy_has_more_time(monkeypatch):
+def test_a_slower_policy_has_more_time():
     later_s = observe.later_s(msgspec.structs.replace(TASK, control_period_s=0.3))
     assert later_s == pytest.approx(0.4)
     for reaction_s, recovery_s, late in ((0.649, 1.999, 0), (0.651, 2.001, 1)):

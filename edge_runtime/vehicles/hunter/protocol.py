@@ -85,8 +85,10 @@ class MotorSlow(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A row of the table. `layout` is struct's: a letter for each field of the message, and x for a
-    byte that is 0. `worth`: of one count of each field; 1 of a plain integer.
+    """A row of the table.
+
+    `layout` is as struct has it: a letter, without a count, for each field of the message, and x
+    for bytes that are 0. `worth` says of each field what one count is; an integer counts by 1.
     """
 
     can_id: int

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Callable, ClassVar, List, NamedTuple, Optional, Type
 
 from edge_runtime import log
@@ -229,8 +230,8 @@ class Ros2Vehicle(StreamedVehicle):
 
     def _leave(self) -> None:
         try:
-            rejected = {**self._node.rejected, "stale": self._core.stale}
-            if any(rejected.values()):
+            rejected = Counter({**self._node.rejected, "stale": self._core.stale})
+            if rejected := +rejected:
                 log.event("info", "ros2_odometry_rejected", **rejected)
             self._node.close()
         finally:
