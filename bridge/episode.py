@@ -258,7 +258,8 @@ def outcome_of(info: Mapping[str, Any]) -> str:
     """How an episode has ended; UNKNOWN where the environment's last ``info`` does not say."""
     if info.get("outcome"):
         return str(info["outcome"])
-    return UNKNOWN if "is_success" not in info else GOAL if info["is_success"] else FAILED
+    success = info.get("is_success")
+    return UNKNOWN if success is None else GOAL if success else FAILED
 
 
 def _speed_mps(info: dict[str, Any]) -> float | None:

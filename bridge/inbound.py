@@ -158,10 +158,13 @@ class FeedbackCheck:
         """Note that a state has been sent."""
         self._sent = (episode, step)
 
-    def read(self, payload: bytes, now_s: float, received_s: float = 0.0) -> Feedback | None:
+    def read(
+        self, payload: bytes, now_s: float, received_s: float | None = None
+    ) -> Feedback | None:
         """Return the feedback if it is this vehicle's newest, else None.
 
-        Monotonic times: ``received_s`` from the wire, and (network injected) heard at ``now_s``.
+        Monotonic times: ``received_s`` from the wire (None: now), and, network injected, heard at
+        ``now_s``.
         """
         feedback = decode_feedback(payload)
         if isinstance(feedback, Rejection):
@@ -176,7 +179,8 @@ class FeedbackCheck:
             self.rejected[fault] += 1
             return None
         self._met = self._met or feedback.session == self._session
-        self._newest, self._newest_s, self._received_s = feedback, now_s, received_s
+        self._newest, self._newest_s = feedback, now_s
+        self._received_s = now_s if received_s is None else received_s
         return feedback
 
     def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:

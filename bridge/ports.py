@@ -214,6 +214,8 @@ class WireListener:
     def watch(self, sample: zenoh.Sample) -> None:
         """Take a token that comes or goes."""
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
+        if "*" in key:
+            return  # no vehicle's own
         if key.endswith("/simulator"):
             self._note_simulator(key, here)
         self._put(key, bytes([here]), size=1)

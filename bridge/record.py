@@ -198,14 +198,7 @@ class RecordingWriter:
         """Make the file; UserError where it exists already."""
         self.messages = 0
         self._copies = ViewerCopies(self._add_copy)
-        self._file = new_file(path)
-        self._mcap = start_mcap(self._file)
-        try:
-            self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
-        except OSError as error:
-            self.close()
-            path.unlink()
-            raise UserError(f"cannot write {path}: {error.strerror}") from None
+        self._file, self._mcap = new_recording_at(path)
         self._channels: dict[tuple[str, int], int] = {}
         self._schema_ids: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
@@ -232,12 +225,11 @@ class RecordingWriter:
         self._mcap.flush()
         self._mcap.add_metadata(METADATA, counts)
         self._mcap.finish()
-        self._file.flush()
+        self._file.close()
 
     def close(self) -> None:
         """Close the file, finished or not."""
-        with contextlib.suppress(OSError):  # it tries once more what the disk did not take
-            self._file.close()
+        close_torn(self._file)
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
         if schema.name not in self._schema_ids:
@@ -264,20 +256,33 @@ def start_mcap(stream: Any) -> Writer:
     return writer
 
 
-def new_file(path: Path) -> BinaryIO:
-    """A new file, locked until it is closed: ``bridge repair`` keeps away meanwhile.
+def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
+    """A new MCAP file, locked until it is closed: ``bridge repair`` keeps away meanwhile.
 
-    UserError where it exists already, or cannot be made.
+    UserError, and no file, where one exists already, or it cannot be made.
     """
     make_directory(path.parent)
     try:
         stream = path.open("xb")
+        try:
+            lock_file(stream.fileno())
+            writer = start_mcap(stream)
+            writer.flush()  # Before anybody is told of the file, it is an MCAP file.
+        except OSError:
+            close_torn(stream)
+            path.unlink()
+            raise
     except FileExistsError:
         raise UserError(f"{path} exists; {NEVER_OVER}") from None
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
-    lock_file(stream.fileno())
-    return stream
+    return stream, writer
+
+
+def close_torn(stream: BinaryIO) -> None:
+    """Close a file that may have failed: it tries once more what the disk did not take."""
+    with contextlib.suppress(OSError):
+        stream.close()
 
 
 Field: Any = descriptor_pb2.FieldDescriptorProto

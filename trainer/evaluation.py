@@ -125,11 +125,13 @@ def evaluate(
     ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
     else the left turn. Episode i is reset with ``seed + i``.
 
-    Raises UserError: nothing there that drives, or in another environment.
+    Raises UserError: nothing there that drives, or in another environment; a condition or number
+    of runs that there is not; an environment that reports what is no number.
     """
-    if condition not in CONDITIONS or runs < 1:
-        known = f"condition is one of {', '.join(CONDITIONS)}, and runs at least 1"
-        raise UserError(f"{known}: {condition}, {runs}")
+    if condition not in CONDITIONS:
+        raise UserError(f"condition must be one of {', '.join(CONDITIONS)}: {condition}")
+    if runs < 1:
+        raise UserError(f"runs must be at least 1: {runs}")
     policy, spec = fspath(policy), parse_spec(latency)
     scenario = scenario_of(scenario or _trained_in(policy))
     env = make_environment(scenario, condition)
@@ -184,8 +186,8 @@ class Drive:
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
         result.reward += finite("reward", reward)
-        for name, seen in (("lateral", self._lateral), ("longitudinal", self._longitudinal)):
-            name = f"{name}_acceleration_mps2"
+        for way, seen in (("lateral", self._lateral), ("longitudinal", self._longitudinal)):
+            name = f"{way}_acceleration_mps2"
             seen.append(abs(finite(name, info[name])))
         if self.over:
             result.outcome = info["outcome"]

@@ -31,7 +31,7 @@ from trainer.training.config import CONFIG_FILE
 EXAMPLE = examples(
     "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key"
 )
-OPSET = 17  # The oldest onnxruntime that a board may have reads these
+OPSET = 17  # The oldest onnxruntime that a board may have reads it
 PARITY_OBSERVATIONS = 1000
 PARITY_TOLERANCE = 1e-5
 

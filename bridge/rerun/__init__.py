@@ -173,7 +173,7 @@ def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -
     except ViewerGone as gone:
         why = viewer.last_words(END_S) or gone.why
         viewer.end()
-        with contextlib.suppress(ViewerGone):  # The first cause is the one to tell.
+        with contextlib.suppress(ViewerGone):  # Here, so that what is told below is the cause.
             viewer.leave(recording)
         raise ViewerGone(why) from None
     finally:

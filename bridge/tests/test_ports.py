@@ -53,13 +53,18 @@ def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
     endpoint, router, client = sessions
     port = SimulatorPort(router, "v1")
     topics = ("state", "command", "feedback", "health")
+    wild = [client.liveliness().declare_token(name) for name in ("phil/**", "phil/*/alive")]
     with open_listener(endpoint, vehicle_id, 5.0) as feed:
         for topic in topics:
             put_wildly(client, topic)
         client.put("phil/v2/state", b"other")
         time.sleep(HEARS_S)
         heard = iter(lambda: feed.next(0.1), None)
-        found = {(one.key, one.payload) for one in heard if one.topic in TOPICS}
+        all_heard = list(heard)
+        found = {(one.key, one.payload) for one in all_heard if one.topic in TOPICS}
+    assert not [one.key for one in all_heard if "*" in one.key]
+    for token in wild:
+        token.undeclare()
     expected = {(f"phil/v1/{topic}", b"own") for topic in topics}
     if vehicle_id == ANY_VEHICLE:
         expected.add(("phil/v2/state", b"other"))

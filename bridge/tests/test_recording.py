@@ -14,7 +14,6 @@ from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -26,7 +25,6 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
-from bridge import record
 from bridge import recording as records
 from bridge.messages import WIRE_TOPICS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
@@ -276,11 +274,14 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
     assert read(out)["per_episode"][0]["steps"] == 60  # The loop went on to its end.
 
 
-def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path, monkeypatch):
-    full = Mock(flush=Mock(side_effect=OSError(28, "No space left on device")))
-    monkeypatch.setattr(record, "start_mcap", lambda stream: full)
-    with pytest.raises(UserError, match=r"cannot write .*a.mcap: No space left"):
-        RecordingWriter(tmp_path / "a.mcap")
+def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path):
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
+    try:
+        with pytest.raises(UserError, match=r"cannot write .*a.mcap: File too large"):
+            RecordingWriter(tmp_path / "a.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -346,7 +347,9 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
     with writing(tmp_path / "drive.mcap") as writer:
         _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=0.05), Event())
     assert writer.messages > 0
-    assert len(list(listener.until_gone(None))) < 1000  # a view's
+    began_s = time.monotonic()
+    assert list(listener.until_gone(4.0))  # a view's
+    assert time.monotonic() - began_s < 2.0
 
 
 def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):

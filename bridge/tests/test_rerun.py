@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
@@ -54,6 +55,17 @@ def test_episodes_stand_end_to_end():
     steps = [timeline.place("a", *place)[1] for place in places]
     assert steps == [0, 7, 8, 5]
     assert timeline.place("a", 1, 2) == ("episode_1", 10)
+
+
+def test_a_scene_without_an_origin_stands_where_its_state_does():
+    recording = MagicMock()
+    log, period_s = WireLog(recording), 0.1
+    log._timeline.period_s = period_s
+    log.write_scene(make_scene(), 10**18)  # The simulator sends it first.
+    log.write_state(make_state(9, session="here"), 10**18)
+    times = [one.args[:1] + tuple(one.kwargs.values()) for one in recording.set_time.call_args_list]
+    here = [("sim_time", 9 * period_s), ("step", 9), ("episode_0", 9 * period_s)]
+    assert times == here * 2
 
 
 def test_a_second_session_is_not_drawn_over_the_first():
@@ -151,7 +163,7 @@ def test_a_window_listens_on_loopback_only_and_stays_open(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("kind", "where", "why"),  # The other places: trainer/tests/test_view.py.
+    ("kind", "where", "why"),  # Most of the other places: trainer/tests/test_view.py.
     [
         ("ends at once", "serve", NO_GPU),
         ("never listens", "serve", "does not listen after 1 s"),

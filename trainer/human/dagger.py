@@ -138,7 +138,7 @@ class HumanTraining:
     def _drive(self, episode: int) -> tuple[int, str]:
         """One episode; the number of take-overs, and the outcome."""
         c = self.config
-        # One episode in so many; with a share of 0 none is.
+        # One episode in so many; with 0 none is.
         demonstrated = c.demonstrate_every and episode % c.demonstrate_every == (
             c.demonstrate_every - 1
         )

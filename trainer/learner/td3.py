@@ -154,7 +154,7 @@ class TD3Learner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
         for name in (*NETWORKS, *OPTIMISERS):
-            # Optimisers keep the very tensors that they are given.
+            # A copy, because optimisers keep the very tensors that they are given.
             getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]

@@ -15,7 +15,7 @@ import numpy as np
 from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment
 
-RESERVED = {"p", "r", "q", "backspace", "space"}  # The wishes, and holding without driving
+RESERVED = {"p", "r", "q", "escape", "backspace", "space"}  # Of the wishes and of Space
 Amount = float | tuple[float, ...]  # An action in [-1, 1]: one number where there is one
 
 
@@ -76,6 +76,13 @@ def controls_of(scenario: str) -> Controls:
         name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(action, rest))
         for name, action in env.keys.items()
     }
-    if taken := sorted(RESERVED & keys.keys()):
-        raise UserError(f"a person cannot drive {scenario}: its keys {', '.join(taken)} have a use")
     return Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))
+
+
+def keyboard_of(scenario: str) -> Controls:
+    """The same for a device with keys; UserError where they have another use."""
+    controls = controls_of(scenario)
+    if taken := sorted(RESERVED & controls.keys.keys()):
+        what = "pause, restart, discard, quit or hold without driving"
+        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which {what}: name others")
+    return controls

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.coach import Coaching
-from trainer.person.controls import Amount, amount, controls_of, vector
+from trainer.person.controls import Amount, amount, controls_of, keyboard_of, vector
 from trainer.person.interface import WISH_HELP, WISHES, Moving, Reading, View, Wish
 from trainer.person.profile import SHIPPED, Profile, read_profile
 from trainer.scenarios.picture import draw_scene
@@ -91,7 +91,7 @@ class KeyboardHands:
     moving = Moving()
 
     def __init__(self, scenario: str) -> None:
-        self._controls = controls_of(scenario)
+        self._controls = keyboard_of(scenario)
         self.help = self._controls.help
         self._down: set[str] = set()
         self._tapped: set[str] = set()

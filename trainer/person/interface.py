@@ -48,9 +48,6 @@ class Reading:
     (``Moving``)."""
 
 
-LET_GO = Reading()
-
-
 @dataclass(frozen=True)
 class Moving:
     """When moving a wheel or a pedal takes over, and when its resting hands control back."""

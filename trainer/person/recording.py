@@ -8,7 +8,6 @@ ever overwritten: sittings add up.
 """
 
 import ast
-import contextlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
@@ -22,7 +21,7 @@ from mcap.records import Channel, Message
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from bridge.record import new_file, start_mcap
+from bridge.record import close_torn, new_recording_at
 from bridge.recording import Records
 from bridge.report import DISCARDED
 from edge_runtime.util import UserError, open_regular
@@ -106,11 +105,9 @@ class Recorder:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
         self.index = 0  # The next step's number
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
-        self._file = new_file(self.path)
-        self._mcap = start_mcap(self._file)
+        self._file, self._mcap = new_recording_at(self.path)
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
         self._closed = self._torn = False
-        self._write_out(self._mcap.flush)
 
     def write(self, step: Step) -> None:
         """Keep a step; from here on no kill takes it away. UserError on a full disk."""
@@ -128,10 +125,9 @@ class Recorder:
         try:
             if not self._torn:  # An index would tell of a step that the disk did not take.
                 self._write_out(self._mcap.finish)
-                self._write_out(self._file.flush)
+                self._write_out(self._file.close)
         finally:
-            with contextlib.suppress(OSError):  # it tries once more what the disk did not take
-                self._file.close()
+            close_torn(self._file)
         if self.index == 0:
             self.path.unlink()
 

@@ -32,7 +32,7 @@ from PIL import Image
 
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
-from trainer.person.controls import controls_of, distance
+from trainer.person.controls import controls_of, distance, keyboard_of
 from trainer.person.interface import WISH_HELP, Moving, Reading, View
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
@@ -116,7 +116,7 @@ class Cockpit:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
         hint = "or slide on the pad, or use a gamepad or wheel"
-        self.controls = controls_of(scenario)
+        self.controls = keyboard_of(scenario)
         self.help: tuple[str, ...] = (self.controls.help, hint, WISH_HELP)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
@@ -299,8 +299,8 @@ def _encode(kind: str, **fields: Any) -> str:
     return _ENCODER.encode({"kind": kind, **fields}).decode()
 
 
-def encode_view(view: View, number: int, help: tuple[str, ...]) -> str:
-    """View ``number``, from 1; ``help`` says what to press for what, one line each.
+def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
+    """View ``number``, from 1; ``hints`` say what to press for what, one line each.
 
     ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show; ``picture`` is
     base64 of a JPEG.
@@ -313,7 +313,7 @@ def encode_view(view: View, number: int, help: tuple[str, ...]) -> str:
         Image.fromarray(view.picture).save(jpeg, "JPEG")
         fields["picture"] = jpeg.getvalue()
     ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
-    return _encode("view", number=number, help=help, ground=ground, **fields)
+    return _encode("view", number=number, help=hints, ground=ground, **fields)
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:

@@ -32,7 +32,7 @@ from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import Layout, ReplayBuffer
 from trainer.learner.td3 import TD3Learner
-from trainer.person.controls import controls_of
+from trainer.person.controls import controls_of, keyboard_of
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
@@ -273,8 +273,10 @@ def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)
     assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
     monkeypatch.setattr(Rover, "keys", {"KeyQ": (0.0, 0.0)})
-    with pytest.raises(UserError, match="its keys q have a use"):  # It would end the sitting.
-        controls_of.__wrapped__(ROVER)
+    controls_of.cache_clear()
+    with pytest.raises(UserError, match=r"is driven with q, which pause, .*: name others"):
+        keyboard_of(ROVER)
+    controls_of.cache_clear()
 
 
 def test_the_package_is_light_before_something_is_asked_for():

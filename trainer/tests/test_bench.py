@@ -69,7 +69,10 @@ def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkey
     monkeypatch.setattr(bench, "TRANSITIONS", 20)
     monkeypatch.setattr(bench, "make_sb3_model", Mock(side_effect=ImportError))
     monkeypatch.setattr(bench, "FULL", TINY)
-    nothing = lambda self, batch, *_: Losses(0.0, 0.0, 0.0, 0.0, np.ones(len(batch.indices)))  # noqa: E731
+
+    def nothing(self, batch, *_):
+        return Losses(0.0, 0.0, 0.0, 0.0, np.ones(len(batch.indices)))
+
     monkeypatch.setattr(TD3Learner, "update", nothing)
     monkeypatch.setattr(bench.ProgressBar, "advance", lambda _, last: ticks.append(last))
     out = tmp_path / "b.json"

@@ -118,3 +118,15 @@ def test_noise_is_a_twentieth_of_the_commands_domain():
         done.append(float(env.step.call_args.args[0][0]))
     assert np.std(done) == pytest.approx(0.1, rel=0.1)
     assert CONDITIONS["nominal"].noise_std == CONDITIONS["dense"].noise_std == 0.0
+
+
+def test_what_cannot_be_evaluated_is_said():
+    for wrong, said in (({"condition": "rain"}, "nominal, noise"), ({"runs": 0}, "at least 1: 0")):
+        with pytest.raises(UserError, match=said):
+            evaluate("expert", "left_turn", **wrong)
+    info = {"lateral_acceleration_mps2": np.nan, "longitudinal_acceleration_mps2": 0.0}
+    env: Any = SimpleNamespace(
+        reset=lambda seed: (0, {}), step=lambda action: (0, 0.0, False, False, info)
+    )
+    with pytest.raises(UserError, match="lateral_acceleration_mps2 is nan"):
+        Drive(env, 0).step(np.zeros(1, np.float32))

@@ -60,7 +60,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert str(straight.runs.parent) not in straight.records_file("left_turn").read_text()
 
 
-def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
+def test_a_killed_unit_goes_on_to_the_same_record(store, straight, tmp_path):
     """A process, killed at a checkpoint as by a power cut."""
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
@@ -84,9 +84,9 @@ def test_two_processes_share_one_file_of_records_and_a_failure_is_one_units(stor
     bad, alone = GUIDED._replace(scenario="congestion"), GUIDED._replace(seed=0)
     write_human(store, bad.scenario).write_bytes(b"no human")
     floor = alone._replace(algorithm=planned.CONSTANT)
-    units = [bad, floor, alone._replace(algorithm=planned.HUMAN_MODEL)]
+    units = [bad, GUIDED, floor, alone._replace(algorithm=planned.HUMAN_MODEL)]
     ends = running.run_units([running.Task(unit, store) for unit in units], 2)
-    assert ends == {running.FINISHED: 2, running.FAILED: 1}
+    assert ends == {running.FINISHED: 3, running.FAILED: 1}
     assert list(store.records("left_turn")) == sorted(units[1:])
     assert set(store.find(units)[0]) == set(units[1:])
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]

@@ -147,7 +147,7 @@ def _command(step: int, action: Action) -> Command:
 
 
 class Store(Protocol):
-    """What takes transitions: a learner, or a buffer before it."""
+    """What takes transitions: a learner."""
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""

@@ -9,7 +9,10 @@ import pytest
 from trainer.person import devices
 from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
+from trainer.tests.conftest import one_thread
 from trainer.tests.test_commands import call
+
+__all__ = ["browser", "cockpit", "one_thread", "opened", "runner", "sit_down"]
 
 FAKE_PADS = """
 globalThis.pads = {};

@@ -8,10 +8,11 @@ import numpy as np
 from msgspec import structs
 
 from trainer.environments import make_environment
-from trainer.person.interface import LET_GO, Moving, Reading, View, Wish
+from trainer.person.interface import Moving, Reading, View, Wish
 from trainer.person.recording import Recorder, Step
 from trainer.person.session import Sitting
 
+LET_GO = Reading()
 QUICK = 1000.0
 """Simulated seconds in one of a test's."""
 
@@ -20,7 +21,6 @@ class Puppet:
     """A person who does what a list says, and then ``then`` for good; ``presence``: whether the
     device is there, each time it is asked for, and then for good."""
 
-    help: tuple[str, ...] = ("a test",)
     moving = Moving()
 
     def __init__(self, readings: Iterable[Reading] = (), then=LET_GO, presence=()) -> None:

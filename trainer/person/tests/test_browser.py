@@ -8,7 +8,6 @@ import pytest
 
 from bridge.rerun import BY_NAME
 from trainer.person.coach import Coaching, Episode, advise
-from trainer.person.interface import LET_GO
 from trainer.person.tests.browser import (
     LIVE,
     OVER,
@@ -22,6 +21,7 @@ from trainer.person.tests.browser import (
     reads,
     until,
 )
+from trainer.person.tests.people import LET_GO
 
 pytestmark = pytest.mark.usefixtures("opened")
 

@@ -10,9 +10,10 @@ import pytest
 from bridge.report import STOPPED
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
 from trainer.environments import make_environment
-from trainer.person.interface import LET_GO, Reading
+from trainer.person.interface import Reading
 from trainer.person.recording import find_recordings, read_steps
 from trainer.person.tests.people import (
+    LET_GO,
     QUIT,
     Discarding,
     Puppet,

@@ -19,9 +19,9 @@ from trainer.person.devices import (
     Window,
     pygame,
 )
-from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.browser import first_view
+from trainer.person.tests.people import LET_GO
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
 from trainer.tests.humans import drive
 

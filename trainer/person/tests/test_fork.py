@@ -20,9 +20,8 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import write_policy
 from trainer.__main__ import main as trainer
 from trainer.drivers import BEST_FILE
-from trainer.person.interface import LET_GO
 from trainer.person.recording import find_recordings, read_episodes, read_steps
-from trainer.person.tests.people import QUIT, Puppet, hold
+from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
 from trainer.tests.test_commands import call, refusal
 from trainer.util import load_torch, save_torch
 

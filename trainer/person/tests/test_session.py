@@ -6,11 +6,10 @@ import pytest
 
 from bridge.report import DISCARDED, RESTARTED, STOPPED
 from trainer.drivers import constant_driver
-from trainer.person.interface import LET_GO
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import Pacer, drive
 from trainer.person.takeover import MAX_SLEW
-from trainer.person.tests.people import QUIT, Discarding, Puppet, hold, make_sitting, wish
+from trainer.person.tests.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 
 
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):

@@ -18,7 +18,7 @@ import segno
 
 from edge_runtime.util import UserError
 from trainer.person import web
-from trainer.person.interface import LET_GO, open_person
+from trainer.person.interface import open_person
 from trainer.person.tests.browser import (
     WAIT_S,
     first_view,
@@ -30,6 +30,7 @@ from trainer.person.tests.browser import (
     say,
     view_of_step,
 )
+from trainer.person.tests.people import LET_GO
 from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit
 
 RESET = struct.pack("ii", 1, 0)

@@ -1,5 +1,4 @@
 import signal
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -9,7 +8,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
-def one_thread() -> Iterator[None]:
+def one_thread():
     """Several would only wait for each other over networks and batches as small as a test's."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
