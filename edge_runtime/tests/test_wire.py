@@ -147,6 +147,7 @@ def test_a_bad_command_is_rejected_by_reason(action, mode, found):
         ([], None),
         ([[0.1, 0.2]] * 11, Reason.MALFORMED),
         ([[0.1, 0.2], [0.1]], Reason.MALFORMED),
+        ([[0.1, 0.2], [0.1, 0.2, 0.3]], Reason.MALFORMED),
         ([[]], Reason.MALFORMED),
         ([0.1], Reason.MALFORMED),
         ("long", Reason.MALFORMED),
