@@ -198,6 +198,9 @@ def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():
     for huge in (wire.decode_state(bytes(2**22 + 1)), wire.decode_command(bytes(2**16 + 1))):
         assert isinstance(huge, Rejection)
         assert huge.reason is Reason.OVERSIZED
+    for whole in (wire.decode_state(bytes(2**22)), wire.decode_command(bytes(2**16))):
+        assert isinstance(whole, Rejection)
+        assert whole.reason is Reason.MALFORMED  # it was read
     for count in (256, 257):
         state = decode_state(wire.encode(make_state(0, session="x" * count)))
         assert isinstance(state, State) == (count == 256)
