@@ -80,6 +80,7 @@ def test_a_killed_unit_goes_on_to_the_same_record(store, straight, tmp_path):
 
 def test_two_processes_share_one_file_of_records_and_a_failure_is_one_units(store, capfd):
     """Each of the others is computed once, and no record is lost."""
+    store = replace(store, plan=replace(TINY, steps=dict.fromkeys(TINY.steps, 60)))
     write_human(store)
     bad, alone = GUIDED._replace(scenario="congestion"), GUIDED._replace(seed=0)
     write_human(store, bad.scenario).write_bytes(b"no human")
