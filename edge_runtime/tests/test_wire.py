@@ -94,6 +94,7 @@ def test_frames_keep_their_order():
     [
         ({"schema": 1}, Reason.SCHEMA),
         ({"schema": 0}, Reason.SCHEMA),
+        ({"schema": 3}, Reason.SCHEMA),
         ({"schema": 9, "step": "nine"}, Reason.SCHEMA),  # though its fields differ
         ({"observation": {"frames": bytes(7199)}}, Reason.OBSERVATION),
         ({"observation": {"frames": bytes(7201)}}, Reason.OBSERVATION),
