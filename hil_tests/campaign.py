@@ -26,7 +26,7 @@ from edge_runtime.cli import (
     share,
     sigterm_as_interrupt,
     whole_number,
-)  # fmt: skip
+)
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError

@@ -185,15 +185,19 @@ class Over:
 
 def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(said):
     over: Any = Over(9)
-    why = lambda: f"because {len(said)}"  # noqa: E731
+
+    def why() -> str:
+        return f"because {len(said)}"
+
     say_what_is_missing(lambda: len(said) == 2, why, over, time.monotonic())
     assert said == ["because 0", "because 1"]
     assert over.waits_s == pytest.approx([0.0, 5.0, 5.0], abs=0.5)
 
 
 def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
-    looks, over = count(), Over(1)
-    say_what_is_missing(lambda: next(looks) > 0, lambda: "too late", over, 0.0)  # type: ignore
+    looks = count()
+    over: Any = Over(1)
+    say_what_is_missing(lambda: next(looks) > 0, lambda: "too late", over, 0.0)
     assert said == []
 
 

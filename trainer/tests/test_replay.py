@@ -72,12 +72,11 @@ def test_a_batch_holds_what_was_stored_and_not_yet_forgotten(episodes, capacity,
     if len(buffer) == 0:
         return
     batch = sample(buffer)
-    spans = np.broadcast_to(batch.spans, 64)
     for row, (before, now) in enumerate(batch.frames):
         older, rest, goal = source.stored[number(now)]
         assert number(now) in list(source.stored)[-len(buffer) :]
         rewards = rest[:steps]
-        assert (number(before), spans[row]) == (older, len(rewards))
+        assert (number(before), batch.spans[row]) == (older, len(rewards))
         assert batch.rewards[row] == sum(0.5**k * reward for k, reward in enumerate(rewards))
         assert bool(batch.terminals[row]) == (goal and len(rest) <= steps)
         assert number(batch.next_frames[row, 1]) == number(now) + len(rewards)
