@@ -295,7 +295,7 @@ class ReplayBuffer:
         penalised: bool = False,
         foreseen: Sequence[NDArray[Any]] = (),
     ) -> None:
-        """Store a transition with the highest priority that any other has (algorithm 1).
+        """Store a transition with the highest priority in its buffer (algorithm 1).
 
         Args:
             action: what was carried out.
@@ -307,7 +307,10 @@ class ReplayBuffer:
             penalised: whether that action is penalised.
             foreseen: the observation before, and what the policy's action would have led to.
         """
-        priority = float(self._priorities[: self._ring.used].max()) if len(self) else 1.0
+        others = self._priorities[: self._ring.used]
+        if len(self._trees) > 1:  # It enters one of two buffers, each with priorities of its own
+            others = others[self._human[: self._ring.used] == human]
+        priority = float(others.max(initial=0.0)) or 1.0
         slot, lost = self._ring.add(next_frames)
         self._forget(lost)
         self._actions[slot] = action

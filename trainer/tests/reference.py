@@ -1,5 +1,7 @@
 """Algorithm 1 written plainly: what the fast learner in ``td3.py`` is tested against.
 
+As there, both losses are taken before either optimiser steps; the paper steps the critics first.
+
 Every term runs its networks from the picture on, by torch's own operations in single precision;
 nothing is shared, nothing is compiled. About three times slower, and easy to read.
 """

@@ -141,7 +141,10 @@ class RunConfig:
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
-"""As the paper prints it, and its least where it leaves a thing open; but a human who frees a
-stuck car is no penalty (eq. 17), and eq. 21b's exponent has a bound."""
+"""As the paper prints it; but a human who frees a stuck car is no penalty (eq. 17), and eq. 21b's
+exponent has a bound. Where the paper can be read in two ways, table A5's noise scale of 0.2 is that
+of TD3's target smoothing, which eq. 22 does not show, its rates of 1 and 0.05 are deviations of the
+exploration noise (eq. 18b), and eq. 32 counts steering in units of full action. What it leaves open
+is ours: cloning weight, precision, 256 steps before the first update, the best actor kept."""
 PRESETS = {"ours": RunConfig(), "printed": PRINTED}
 """Where the settings of a training start from, by the word behind ``--preset``."""
