@@ -14,7 +14,9 @@ import io
 import json
 import math
 import re
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -70,11 +72,44 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
         modes = _metadata(environment_id).get("render_modes") or ()
         if RENDERED in modes:
             options["render_mode"] = RENDERED
-        return gymnasium.make(environment_id, **options)
+        return _OneLine(_make_quietly(environment_id, **options))
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
         first_line = (str(error).splitlines() or [""])[0]
         what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
         raise UserError(f"no environment {name!r}: {what} ({hint()})") from error
+
+
+class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Says in one line what a stranger's environment raises, and where."""
+
+    def reset(self, **options: Any) -> Any:
+        """Begin an episode."""
+        return self._do(self.env.reset, **options)
+
+    def step(self, action: Any) -> Any:
+        """One control period."""
+        return self._do(self.env.step, action)
+
+    def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        try:
+            return call(*arguments, **named)
+        except UserError:
+            raise
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(last.filename).name}, line {last.lineno}"
+            what = f"{type(error).__name__}: {error} ({where})"
+            own = self.spec.id if self.spec else type(self.unwrapped).__name__
+            raise UserError(f"environment {own} failed in {call.__name__}: {what}") from error
+
+
+def _make_quietly(environment_id: str, **options: Any) -> Environment:
+    """Make it without Gymnasium's advice to its author, which would stand before our one line."""
+    level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR
+    try:
+        return gymnasium.make(environment_id, **options)
+    finally:
+        gymnasium.logger.min_level = level
 
 
 def _id_of(name: str) -> str:
@@ -120,6 +155,9 @@ def load_plugin(environment_id: str) -> None:
         with namespace(wanted) if wanted else contextlib.nullcontext():
             if callable(register):  # A module has registered them by being imported.
                 register()
+    if environment_id not in gymnasium.registry:  # A scenario may be named by its id
+        for scenario in known(group=SCENARIO_GROUP):
+            scenario.load()
 
 
 def describe(environment: Environment, period_s: float | None = None) -> Task:

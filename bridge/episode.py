@@ -263,16 +263,20 @@ def outcome_of(info: Mapping[str, Any]) -> str:
 
 
 def _speed_mps(info: dict[str, Any]) -> float | None:
-    return _number(info, "speed_mps") if "speed_mps" in info else None
+    return None if info.get("speed_mps") is None else _number(info, "speed_mps")
 
 
 def _number(info: dict[str, Any], name: str) -> float:
-    return finite(name, info.get(name, 0.0))
+    value = info.get(name)
+    return 0.0 if value is None else finite(name, value)
 
 
 def finite(name: str, value: Any) -> float:
-    """The number; UserError where it is not finite: neither wire nor report can carry it."""
-    number = float(value)
+    """The number; UserError for one that is not finite, or none: no wire or report carries it."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise UserError(f"the environment's {name} is {value!r}, no number") from None
     if not math.isfinite(number):
         raise UserError(f"the environment's {name} is {number}, not a finite number")
     return number

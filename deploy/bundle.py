@@ -44,7 +44,13 @@ from edge_runtime.config import BUILT_IN, NONE, Config, load_config
 from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.policy import Policy, load_policy
-from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_bytes
+from edge_runtime.util import (
+    DEFAULT_PUBLIC_KEY,
+    MAX_POLICY_MIB,
+    UserError,
+    open_regular,
+    read_bytes,
+)
 from edge_runtime.vehicles import GROUP, vehicle_limits
 
 NAME = "install.pyz"
@@ -157,7 +163,7 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
     key, policy, config, text = check_inputs(inputs)
     contents = {
         NAME: build_installer(),
-        POLICY: read_bytes(inputs.policy, "policy file"),
+        POLICY: read_bytes(inputs.policy, "policy file", MAX_POLICY_MIB),
         f"{POLICY}.sig": read_bytes(f"{inputs.policy}.sig", "signature"),
         PUBLIC_KEY: read_bytes(inputs.public_key, "public key"),
         CONFIG: text.encode(),

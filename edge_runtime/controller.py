@@ -296,8 +296,10 @@ class Controller:
     def _drive_order(
         self, answers: Received, wanted: List[float], inference_ns: int, now_s: float
     ) -> Order:
-        # More than a control period counts as one: a vehicle need not leap after a pause.
-        elapsed_s = min(max(now_s - self._ordered_s, 0.0), self._period_s)
+        # A simulator does for T what it is told, however fast it runs. A vehicle does it in real
+        # time; there more than T counts as T: it need not leap after a pause.
+        passed_s = now_s - self._ordered_s if self._needs_rearm else self._period_s
+        elapsed_s = min(max(passed_s, 0.0), self._period_s)
         self._last_action = limit_action(wanted, self._last_action, self._limits, elapsed_s)
         self._ordered_s = now_s
         return Order(answers, DRIVE, self._last_action, "", inference_ns)

@@ -2,7 +2,7 @@
 
 Pure: time is passed in. Contract, section 3: a new session is taken over only when the current
 one has been silent for 2 T, and a state that is not newer than the last accepted one is rejected,
-as is one from further ahead than any simulator can have come.
+as is one from further ahead than any simulator can have come, unless the next one follows it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after th
 # and besides as many as a quick simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
+MAX_LOST_STEPS = 10
 SKIPPED_EPISODES_PER_S = 1.0
 SKIPPED_STEPS_PER_PERIOD = 10.0
 
@@ -47,6 +48,7 @@ class LatestState:
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
         self._forgotten: Set[int] = set()
+        self._leap: Optional[Tuple[str, Position]] = None  # The last that was too far ahead
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
@@ -77,8 +79,13 @@ class LatestState:
             return Rejection(Reason.FOREIGN_SESSION, words)
         last = self._lasts.get(session)
         if last is not None:
-            elapsed_s = now_s - last.accepted_s
-            return _judge_position((state.episode, state.step), last, elapsed_s, self._period_s)
+            position, leap = (state.episode, state.step), self._leap
+            refusal = _judge_position(position, last, now_s, self._period_s)
+            if refusal is None or refusal.reason is not Reason.FUTURE:
+                return refusal
+            self._leap = session, position
+            # A simulator that counts in leaps goes on from where it came to.
+            return None if leap is not None and _goes_on((session, position), leap) else refusal
         if hash(session) in self._forgotten:
             return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
         if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over
@@ -87,10 +94,18 @@ class LatestState:
         return None
 
 
+def _goes_on(state: Tuple[str, Position], before: Tuple[str, Position]) -> bool:
+    """Whether it is the next state of the same episode, or one of a few after it."""
+    (session, (episode, step)), (its_session, (its_episode, its_step)) = state, before
+    is_same = (session, episode) == (its_session, its_episode)
+    return is_same and 0 < step - its_step <= MAX_LOST_STEPS
+
+
 def _judge_position(
-    position: Position, last: _Last, elapsed_s: float, period_s: float
+    position: Position, last: _Last, now_s: float, period_s: float
 ) -> Optional[Rejection]:
     """Reject what is not newer, and what no simulator can have reached since its last state."""
+    elapsed_s = now_s - last.accepted_s
     episodes = position[0] - last.position[0]
     steps = position[1] - (last.position[1] if episodes == 0 else 0)
     if position <= last.position:

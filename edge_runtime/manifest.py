@@ -21,6 +21,7 @@ MANIFEST_SCHEMA = 2
 MIN_PERIOD_S, MAX_PERIOD_S = 0.01, 1.0
 DTYPES = ("uint8", "int32", "int64", "float32", "bool")
 OVERHEAD_BYTES = 4096  # What a state holds besides its observation, at most
+_HEADS_BYTES = 10  # MessagePack's, of a name and its bytes, at most
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -187,9 +188,12 @@ class Layout:
             for name, entry in task.observation.items()
         ]
         self.size = sum(part.size for part in self.parts)
-        self.max_payload_bytes = self.size + OVERHEAD_BYTES
+        # A few names fit into half of what there is besides; many count.
+        names = sum(len(name.encode()) + _HEADS_BYTES for name in task.observation)
+        names = max(0, names - OVERHEAD_BYTES // 2)
+        self.max_payload_bytes = self.size + names + OVERHEAD_BYTES
         if self.max_payload_bytes > MAX_STATE_BYTES:
-            found = f"the observation holds {self.size} bytes"
+            found = f"the observation holds {self.size + names} bytes"
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
 
     def refusal(self, observation: Mapping[str, bytes]) -> Optional[Rejection]:

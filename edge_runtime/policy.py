@@ -19,7 +19,13 @@ import numpy as np
 
 from edge_runtime import log
 from edge_runtime.manifest import MANIFEST_KEY, Layout, Manifest, Task, decode_manifest
-from edge_runtime.util import DEFAULT_PUBLIC_KEY, PathLike, UserError, read_bytes
+from edge_runtime.util import (
+    DEFAULT_PUBLIC_KEY,
+    MAX_POLICY_MIB,
+    PathLike,
+    UserError,
+    read_bytes,
+)
 
 if TYPE_CHECKING:  # `deploy` and an operator's commands need no onnxruntime.
     import onnxruntime
@@ -69,7 +75,7 @@ def load_policy(
     Raises UserError with the first reason why the policy may not drive.
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
-    data = read_bytes(path, "policy file")
+    data = read_bytes(path, "policy file", MAX_POLICY_MIB)
     trust = check_trust(path, data, public_key, allow_unsigned)
     try:
         return open_policy(data, trust)

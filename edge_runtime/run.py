@@ -249,7 +249,7 @@ def say_what_is_missing(
         next_s = time.monotonic() + _WAITING_PERIOD_S
         words = why()  # a name server takes time
         if not has_heard():
-            log.event("info", "waiting", why=words)
+            log.event("warning", "waiting", why=words)
 
 
 def why_no_state(
@@ -258,8 +258,12 @@ def why_no_state(
     """What keeps states away, on one line."""
     from edge_runtime.reach import look  # Here: mostly the simulator is there first.
 
-    if not session.info.routers_zid():
+    def is_linked() -> bool:
+        return bool(session.info.routers_zid() or session.info.peers_zid())
+
+    if not is_linked():
         _, refusal = look(connect, tls)
-        if not session.info.routers_zid():  # it may have come meanwhile
-            return refusal or f"{connect} gives no link yet"
+        if not is_linked():  # it may have come meanwhile
+            refusal = refusal or f"{connect} gives no link yet"
+            return refusal if connect in refusal else f"{connect}: {refusal}"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

@@ -229,12 +229,17 @@ def is_foreign(state: State, task: str) -> bool:
 
 
 def decode_command(payload: bytes) -> Union[Command, Rejection]:
-    """A Command of a known mode with at least one action, finite like its plan's, or why not."""
+    """A Command of a known mode, finite, or why not.
+
+    To drive takes at least one action, and a plan of as many. A stop is one whatever it carries.
+    """
     command = _decode(payload, Command)
     if isinstance(command, Rejection):
         return command
     if command.mode not in COMMAND_MODES:
         return Rejection(Reason.MALFORMED, f"mode {command.mode!r} is neither drive nor safe_stop")
+    if command.mode == SAFE_STOP:
+        return command
     if not command.action:
         return Rejection(Reason.MALFORMED, "action is empty")
     plan = command.plan or []

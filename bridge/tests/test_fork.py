@@ -63,7 +63,7 @@ def parking_policy(folder: Path) -> Path:
     return path
 
 
-def record(folder: Path, env: str, policy: Path, *options: str) -> Path:
+def record(folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = ()) -> Path:
     """A drive of the three processes, as a person would record it."""
     endpoint, path = free_endpoint(), folder / "drive.mcap"
     with start_simulate(
@@ -74,7 +74,7 @@ def record(folder: Path, env: str, policy: Path, *options: str) -> Path:
             wait_until(
                 lambda: path.exists() and path.stat().st_size > 0, "the recording to begin", 100.0
             )
-            with start_edge(endpoint, policy):
+            with start_edge(endpoint, policy, *edge):
                 assert simulator.wait(200.0) == 0, simulator.errors
             assert recorder.wait() == 0, recorder.errors
     return path
@@ -141,6 +141,16 @@ def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
         out.finish(dropped=0)
     found = is_recorded_to_the_bit(path, 0, policy, row.time_s, "--env", PARKING)
     assert found["fork"] == asdict(row)
+
+
+def test_a_drive_with_plans_is_the_same_to_the_bit(tmp_path):
+    settings, loses = tmp_path / "edge.toml", ("--latency", "loss=30%")
+    settings.write_text("[ride_through]\nmax_s = 0.3\n")
+    config = ("--config", str(settings))
+    path = record(tmp_path, "left_turn", OURS, "--seed", "3", *loses, edge=config)
+    found = fork_of(path, "--at", "1s", "--policy", OURS)
+    assert found["differs_from_s"] is None
+    assert found["fork"] == found["recorded"]
 
 
 def test_another_policy_or_network_drives_on_in_another_way(tmp_path):

@@ -204,6 +204,40 @@ def test_an_attached_vehicle_and_its_operator_are_the_recordings(hand):
     assert is_the_same(hand)
 
 
+NOT_ARMED = {"mode": "safe_stop", "reason": "not_armed", "action": [-1.0]}
+OUTSIDE = {"mode": "safe_stop", "reason": "outside_envelope", "action": [-1.0]}
+
+
+def test_a_vehicle_that_was_not_armed_at_first_nor_after_a_restart_is_the_recordings(hand):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="mock", needs_rearm=True))
+    hand.drive(0, 8, **NOT_ARMED)
+    hand.drive(8, 12)
+    hand.hear(1.55, "health", health(ns(1.55), 0.3, vehicle="mock", needs_rearm=True))
+    hand.drive(13, 20, **NOT_ARMED)
+    assert is_the_same(hand, compared=19)
+
+
+@pytest.mark.parametrize("vehicle", ["none", "mock"])
+def test_a_link_that_left_the_envelope_is_the_recordings(hand, vehicle):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle=vehicle, needs_rearm=False))
+    hand.drive(0, 5)
+    hand.drive(5, 12, **OUTSIDE)  # Three found it outside, four inside again.
+    hand.drive(12, 15)
+    hand.drive(15, 20, **OUTSIDE)
+    hand.drive(20, 22)
+    hand.drive(22, 25, **OUTSIDE)  # Until the end
+    assert is_the_same(hand, compared=25)
+
+
+def test_a_vehicle_that_is_not_installed_is_named_by_the_settings(hand, refusal):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="Rover", needs_rearm=False))
+    hand.drive(0, 3)
+    hand.close()
+    words = ("--policy", make_policy(hand.path.parent, "constant"), "--allow-unsigned")
+    said = refusal("replay", hand.path, *words)
+    assert "--config FILE.toml: the settings it was driven by" in said
+
+
 def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
     hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="hunter", needs_rearm=False))
     hand.drive(0, 3)

@@ -3,6 +3,8 @@
 import contextlib
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -145,6 +147,15 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
     assert "now=standby" in edge.log
     assert "now=safe_stop" not in edge.log.split("now=standby")[-1]
     assert list(tmp_path.glob("*half*")) == []
+
+
+def test_in_lock_step_a_rate_limit_gives_the_same_drive_each_time(tmp_path):
+    policy, endpoint = tmp_path / "slow.onnx", free_endpoint()
+    write_policy(policy, "constant", 0.8, actions=[replace(PEDAL, slew_per_s=1.0)])
+    with start_edge(endpoint, policy):
+        report = simulate_undisturbed(tmp_path, endpoint, TOY, ("--clock", "lockstep"))
+    (row,) = report["per_episode"]
+    assert np.ravel(row["actions"][:9]) == pytest.approx([*np.arange(1, 9) / 10, 0.8])
 
 
 def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):
@@ -302,6 +313,43 @@ def test_what_an_environment_says_wrongly_of_itself_is_one_line(monkeypatch, nam
     monkeypatch.setattr(made.unwrapped, name, value, raising=False)
     with pytest.raises(UserError, match=f"^environment 'left_turn': {words}"):
         describe(made)
+
+
+def test_what_an_environment_raises_is_one_line_with_its_place(monkeypatch):
+    made = make_environment(TOY)
+    monkeypatch.setattr(made.unwrapped, "_goal_m", None)
+    made.reset(seed=0)
+    where = r"failed in step: TypeError: .* \(toy.py, line \d+\)$"
+    with pytest.raises(UserError, match=f"^environment BridgeToy-v0 {where}"):
+        made.step(np.zeros(1, np.float32))
+
+
+def test_what_an_environment_does_not_know_may_be_none(environment, monkeypatch):
+    known = environment.unwrapped.step
+
+    def says(**info):
+        def step(action):
+            return *known(action)[:4], info
+
+        monkeypatch.setattr(environment.unwrapped, "step", step)
+
+    says(speed_mps=None, distance_m=None)
+    clock = ScriptedClock()
+    _, result = run(environment, clock)
+    assert (clock.states[-1].speed_mps, result.distance_m) == (None, 0.0)
+    says(speed_mps="x")
+    with pytest.raises(UserError, match="the environment's speed_mps is 'x', no number"):
+        run(environment, ScriptedClock())
+
+
+def test_a_scenario_is_known_by_its_id_in_a_process_that_has_not_imported_it():
+    code = (
+        "import warnings; warnings.simplefilter('error');"
+        "from bridge.environments import make_environment;"
+        "print(make_environment('phil/Congestion-v0').unwrapped.scenario)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("congestion\n", "")
 
 
 def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):

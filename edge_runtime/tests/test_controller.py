@@ -310,15 +310,24 @@ def test_an_order_says_how_long_its_own_inference_took():
     assert controller.farewell().inference_ns == 0
 
 
-def test_a_rate_limit_is_per_second_and_counts_from_the_last_order_whatever_its_mode():
+def test_without_a_vehicle_a_rate_limit_counts_control_periods_however_fast_they_pass():
     controller = make(vehicle={"pedal": ActionLimit(-1.0, 1.0, 2.5)})
+    full = np.ones(1, np.float32)
+    actions = [answer(controller, step, 0.003 * step, full).action[0] for step in range(3)]
+    assert actions == pytest.approx([0.25, 0.5, 0.75])
+
+
+def test_a_rate_limit_is_per_second_and_counts_from_the_last_order_whatever_its_mode():
+    controller = make(vehicle={"pedal": ActionLimit(-1.0, 1.0, 2.5)}, needs_rearm=True)
     assert answer(controller, 0, 0.0).action == [0.25]
     assert answer(controller, 1, 0.1).action == pytest.approx([0.5])
     assert answer(controller, 2, 0.0, np.array([1.0], np.float32)).action == pytest.approx([0.5])
     controller.tick(0.4)
-    times_s = enumerate((0.4, 0.5, 0.6, 0.7, 0.71, 0.81), start=2)
+    answer(controller, 2, 0.4)
+    assert not controller.rearm(0.45)
+    times_s = enumerate((0.5, 0.6, 0.7, 0.71, 0.81), start=3)
     actions = [answer(controller, step, now_s).action[0] for step, now_s in times_s]
-    assert actions == pytest.approx([-1.0] * 4 + [-0.975, -0.725])
+    assert actions == pytest.approx([-1.0] * 3 + [-0.975, -0.725])
 
 
 SLOW = {"pedal": ActionLimit(-1.0, 0.5, slew_per_s=2.0)}

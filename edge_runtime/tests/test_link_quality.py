@@ -201,8 +201,12 @@ def test_without_an_echo_nothing_is_known():
         quality.note_state(make_state(step), 0)
         quality.note_command(0, step)
         quality.judge()
+        if step == 100:
+            assert quality.refusal().startswith(
+                "the link is not known yet: that takes 200 messages"
+            )
     assert (quality.outside, quality.health()["link"]) == ("", {})
-    assert quality.refusal() == "the link is not known yet: that takes 200 messages each way"
+    assert "this simulator does not say what it has heard" in quality.refusal()
 
 
 @pytest.mark.parametrize(

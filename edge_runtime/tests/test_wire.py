@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import wire
-from edge_runtime.manifest import Layout
+from edge_runtime.manifest import Entry, Layout
 from edge_runtime.tests.harness import HEALTH, make_command, make_state
 from edge_runtime.tests.policies import SHAPE, SIZE, TASK
 from edge_runtime.util import UserError
@@ -187,6 +187,15 @@ def padded_to(size: int) -> bytes:
     tried = 3000
     overhead = len(msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(tried)})) - tried
     return msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(size - overhead)})
+
+
+def test_a_state_of_many_entries_fits_whatever_their_names_take():
+    entries = {
+        f"{number:03d}_" + 30 * "x": Entry(dtype="float32", shape=[]) for number in range(300)
+    }
+    task = msgspec.structs.replace(TASK, observation=entries)
+    state = make_state(0, observation=dict.fromkeys(entries, bytes(4)), task=task.text)
+    assert isinstance(wire.decode_state(wire.encode(state), Layout(task)), State)
 
 
 def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():

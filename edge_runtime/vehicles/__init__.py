@@ -5,10 +5,11 @@ What one of them needs is imported for that one only.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
+from typing import Any, Callable, Iterable, Mapping, Optional, Tuple, Type, TypeVar
 
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
@@ -64,11 +65,14 @@ def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
 
 
 def find_vehicle(name: str) -> Type[Vehicle]:
-    """The class of a driver. Raises UserError where it cannot be loaded, or is no Vehicle."""
+    """The class of a driver, also by its own name, which recordings have.
+
+    Raises UserError where it cannot be loaded, or is no Vehicle.
+    """
     place = name if ":" in name else BUILT_IN.get(name)
     if place is None:
         others = {point.name: point.value for point in _others()}
-        place = others.get(name)
+        place = others.get(name) or _called(name, others.values())
     if place is None:
         known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
         raise UserError(f"vehicle {name!r} is not known; choose from {known}, or a module:Class")
@@ -83,6 +87,15 @@ def find_vehicle(name: str) -> Type[Vehicle]:
         lacking = ", ".join(sorted(kind.__abstractmethods__))
         raise UserError(f"vehicle {name!r}: {place} is no whole Vehicle: it lacks {lacking}")
     return kind
+
+
+def _called(name: str, places: Iterable[str]) -> Optional[str]:
+    """Which of them is of a driver that calls itself so."""
+    for place in places:
+        with contextlib.suppress(UserError):
+            if find_vehicle(place).name == name:
+                return place
+    return None
 
 
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:

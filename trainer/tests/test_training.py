@@ -32,6 +32,7 @@ from trainer.policy_file import export
 from trainer.tests.test_td3 import same_weights
 from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
+from trainer.training.command import check_directory
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, Trials, read_metrics
 from trainer.training.run import TrainingRun
@@ -163,6 +164,17 @@ def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
     process.communicate()
     assert 3 <= len(read_metrics(tmp_path)) < 5, "killed too late to mean anything"
     resume_and_compare(tmp_path, whole)
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path, whole):
+    seldom = ("--set", "checkpoint_every=100")
+    process = begin(tmp_path, *seldom, episodes=1)
+    process.kill()
+    process.communicate()
+    assert not (tmp_path / CHECKPOINT_FILE).exists()
+    resume_and_compare(tmp_path, whole, *seldom)
+    with pytest.raises(UserError, match="holds no run to resume"):
+        check_directory(tmp_path / "nowhere", TINY, resume=True)
 
 
 def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):

@@ -234,7 +234,9 @@ def _train(
             training = stack.enter_context(training_with_person(person, config, run_dir))
         else:
             check_person_options(person)
-            training = TrainingRun(config, run_dir, person.resume)
+            # One that was killed before its first checkpoint begins anew.
+            began = (run_dir / CHECKPOINT_FILE).is_file()
+            training = TrainingRun(config, run_dir, person.resume and began)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -365,8 +367,8 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
     started = (run_dir / CHECKPOINT_FILE).is_file()
     if started and not resume:
         raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
-    if resume and not started:
-        raise UserError(f"{run_dir} holds no checkpoint to resume from")
+    if resume and not (started or (run_dir / CONFIG_FILE).is_file()):
+        raise UserError(f"{run_dir} holds no run to resume")
     if resume:
         _check_settings(run_dir, config)
 
