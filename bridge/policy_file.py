@@ -24,6 +24,7 @@ from edge_runtime.envelope import read_envelope
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
 from edge_runtime.policy import (
+    MAX_POLICY_MIB,
     OUTPUT,
     SIGNATURE_SUFFIX,
     UNSIGNED,
@@ -34,7 +35,7 @@ from edge_runtime.policy import (
     policy_id_of,
 )
 from edge_runtime.tls import read_signing_key
-from edge_runtime.util import MAX_POLICY_MIB, UserError, read_bytes, read_json
+from edge_runtime.util import UserError, read_bytes, read_json
 
 REAL_OBSERVATIONS = 200
 FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own

@@ -43,14 +43,8 @@ from edge_runtime.cli import Command, examples
 from edge_runtime.config import BUILT_IN, NONE, Config, load_config
 from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
-from edge_runtime.policy import Policy, load_policy
-from edge_runtime.util import (
-    DEFAULT_PUBLIC_KEY,
-    MAX_POLICY_MIB,
-    UserError,
-    open_regular,
-    read_bytes,
-)
+from edge_runtime.policy import MAX_POLICY_MIB, Policy, load_policy
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_bytes
 from edge_runtime.vehicles import GROUP, vehicle_limits
 
 NAME = "install.pyz"

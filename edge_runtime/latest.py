@@ -48,7 +48,7 @@ class LatestState:
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
         self._forgotten: Set[int] = set()
-        self._leap: Optional[Tuple[str, Position]] = None  # The last that was too far ahead
+        self._leap = ("", -1, -1)  # The last that was too far ahead: session, episode, step
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
@@ -83,22 +83,16 @@ class LatestState:
             refusal = _judge_position(position, last, now_s, self._period_s)
             if refusal is None or refusal.reason is not Reason.FUTURE:
                 return refusal
-            self._leap = session, position
+            self._leap = session, *position
             # A simulator that counts in leaps goes on from where it came to.
-            return None if leap is not None and _goes_on((session, position), leap) else refusal
+            goes_on = leap[:2] == (session, position[0]) and position[1] - leap[2] <= MAX_LOST_STEPS
+            return None if goes_on and position[1] > leap[2] else refusal
         if hash(session) in self._forgotten:
             return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
         if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over
             words = f"there were {len(self._forgotten)} simulators before; start the runtime again"
             return Rejection(Reason.FOREIGN_SESSION, words)
         return None
-
-
-def _goes_on(state: Tuple[str, Position], before: Tuple[str, Position]) -> bool:
-    """Whether it is the next state of the same episode, or one of a few after it."""
-    (session, (episode, step)), (its_session, (its_episode, its_step)) = state, before
-    is_same = (session, episode) == (its_session, its_episode)
-    return is_same and 0 < step - its_step <= MAX_LOST_STEPS
 
 
 def _judge_position(

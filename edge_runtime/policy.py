@@ -19,13 +19,7 @@ import numpy as np
 
 from edge_runtime import log
 from edge_runtime.manifest import MANIFEST_KEY, Layout, Manifest, Task, decode_manifest
-from edge_runtime.util import (
-    DEFAULT_PUBLIC_KEY,
-    MAX_POLICY_MIB,
-    PathLike,
-    UserError,
-    read_bytes,
-)
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, PathLike, UserError, read_bytes
 
 if TYPE_CHECKING:  # `deploy` and an operator's commands need no onnxruntime.
     import onnxruntime
@@ -39,6 +33,7 @@ UNSIGNED = "unsigned"
 
 OPSETS = range(13, 22)
 MAX_IR_VERSION = 10
+MAX_POLICY_MIB = 512
 OUTPUT = "action"
 _RANGE_TOLERANCE = 1e-5  # Of an action's whole range: the last bits of a network's tanh
 

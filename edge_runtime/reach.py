@@ -32,7 +32,7 @@ def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
     try:
         _address(endpoint)
     except OSError as error:
-        return False, f"host {host!r} cannot be resolved ({error.strerror})"
+        return False, f"host {host!r} cannot be resolved ({error.strerror}), port {port}"
     if _kind(protocol) != socket.SOCK_STREAM:
         return False, ""
     try:

@@ -264,6 +264,5 @@ def why_no_state(
     if not is_linked():
         _, refusal = look(connect, tls)
         if not is_linked():  # it may have come meanwhile
-            refusal = refusal or f"{connect} gives no link yet"
-            return refusal if connect in refusal else f"{connect}: {refusal}"
+            return refusal or f"{connect} gives no link yet"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

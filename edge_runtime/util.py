@@ -16,7 +16,6 @@ PathLike = Union[str, "os.PathLike[str]"]
 DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
 """Where `deploy keys` writes it, and whoever loads a policy looks for it."""
 MAX_FILE_MIB = 64  # More than any certificate, configuration or report needs
-MAX_POLICY_MIB = 512
 
 # Nobody can catch the first two. The processor raises the next four, and would raise them again
 # before Python could act. The others do not end a process.

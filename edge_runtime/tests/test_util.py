@@ -16,7 +16,7 @@ from edge_runtime import cli, util
 from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
-from edge_runtime.policy import load_policy
+from edge_runtime.policy import MAX_POLICY_MIB, load_policy
 from edge_runtime.service import quantiles_ms
 from edge_runtime.util import UserError, printable, read_bytes
 
@@ -141,8 +141,9 @@ def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path, special
 def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, reader):
     path = tmp_path / "hole"
     path.touch()
-    os.truncate(path, (util.MAX_FILE_MIB << 20) + 1)
-    with pytest.raises(UserError, match=f"is larger than {util.MAX_FILE_MIB} MiB"):
+    most_mib = MAX_POLICY_MIB if reader == "policy" else util.MAX_FILE_MIB
+    os.truncate(path, (most_mib << 20) + 1)
+    with pytest.raises(UserError, match=f"is larger than {most_mib} MiB"):
         READERS[reader](path)
     assert read_bytes("/proc/self/status", "of unknown size").startswith(b"Name:")
 

@@ -166,15 +166,15 @@ def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
     resume_and_compare(tmp_path, whole)
 
 
-def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path, whole):
-    seldom = ("--set", "checkpoint_every=100")
-    process = begin(tmp_path, *seldom, episodes=1)
-    process.kill()
-    process.communicate()
-    assert not (tmp_path / CHECKPOINT_FILE).exists()
-    resume_and_compare(tmp_path, whole, *seldom)
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path):
+    config = replace(TINY, episodes=1, evaluate_every_steps=0)
     with pytest.raises(UserError, match="holds no run to resume"):
-        check_directory(tmp_path / "nowhere", TINY, resume=True)
+        check_directory(tmp_path, config, resume=True)
+    (tmp_path / "config.toml").write_text(config.as_toml())
+    (tmp_path / "config.json").write_text(json.dumps(config.as_dict()))
+    words = ("train", "--out", str(tmp_path), "--config", str(tmp_path / "config.toml"))
+    assert run_cli(main, [*words, "--resume"]) == 0
+    assert len(read_metrics(tmp_path)) == 1
 
 
 def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
