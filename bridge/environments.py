@@ -80,7 +80,7 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
 
 
 class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Says in one line what a stranger's environment raises, and where."""
+    """Says in one line what a stranger's environment raises while it drives or draws, and where."""
 
     def reset(self, **options: Any) -> Any:
         """Begin an episode."""
@@ -89,6 +89,10 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         """One control period."""
         return self._do(self.env.step, action)
+
+    def render(self) -> Any:
+        """What it draws."""
+        return self._do(self.env.render)
 
     def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         try:
@@ -155,9 +159,10 @@ def load_plugin(environment_id: str) -> None:
         with namespace(wanted) if wanted else contextlib.nullcontext():
             if callable(register):  # A module has registered them by being imported.
                 register()
-    if environment_id not in gymnasium.registry:  # A scenario may be named by its id
+    if wanted and environment_id not in gymnasium.registry:  # A scenario may be named by its id
         for scenario in known(group=SCENARIO_GROUP):
-            scenario.load()
+            with contextlib.suppress(Exception):  # Another one's must not hide what is wrong
+                scenario.load()
 
 
 def describe(environment: Environment, period_s: float | None = None) -> Task:

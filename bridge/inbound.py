@@ -87,10 +87,10 @@ class CommandCheck:
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
-        if command.mode == SAFE_STOP and _action_fault(command.action, self._actions, 0.0):
+        if _action_fault(command.action, self._actions, COMMAND_ROUNDING):
             # It is a stop by its mode; who reads its action finds one that fits.
-            rest = [min(max(0.0, row.low), row.high) for row in self._actions]
-            return msgspec.structs.replace(command, action=rest)
+            stop = [row.stop or min(max(0.0, row.low), row.high) for row in self._actions]
+            return msgspec.structs.replace(command, action=stop)
         return command
 
     def reject(self, reason: str) -> None:

@@ -26,7 +26,7 @@ from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
-from edge_runtime.config import NONE, Config, add_trust, load_config
+from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import Controller, Limits, Order, Received, shared_limits
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
@@ -35,8 +35,17 @@ from edge_runtime.ride import Ride
 from edge_runtime.safety import FRESH_STATES_TO_RECOVER, SILENCE_PERIODS, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, printable
-from edge_runtime.vehicles import find_vehicle, vehicle_limits
-from edge_runtime.wire import SAFE_STOP, Command, Health, State, decode_command, encode, is_foreign
+from edge_runtime.vehicles import find_vehicle, installed_as, vehicle_limits
+from edge_runtime.wire import (
+    DRIVE,
+    SAFE_STOP,
+    Command,
+    Health,
+    State,
+    decode_command,
+    encode,
+    is_foreign,
+)
 
 RUNTIME_ENDED = "runtime_ended"
 """Reason of the farewell of a runtime that is ended; no decision about a state."""
@@ -205,13 +214,27 @@ class RecordedDrive:
     def outside(self) -> set[Key]:
         """The states that found the link outside of the policy's envelope.
 
-        A stop for it is told of until enough states in a row were fresh: the last before it drives
-        again found the link inside.
+        A stop for it is told of until enough states in a row were fresh. So where the runtime then
+        drove again, the last ones before that found the link inside.
         """
-        keys = list(self.exchanges)
-        told = [self.exchanges[key].answers[0].reason == Event.OUTSIDE.value for key in keys]
-        last = FRESH_STATES_TO_RECOVER
-        return {key for place, key in enumerate(keys) if all(told[place : place + last])}
+        found: set[Key] = set()
+        run: list[Key] = []
+        before: Exchange | None = None
+        for key, exchange in self.exchanges.items():
+            first = exchange.answers[0]
+            if first.reason == Event.OUTSIDE.value:
+                run.append(key)
+            else:
+                recovers = first.mode == DRIVE and not self._restarted(before, exchange)
+                found.update(run[: 1 - FRESH_STATES_TO_RECOVER] if recovers else run)
+                run = []
+            before = exchange
+        return found.union(run)
+
+    def _restarted(self, before: Exchange | None, after: Exchange) -> bool:
+        """Whether the runtime was started anew between two exchanges."""
+        from_s = before.arrived_s if before else 0.0
+        return any(from_s < start_s <= after.arrived_s for start_s in self.runtime_starts_s)
 
     def _take(self, heard: Heard) -> None:
         if self._zero_ns is None:
@@ -292,7 +315,9 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     """
     name = drive.vehicle
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
-        name = config.vehicle  # a module:Class, of which the recording has the class's name
+        name = config.vehicle  # A module:Class, of which the recording has the class's name
+    elif name not in (NONE, *BUILT_IN):
+        name = installed_as(name)
     try:
         limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)
     except UserError as error:

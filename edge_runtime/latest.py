@@ -2,7 +2,7 @@
 
 Pure: time is passed in. Contract, section 3: a new session is taken over only when the current
 one has been silent for 2 T, and a state that is not newer than the last accepted one is rejected,
-as is one from further ahead than any simulator can have come, unless the next one follows it.
+as is one from further ahead than any simulator can have come, unless the next state follows it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after th
 # and besides as many as a quick simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
-MAX_LOST_STEPS = 10
+_NO_LEAP = ("", -1, -1)  # Session, episode, step
+MAX_LOST_STEPS = 10  # From one state to the next that is heard
 SKIPPED_EPISODES_PER_S = 1.0
 SKIPPED_STEPS_PER_PERIOD = 10.0
 
@@ -48,14 +49,14 @@ class LatestState:
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
         self._forgotten: Set[int] = set()
-        self._leap = ("", -1, -1)  # The last that was too far ahead: session, episode, step
+        self._leap = _NO_LEAP  # The newest that was too far ahead, since the last accepted
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
         rejection = self._judge(state, now_s)
         if rejection is not None:
             return self.reject(rejection)
-        self._session, self._heard_s = state.session, now_s
+        self._session, self._heard_s, self._leap = state.session, now_s, _NO_LEAP
         self._lasts[state.session] = _Last((state.episode, state.step), now_s)
         self._lasts.move_to_end(state.session)
         while len(self._lasts) > _REMEMBERED_SESSIONS:

@@ -205,7 +205,7 @@ class LinkQuality:
         """Why a vehicle may not be armed; empty if it may."""
         if not (values := self.values(UNSEEN, 1)):
             if not self.down.times_ms and self._commands > TO_ARM:
-                return "the link cannot be known: this simulator does not say what it has heard"
+                return "the link is not known: the simulator does not say that it hears commands"
             return f"the link is not known yet: that takes {TO_ARM} messages each way"
         load, words = self._load(values)
         return words if load >= ARM_BELOW else self.outside

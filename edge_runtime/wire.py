@@ -231,7 +231,7 @@ def is_foreign(state: State, task: str) -> bool:
 def decode_command(payload: bytes) -> Union[Command, Rejection]:
     """A Command of a known mode, finite, or why not.
 
-    To drive takes at least one action, and a plan of as many. A stop is one whatever it carries.
+    To drive takes at least one action, and a plan of as many. A stop needs none, and has no plan.
     """
     command = _decode(payload, Command)
     if isinstance(command, Rejection):
@@ -239,7 +239,7 @@ def decode_command(payload: bytes) -> Union[Command, Rejection]:
     if command.mode not in COMMAND_MODES:
         return Rejection(Reason.MALFORMED, f"mode {command.mode!r} is neither drive nor safe_stop")
     if command.mode == SAFE_STOP:
-        return command
+        return msgspec.structs.replace(command, plan=msgspec.UNSET)
     if not command.action:
         return Rejection(Reason.MALFORMED, "action is empty")
     plan = command.plan or []

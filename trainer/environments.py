@@ -296,7 +296,7 @@ def _said(info: Mapping[str, Any]) -> dict[str, Any]:
     """The info with all that the trainer looks at; what is not known is nan, or no distance."""
     unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
     still = {"lateral_acceleration_mps2": 0.0, "longitudinal_acceleration_mps2": 0.0}
-    return {**unknown, **still, **info}
+    return {**unknown, **still, **{key: value for key, value in info.items() if value is not None}}
 
 
 def _layout(task: Task, several: bool) -> Layout:

@@ -61,10 +61,11 @@ def test_a_command_that_answers_nothing_is_counted_by_reason(changes, reason):
 @pytest.mark.parametrize("action", [[], [0.1, 0.1], [7.0]])
 def test_a_stop_is_one_by_its_mode_whatever_action_it_carries(action):
     check, stop = checking(), make_command(5, mode="safe_stop", reason="other_task", action=action)
-    assert check.read(encode(stop)) == msgspec.structs.replace(stop, action=[0.0])
+    assert check.read(encode(stop)) == msgspec.structs.replace(stop, action=[-1.0])
     assert not check.rejected
-    fits = msgspec.structs.replace(stop, action=[-1.0], sent_ns=stop.sent_ns + 1)
+    fits = msgspec.structs.replace(stop, action=[-0.9], sent_ns=stop.sent_ns + 1)
     assert check.read(encode(fits)) == fits
+    assert check.read(encode(msgspec.structs.replace(fits, plan=[[0.5]] * 99))) == fits
 
 
 def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():

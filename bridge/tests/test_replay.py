@@ -229,6 +229,24 @@ def test_a_link_that_left_the_envelope_is_the_recordings(hand, vehicle):
     assert is_the_same(hand, compared=25)
 
 
+@pytest.mark.parametrize("end", ["silence", "fault", "restart"])
+def test_a_short_while_outside_that_something_else_ends_is_the_recordings(hand, end):
+    vehicle = "mock" if end == "fault" else "none"
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle=vehicle, needs_rearm=False))
+    hand.drive(0, 5)
+    hand.drive(5, 8, **OUTSIDE)
+    if end == "silence":
+        hand.stop(7, 4)
+        hand.drive(8, 12, start_s=0.5, **SAFE_STOP)
+        hand.drive(12, 14, start_s=0.5)
+    elif end == "fault":
+        hand.drive(8, 10, **FAULT)
+    else:
+        hand.hear(0.79, "health", health(ns(0.79), 0.01, vehicle=vehicle, needs_rearm=False))
+        hand.drive(8, 12)
+    assert is_the_same(hand)
+
+
 def test_a_vehicle_that_is_not_installed_is_named_by_the_settings(hand, refusal):
     hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="Rover", needs_rearm=False))
     hand.drive(0, 3)

@@ -49,6 +49,10 @@ STORIES: dict = {
         (A, 100, 1, 0.6, STALE), (B, 200, 0, 1.0, None), (A, 201, 13, 2.0, FUTURE),
         (B, 201, 0, 2.0, None), (B, 300, 14, 2.1, FUTURE), (B, 300, 15, 2.2, None),
     ],
+    "two leaps between which it went on as ever are two strays": [
+        (A, 0, 5, 0.0, None), (A, 100, 0, 0.1, FUTURE), (A, 0, 6, 0.2, None),
+        (A, 100, 1, 0.3, FUTURE), (A, 0, 7, 0.4, None), (A, 100, 1, 0.5, FUTURE),
+    ],
     "after an outage a simulator may be far ahead": [
         (A, 0, 0, 0.0, None), (A, 0, 20_001, 100.0, FUTURE), (A, 0, 20_000, 100.0, None),
         (A, 31, 0, 120.0, FUTURE), (A, 30, 0, 120.0, None),

@@ -206,7 +206,7 @@ def test_without_an_echo_nothing_is_known():
                 "the link is not known yet: that takes 200 messages"
             )
     assert (quality.outside, quality.health()["link"]) == ("", {})
-    assert "this simulator does not say what it has heard" in quality.refusal()
+    assert "does not say that it hears commands" in quality.refusal()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import contextlib
 import inspect
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Callable, Iterable, Mapping, Optional, Tuple, Type, TypeVar
+from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
@@ -65,14 +65,11 @@ def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
 
 
 def find_vehicle(name: str) -> Type[Vehicle]:
-    """The class of a driver, also by its own name, which recordings have.
-
-    Raises UserError where it cannot be loaded, or is no Vehicle.
-    """
+    """The class of a driver. Raises UserError where it cannot be loaded, or is no Vehicle."""
     place = name if ":" in name else BUILT_IN.get(name)
     if place is None:
         others = {point.name: point.value for point in _others()}
-        place = others.get(name) or _called(name, others.values())
+        place = others.get(name)
     if place is None:
         known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
         raise UserError(f"vehicle {name!r} is not known; choose from {known}, or a module:Class")
@@ -89,13 +86,16 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     return kind
 
 
-def _called(name: str, places: Iterable[str]) -> Optional[str]:
-    """Which of them is of a driver that calls itself so."""
-    for place in places:
+def installed_as(own_name: str) -> str:
+    """The name by which an installed driver is chosen, of one that calls itself `own_name`.
+
+    A recording knows the latter. Where none does, it is returned as it is.
+    """
+    for point in _others():
         with contextlib.suppress(UserError):
-            if find_vehicle(place).name == name:
-                return place
-    return None
+            if find_vehicle(point.value).name == own_name:
+                return str(point.name)
+    return own_name
 
 
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:

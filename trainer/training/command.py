@@ -234,9 +234,7 @@ def _train(
             training = stack.enter_context(training_with_person(person, config, run_dir))
         else:
             check_person_options(person)
-            # One that was killed before its first checkpoint begins anew.
-            began = (run_dir / CHECKPOINT_FILE).is_file()
-            training = TrainingRun(config, run_dir, person.resume and began)
+            training = TrainingRun(config, run_dir, (run_dir / CHECKPOINT_FILE).is_file())
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -367,8 +365,12 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
     started = (run_dir / CHECKPOINT_FILE).is_file()
     if started and not resume:
         raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
-    if resume and not (started or (run_dir / CONFIG_FILE).is_file()):
-        raise UserError(f"{run_dir} holds no run to resume")
+    if resume and not started:
+        # It may have been killed before the first one.
+        begun, done = (run_dir / CONFIG_FILE).is_file(), len(read_metrics(run_dir))
+        if not begun or done >= config.checkpoint_every:
+            raise UserError(f"{run_dir} holds no checkpoint to resume from")
+        print(f"{run_dir} holds no checkpoint yet: it begins anew", file=sys.stderr)
     if resume:
         _check_settings(run_dir, config)
 

@@ -58,7 +58,7 @@ WRONG = [
     (TRAIN, ("--human", "keyboard", "--set", "missed_share=0.3"), "not replaced"),
     (TRAIN, ("--human", "keyboard", "--algorithm", "phil_gated"), "no person yet"),
     (TRAIN, ("--speed", "2"), "--speed means nothing with --human expert"),
-    (TRAIN, ("--human", "keyboard", "--resume"), "no run to resume"),
+    (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
     (HUMAN, ("{tmp}",), "no recording in"),
     (HUMAN, ("{tmp}/file",), "no recording of a sitting"),
     (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows it"),
