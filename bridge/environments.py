@@ -27,6 +27,7 @@ from gymnasium.spaces import Box, Dict
 from PIL import Image
 
 from edge_runtime.manifest import DTYPES, Action, Car, Entry, Task, check_task
+from edge_runtime.policy import OUTPUT
 from edge_runtime.util import UserError
 
 Environment = gymnasium.Env[Any, Any]
@@ -197,6 +198,9 @@ def _entries(environment: Environment, name: str) -> dict[str, Entry]:
     boxes = dict(space.spaces) if isinstance(space, Dict) else {entry_name(own): space}
     entries = {}
     for entry, box in boxes.items():
+        if not entry or entry.isdigit() or entry == OUTPUT:  # An ONNX graph would rename it
+            taken = "a number, nothing, and what the policy answers with are no names"
+            raise UserError(f"environment {name!r} observes {entry!r}: {taken}")
         dtype = str(getattr(box, "dtype", None)).replace("float64", "float32")
         if not isinstance(box, Box) or dtype not in DTYPES:
             known = f"Box or a flat Dict of Boxes of {', '.join(DTYPES)}"

@@ -178,7 +178,11 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
     packed = _pack({MANIFEST: to_json(manifest), **contents})
     signature = _sign(packed, key)
     write_atomic(f"{path}.sig", signature)
-    write_private(path, packed)  # it holds a private key
+    try:
+        write_private(path, packed)  # it holds a private key
+    finally:
+        if not path.exists():
+            Path(f"{path}.sig").unlink()
     return Made(path, manifest, {name: len(data) for name, data in sorted(contents.items())})
 
 

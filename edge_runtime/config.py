@@ -122,6 +122,8 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
 def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
     """`vehicle` is a driver, or a table: `driver`, and a table of settings for each vehicle."""
     given = tables.get("vehicle")
+    if "vehicle_settings" in tables:
+        raise UserError("vehicle_settings is no setting; write [vehicle.NAME]")
     if not isinstance(given, dict):
         return tables
     for name, table in given.items():

@@ -55,7 +55,7 @@ def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
         return why
     if endpoint.startswith("quic/"):  # such a link does not say why it fails
         why = why or "or one end does not believe the other's certificate"
-    help_ = "start the simulator first, or name its address with --connect"
+    help_ = "start the simulator or router there first, or name another address with --connect"
     return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
 
 

@@ -64,7 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         for rule, is_kept in RULES.items():
             try:
                 words = "" if is_kept(bench) else f"it says {bench.last}"
-            except Exception as error:  # a driver may raise anything, and the next rule is due
+            # A driver may raise anything, and the next rule is due.
+            except (Exception, SystemExit) as error:
                 words = f"{type(error).__name__}: {error}"
             broken += bool(words)
             verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
@@ -88,10 +89,11 @@ class Bench:
         self.last: VehicleReport | None = None
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
-        """Call the driver with the time after the arguments, as it takes it."""
+        """Call the driver with the time after the arguments, and behind it a command's speed."""
         now_s = time.monotonic()
+        speed_mps = (None,) if name == "command" else ()
         try:
-            return getattr(self.vehicle, name)(*arguments, now_s, **options)
+            return getattr(self.vehicle, name)(*arguments, now_s, *speed_mps, **options)
         finally:
             self.longest_s = max(self.longest_s, time.monotonic() - now_s)
 
@@ -189,7 +191,7 @@ RULES: dict[str, Callable[[Bench], bool]] = {
     "enabled, it stands until the first command": lambda it: (
         it.call("enable") is None and not it.until(moves=True, limit_s=0.5)
     ),
-    "commands move it": lambda it: it.goes(),
+    "commands move it, and it tells of no fault": lambda it: it.goes() and not it.report().faults,
     "a command holds for 1.5 T": lambda it: it.goes() and not it.after(1.5).self_braking,
     "it brakes by itself after 2 T without a command": lambda it: (
         it.goes(enables=True)

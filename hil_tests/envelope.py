@@ -61,6 +61,7 @@ CHUNK = 8  # Drives of one task of a process
 FRESH = 1_000_000  # So far from the seeds of the search are those that confirm it
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
 BURST_PERCENT = 5.0  # Share of the messages in bad stretches
+MOST_LOSS_PERCENT = 99.0  # In bursts all is lost; between them it must be less
 JITTER_FLOOR = 2.0  # Delay below so many standard deviations of jitter would be cut at zero
 SCALE = 20  # Steps of the way to the corner of all limits
 
@@ -82,7 +83,7 @@ Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
 def network(at: Point) -> LatencySpec:
     """The network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
-    spread_ms, has_bursts = jitter_ms or tail_ms, burst >= 1.0
+    spread_ms, has_bursts, loss = jitter_ms or tail_ms, burst >= 1.0, min(loss, MOST_LOSS_PERCENT)
     settings: dict[str, Any] = {
         "delay_ms": max(delay_ms, JITTER_FLOOR * spread_ms),
         "jitter_ms": spread_ms,

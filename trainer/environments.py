@@ -19,7 +19,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
-from bridge.episode import outcome_of
+from bridge.episode import finite, outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Driver, Expert, Reason
@@ -130,7 +130,7 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
     Raises UserError: there is none.
     """
     if ":" not in human and env.expert is None:
-        raise UserError(f"{env.scenario} offers no expert(): --human module:Class may be one")
+        raise UserError(f"{env.scenario} offers no expert(); module:Class may name another one")
     if ":" not in human:
         expert: Expert = env.expert()
         return expert
@@ -206,7 +206,8 @@ class Adapted:
         info = _said(info)
         if terminated or truncated:
             info["outcome"] = outcome_of(info)
-        return self._seen(observation), float(reward), bool(terminated), truncated, info
+        reward = finite("reward", reward)
+        return self._seen(observation), reward, bool(terminated), truncated, info
 
     @property
     def brake_action(self) -> Action:
@@ -260,12 +261,22 @@ class Adapted:
         return _ScaledExpert(self, self.unwrapped.expert())
 
     def _seen(self, observation: Any) -> NDArray[Any]:
-        if self.layout.dtype.names is None:
-            return np.asarray(observation, self.layout.dtype)
-        seen = np.zeros((), self.layout.dtype)
-        for name in self.layout.dtype.names:
-            seen[name] = observation[name]
+        kind = self.layout.dtype
+        if kind.names is None:
+            return self._checked(observation, kind, self.layout.shape)
+        seen = np.zeros((), kind)
+        for name in kind.names:
+            seen[name] = self._checked(observation[name], kind[name].base, kind[name].shape)
         return seen
+
+    def _checked(self, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """The array. UserError for one that no network could learn from."""
+        array = np.asarray(value, dtype)
+        if array.shape != shape:
+            raise UserError(f"an observation of {self.scenario} is {array.shape}, not {shape}")
+        if dtype.kind == "f" and not np.isfinite(array).all():
+            raise UserError(f"an observation of {self.scenario} holds a number that is not finite")
+        return array
 
 
 class _ScaledExpert(Driver):

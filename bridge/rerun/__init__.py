@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -47,6 +48,8 @@ BY_NAME = MappingProxyType(
 LOOPBACK = "127.0.0.1"
 START_S = 30.0  # How long it may take until it listens
 LOOK_S = 0.05
+LEAST_FREE_BYTES = 1 << 20
+WRITE_S = 60.0  # How long a disk may take for what was drawn
 FLUSH_S = 5.0  # How long it may take to receive what was drawn
 END_S = 1.0  # How long a viewer that takes no more may take to end
 GRPC_PORT = 9876
@@ -139,11 +142,17 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
     make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
+        # rerun's writer waits for ever for a disk that was full when it began.
+        if shutil.disk_usage(target.parent).free < LEAST_FREE_BYTES:
+            raise UserError(f"cannot write {path}: no space left on the device")
         recording.save(temporary, default_blueprint=blueprint)
         try:
             yield
         finally:
-            recording.flush()
+            try:
+                recording.flush(timeout_sec=WRITE_S)
+            except RuntimeError as error:
+                raise UserError(f"cannot write {path}: {error}") from None
             recording.disconnect()  # Writes the footer.
             # No part takes a whole one's place; but ^C is the ordinary way to end one.
             if not (target.exists() and isinstance(sys.exc_info()[1], Exception)):

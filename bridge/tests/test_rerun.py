@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import msgspec
@@ -324,6 +325,21 @@ def test_no_part_of_a_recording_takes_a_whole_ones_place(tmp_path):
             raise error
         assert (out.read_bytes() != b"whole") == taken
         assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_disk_without_space_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
+    def saved():
+        with _saved(rr.RecordingStream("t"), str(tmp_path / "a.rrd"), rrb.Blueprint()):
+            pass
+
+    gone = MagicMock(side_effect=RuntimeError("writer is gone"))
+    monkeypatch.setattr(rr.RecordingStream, "flush", gone)
+    with pytest.raises(UserError, match=r"cannot write .*a\.rrd: writer is gone"):
+        saved()
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=65_536))
+    with pytest.raises(UserError, match=r"cannot write .*a\.rrd: no space left"):
+        saved()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_live_pictures_are_at_most_ten_a_second(monkeypatch):

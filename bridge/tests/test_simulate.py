@@ -315,6 +315,14 @@ def test_what_an_environment_says_wrongly_of_itself_is_one_line(monkeypatch, nam
         describe(made)
 
 
+@pytest.mark.parametrize("entry", ["action", "0", ""])
+def test_a_name_that_a_policy_cannot_use_is_refused(monkeypatch, entry):
+    made = make_environment(TOY)
+    monkeypatch.setattr(made.unwrapped, "observation_name", entry)
+    with pytest.raises(UserError, match=f"^environment 'left_turn' observes {entry!r}: "):
+        describe(made)
+
+
 def test_what_an_environment_raises_is_one_line_with_its_place(monkeypatch):
     made = make_environment(TOY)
     monkeypatch.setattr(made.unwrapped, "_goal_m", None)

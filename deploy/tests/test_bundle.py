@@ -10,6 +10,7 @@ import subprocess
 import tarfile
 import zipfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -243,6 +244,13 @@ def test_a_mistake_is_said_before_any_download(workshop, tmp_path, capsys, monke
     said = capsys.readouterr().err.strip().splitlines()
     assert (status, len(said)) == (2, 1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bundle_that_does_not_fit_leaves_no_signature(workshop, tmp_path, monkeypatch):
+    monkeypatch.setattr(bundle_module, "write_private", Mock(side_effect=UserError("full")))
+    with pytest.raises(UserError, match="full"):
+        make_bundle(workshop.inputs(), HERE, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):

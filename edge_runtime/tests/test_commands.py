@@ -142,6 +142,11 @@ def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags):
         load_config(settings("log_level = 'debug'"), flags)
 
 
+def test_settings_of_a_vehicle_stand_in_its_table(settings):
+    with pytest.raises(UserError, match=r"vehicle_settings is no setting; write \[vehicle.NAME\]"):
+        load_config(settings("policy = 'p.onnx'\nvehicle_settings.hunter.scale = 0.05"), {})
+
+
 def test_flags_win_over_the_file(settings):
     path = settings("policy = 'file.onnx'\nvehicle_id = 'from_file'\nallow_unsigned = true")
     config = load_config(path, {"policy": "flag.onnx", "connect": None, "allow_unsigned": None})

@@ -78,6 +78,8 @@ class BrokenVehicle(MockVehicle):
         self.asked.append(what)
         if self.broken == "command":
             raise OSError("bus off")
+        if self.broken == "exit":
+            raise SystemExit
 
 
 class NotingRunner(VehicleRunner):
@@ -151,8 +153,13 @@ def test_a_driver_that_cannot_be_enabled_at_the_start_gets_one_line(vehicle):
 
 @pytest.mark.parametrize(
     ("broken", "action", "asked"),
-    [("command", [0.5], ["command", "brake"]), ("", [], ["brake"]), ("", [0.5, 0.5], ["brake"])],
-    ids=["the driver raises", "no action", "more than the policy's actions"],
+    [
+        ("command", [0.5], ["command", "brake"]),
+        ("exit", [0.5], ["command", "brake"]),
+        ("", [], ["brake"]),
+        ("", [0.5, 0.5], ["brake"]),
+    ],
+    ids=["the driver raises", "the driver exits", "no action", "more than the policy's actions"],
 )
 def test_a_command_not_taken_is_a_fault_until_one_is(vehicle, runner, broken, action, asked):
     vehicle.broken = broken

@@ -95,8 +95,10 @@ def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words
 
 
 def test_a_driver_of_another_package_gets_its_own_table():
-    tables = {"milk_cart": {"wheels": 3}, "cart": {"wheels": 2}, "other": {"speed": 1}}
+    tables = {"milk_cart": {"wheels": 3}, "hunter": {"speed": 1}}
     for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):
+        if ":" in name:
+            tables["cart"] = {"wheels": 2}
         vehicle: Any = make_vehicle(name, tables, a_manifest())
         assert (vehicle.name, vehicle.wheels) == ("cart", wheels)
         assert vehicle_limits(name, tables, a_manifest()) == MockVehicle.limits
@@ -104,6 +106,14 @@ def test_a_driver_of_another_package_gets_its_own_table():
     # A recording has the name that it calls itself by.
     assert (installed_as("cart"), installed_as("mock")) == ("milk_cart", "mock")
     assert vehicle_limits("none", tables, a_manifest()) == {}
+
+
+@pytest.mark.parametrize(("name", "own"), [("hunter", "hunter"), ("carts:Cart", "cart")])
+def test_a_misspelt_table_leaves_no_cap_at_its_default(name, own):
+    words = rf"\[vehicle.Hunter\] is the table of no vehicle .*; that of {name} is .*\.{own}\]$"
+    for asked in (make_vehicle, vehicle_limits):
+        with pytest.raises(UserError, match=words):
+            asked(name, {"Hunter": {"scale": 0.05}, "mock": {}}, a_manifest())
 
 
 def test_a_robot_follows_the_manifests_car_or_that_of_the_settings():

@@ -37,6 +37,9 @@ def check_driver(vehicle: Any) -> None:
     """Raise UserError for what is no driver, and, closed, for one without proper `limits`."""
     if not isinstance(vehicle, Vehicle):
         raise UserError(f"vehicle {vehicle!r} is no edge_runtime.vehicles.base.Vehicle")
+    if not isinstance(vehicle.name, str):
+        vehicle.close()
+        raise UserError(f"vehicle {type(vehicle).__name__}: its name must be text")
     limits: Any = getattr(vehicle, "limits", None)
     if not (isinstance(limits, dict) and all(isinstance(x, ActionLimit) for x in limits.values())):
         vehicle.close()
@@ -99,9 +102,17 @@ def installed_as(own_name: str) -> str:
 
 
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
-    """The class, and its table: that of its name here, of a module:Class that of its own name."""
+    """The class, and its table: that of its name here, of a module:Class that of its own name.
+
+    Raises UserError for a table of nobody: a misspelt one would leave a speed cap at its default.
+    """
     kind = find_vehicle(name)
-    return kind, tables.get(kind.name if ":" in name else name, {})
+    own = kind.name if ":" in name else name
+    unknown = tables.keys() - {own, *BUILT_IN, *(point.name for point in _others())}
+    if unknown:
+        found = f"[vehicle.{min(unknown)}] is the table of no vehicle that is known here"
+        raise UserError(f"{found}; that of {name} is [vehicle.{own}]")
+    return kind, tables.get(own, {})
 
 
 def _others() -> Iterable[Any]:

@@ -388,7 +388,8 @@ class VehicleRunner:
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif now_s - task.given_s <= self._silence_s:  # One that hung must not obey the past.
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
-        except Exception as error:  # a driver may raise anything; its thread must live on
+        # A driver may raise anything; its thread must live on, whatever asks it to exit.
+        except (Exception, SystemExit) as error:
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)
             self._refuses = True

@@ -35,14 +35,18 @@ def flawed(flaw, clock):
             if flaw == "moves at once":
                 super().command({"pedal": 1.0}, now_s)
 
-        def command(self, action, now_s, scenario_speed_mps=None):
+        def command(self, action, now_s, *speed_mps):
+            if flaw == "exits":
+                raise SystemExit
+            if flaw == "takes no speed" and speed_mps:
+                raise TypeError
             if flaw == "takes nan":
                 action = {name: 0.0 if value != value else value for name, value in action.items()}
             if flaw == "takes anything":
                 action = {"pedal": 0.0, **action}
             if flaw in ("moves disabled", "never latches"):
                 self._latched = False
-            super().command(action, now_s, scenario_speed_mps)
+            super().command(action, now_s, *speed_mps)
 
         def brake(self, now_s, latch=True):
             self.braked = True
@@ -55,6 +59,8 @@ def flawed(flaw, clock):
                 report = report._replace(self_braking=False)
             if flaw == "impatient":
                 report = report._replace(self_braking=now_s - self._commanded_s > 0.1)
+            if flaw == "complains":
+                report = report._replace(faults=["battery low"])
             if flaw == "leaves its limits":
                 return report._replace(action=dict.fromkeys(report.action, 2.0))
             return report._replace(action={}) if flaw == "no actions" else report
@@ -87,6 +93,9 @@ def clock(monkeypatch):
         ("slow", "no call takes longer"),
         ("frozen", "each action has a finite range"),
         ("dead", "commands move it"),
+        ("complains", "commands move it, and it tells of no fault"),
+        ("takes no speed", "commands move it"),
+        ("exits", "commands move it"),
         ("never again", "`enable` after a stop"),
         ("moves disabled", "no command moves it before"),
         ("moves at once", "enabled, it stands until"),

@@ -141,6 +141,7 @@ def test_bursts_come_on_top_of_the_loss():
     way = network({"loss_percent": 10.0, "burst_messages": 3.0}).up
     assert way.bad_share == pytest.approx(BURST_PERCENT / 100)
     assert network({"burst_messages": 0.5}) == network({})
+    assert network({"loss_percent": 100.0, "burst_messages": 3.0}).up.loss_percent > 99.0
 
 
 @given(st.sets(st.integers(0, 199), min_size=1, max_size=6), st.integers(1, 5))

@@ -244,16 +244,18 @@ def test_an_empty_name_of_what_is_written_is_refused(program, least, empty, only
         assert f"{name}: an empty value after --out (see" in only_parse[-1]
 
 
-def test_phil_runs_every_folder():
+def test_phil_runs_every_folder(tmp_path):
     """As installed: the script lies beside the Python that runs this test."""
+    (tmp_path / "own.py").write_text("raise ImportError('found')")
     phil = Path(sys.executable).with_name("phil")
     for words, status, said in (
         (["trainer", "--version"], 0, __version__),
         (["edge_runtime", "chekc"], 2, "chekc"),
         (["bridg"], 2, "did you mean bridge?"),
+        (["bridge", "simulate", "--env", "own:Mine-v0"], 2, "ImportError: found"),
         ([], 0, "hil_tests"),
     ):
-        ended = subprocess.run([phil, *words], capture_output=True, text=True)
+        ended = subprocess.run([phil, *words], capture_output=True, text=True, cwd=tmp_path)
         assert ended.returncode == status
         assert said in ended.stdout + ended.stderr
 

@@ -121,6 +121,23 @@ def test_what_is_foreseen_is_what_happens_and_foreseeing_changes_nothing(name):
     assert 2 < len(foresee(env, observation, action, 1000)) < 500  # not beyond the end
 
 
+@pytest.mark.filterwarnings("ignore:.*WARN")  # Gymnasium's
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ((np.full(3, np.nan), 1.0), "holds a number that is not finite"),
+        ((np.zeros(7), 1.0), r"is \(7,\), not \(3,\)"),
+        ((np.zeros(3), np.inf), "reward is inf"),
+    ],
+)
+def test_what_no_network_could_learn_from_is_the_environments_fault(changed, words, monkeypatch):
+    env = make_environment("Pendulum-v1")
+    env.reset(seed=0)
+    monkeypatch.setattr(env.unwrapped, "step", lambda action: (*changed, False, False, {}))
+    with pytest.raises(UserError, match=words):
+        env.step(np.zeros(1, np.float32))
+
+
 class Shared(Rover):
     def __deepcopy__(self, memo):
         return self

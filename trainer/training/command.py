@@ -265,6 +265,9 @@ def _train(
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{_summary(run_dir, training.env.control_period_s)}: {run_dir}")
+    if training.over and training.steps < config.steps:
+        said = f"{config.episodes} episodes were over first: --episodes N allows more"
+        print(said, file=sys.stderr)
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
