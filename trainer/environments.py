@@ -132,8 +132,7 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
     if ":" not in human and env.expert is None:
         raise UserError(f"{env.scenario} offers no expert(); module:Class may name another one")
     if ":" not in human:
-        expert: Expert = env.expert()
-        return expert
+        return env.expert()
     try:
         own = EntryPoint(human, human, "").load()(env.unwrapped)
     except Exception as error:  # A module may raise anything when it is imported.
@@ -295,8 +294,7 @@ class _ScaledExpert(Driver):
 
     def wants_control(self, action: Action) -> Reason | None:
         """Why it would take over from ``action``, or None."""
-        reason: Reason | None = self._own.wants_control(outer(self._env.action_range, action))
-        return reason
+        return self._own.wants_control(outer(self._env.action_range, action))
 
     def may_return(self) -> bool:
         """Whether it would give control back here."""

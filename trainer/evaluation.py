@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "policy",
         metavar="POLICY",
-        help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, or constant:ACTION for one "
-        "action from -1 to 1 throughout",
+        help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, module:Class of another one, "
+        "or constant:ACTION for one action from -1 to 1 throughout",
     )
     add_public_key(parser)
     add_scenario(parser, None)
@@ -101,8 +101,7 @@ class Evaluation:
     @property
     def success_rate(self) -> float | None:
         """Share of episodes that reached the goal; None where the environment knows of none."""
-        rate: float | None = self.report["success_rate"]
-        return rate
+        return self.report["success_rate"]
 
     @property
     def mean_return(self) -> float:

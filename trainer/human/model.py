@@ -146,6 +146,6 @@ def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
         space = make_environment(state["scenario"]).observation_space
         actor = Actor(state["action_size"], state["frames"], space)
         actor.load_state_dict(state.pop("actor"))
-    except (LookupError, TypeError, RuntimeError) as error:
+    except (AttributeError, LookupError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} is not a human model of this project") from error
     return actor, state

@@ -157,7 +157,7 @@ def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeyp
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "best_actor.pt", "human_model.pt"])
 def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
-    save_torch(tmp_path / name, {"something": 1})
+    save_torch(tmp_path / name, {"something": 1, "scenario": 3})
     refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
 
 

@@ -108,8 +108,7 @@ class VehicleEnd:
         decision = self._link.decide()
         self.press_brake(bool(decision.brake_reason))
         if self.braking:
-            action: Action = self.env.brake_action
-            return action
+            return self.env.brake_action
         if self._aware is not None:
             return self._newest(self._received, self._step - 1 - self._aware.ticks)
         command = decision.command
@@ -147,26 +146,13 @@ def _command(step: int, action: Action) -> Command:
 
 
 class Store(Protocol):
-    """What takes transitions: a learner."""
+    """What takes transitions, with the arguments of ``ReplayBuffer.add``: a learner."""
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
 
-    def add(
-        self,
-        action: Action,
-        reward: float,
-        observation: Observation,
-        terminal: bool,
-        human: bool,
-        overruled: Action | None = None,
-        penalised: bool = False,
-        foreseen: Sequence[Observation] = (),
-    ) -> None:
-        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``.
-
-        ``foreseen``: the observation before it, and what ``overruled`` would have led to.
-        """
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Store a transition that led to an observation."""
 
 
 class DelayedPolicy:
@@ -212,7 +198,7 @@ class DelayedPolicy:
     def store(
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
-        """Keep the tick that led to ``observation``; arguments as ``Store.add``.
+        """Keep the tick that led to ``observation``; arguments as ``ReplayBuffer.add``.
 
         The first d of an episode answer to nothing that the policy could know.
         """

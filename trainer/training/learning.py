@@ -91,8 +91,7 @@ class LearningThread:
 
     def doubt(self, observation: Observation, action: Action) -> float:
         """How much the critics differ about an action; not while updating."""
-        found: float = self.in_thread(self.learner.doubt, observation, action)
-        return found
+        return self.in_thread(self.learner.doubt, observation, action)
 
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
@@ -107,7 +106,7 @@ class LearningThread:
         self.replay.start_episode(observation)
 
     def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``Store.add``."""
+        """Store a transition; arguments as ``ReplayBuffer.add``."""
         self.replay.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
