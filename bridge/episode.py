@@ -247,7 +247,10 @@ def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str
         observation = {entry_name(environment.unwrapped): observation}
     packed = {}
     for name, dtype, shape, _ in layout.parts:
-        array = np.asarray(observation[name], dtype)
+        try:
+            array = np.asarray(observation[name], dtype)
+        except (LookupError, TypeError, ValueError) as error:
+            raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
         if array.shape != shape:
             raise UserError(f"the observation {name} is {array.shape}, not {shape}")
         packed[name] = array.tobytes()

@@ -167,7 +167,6 @@ class WireListener:
     """The messages in order of arrival, and whether their simulators are there."""
 
     def __init__(self) -> None:
-        self.simulator_gone = threading.Event()
         self.simulator_seen = threading.Event()
         self.dropped = 0
         self._simulators: set[str] = set()
@@ -198,7 +197,7 @@ class WireListener:
         while now_s < end_s:
             yield self.next(POLL_S)
             now_s = time.monotonic()
-            if not self.simulator_gone.is_set():
+            if self._simulators:
                 seen_s = now_s
             elif now_s - seen_s >= linger_s and not self.waiting:
                 return
@@ -217,18 +216,10 @@ class WireListener:
         if "*" in key:
             return  # no vehicle's own
         if key.endswith("/simulator"):
-            self._note_simulator(key, here)
+            (self._simulators.add if here else self._simulators.discard)(key)
+            if here:
+                self.simulator_seen.set()
         self._put(key, bytes([here]), size=1)
-
-    def _note_simulator(self, key: str, here: bool) -> None:
-        if here:
-            self._simulators.add(key)
-            self.simulator_gone.clear()
-            self.simulator_seen.set()
-        else:
-            self._simulators.discard(key)
-            if not self._simulators:
-                self.simulator_gone.set()
 
     def _put(self, key: str, payload: bytes, size: int) -> None:
         topic, arrived_ns = key.rpartition("/")[2], self._zero_ns + time.monotonic_ns()

@@ -104,7 +104,7 @@ def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
             clock = VehicleClock(port.publish_state, check, asked.latency, task, feedback)
         else:
             clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency, task)
-        with contextlib.closing(clock), EpisodeBar("episodes", asked.episodes) as bar:
+        with contextlib.closing(clock), ProgressBar("episodes", asked.episodes) as bar:
             bar.show("waiting for an edge runtime")
             port.hear("command", clock.receive)
             port.wait_for_edge(wait_s, endpoint)
@@ -121,7 +121,7 @@ def _drive(
     port: SimulatorPort,
     clock: Clock,
     check: CommandCheck,
-    bar: EpisodeBar,
+    bar: ProgressBar,
     task: Task,
     manifest: Manifest | None,
 ) -> dict[str, Any]:
@@ -133,11 +133,17 @@ def _drive(
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
     rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
-    edge = port.edge_counts
+    edge, waited = port.edge_counts, False
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
+        nonlocal waited
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
+        bar.show(f"step {step:3d}  {doing[:40]}")
         waits = edge.newest is not None and edge.newest.needs_rearm
-        bar.tick(step, decision, rearm if waits else "")
+        if waits and not waited:
+            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
+        waited = waits
 
     runner = EpisodeRunner(
         environment,
@@ -196,18 +202,3 @@ def _drive(
             "vehicle": vehicle.report(action_names) if vehicle else None,
         },
     )
-
-
-class EpisodeBar(ProgressBar):
-    """Shows the episodes done and what the vehicle does."""
-
-    _waits_for = ""
-
-    def tick(self, step: int, decision: Decision, waits_for: str = "") -> None:
-        """Show one tick; ``waits_for`` is the command that the vehicle needs to drive again."""
-        reason = printable(decision.brake_reason)
-        doing = f"braking: {reason}" if reason else "driving"
-        self.show(f"step {step:3d}  {doing[:40]}")
-        if waits_for and not self._waits_for:
-            self.say(f"the vehicle stands until it is re-armed: {waits_for}")
-        self._waits_for = waits_for

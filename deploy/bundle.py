@@ -36,7 +36,7 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 import deploy.installer
 import edge_runtime
 from deploy.certs import DEFAULT_KEY, write_private
-from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
+from deploy.installer.layout import CONFIG, NO_ZIP, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
 from edge_runtime import tls
 from edge_runtime.cli import Command, examples
@@ -74,8 +74,6 @@ TARGETS = {
         ("linux-x86_64", "3.8", "x86_64"),  # jetpack5's versions on a workstation
     )
 }
-_MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
-"""The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
 _PATCH = 2  # pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2.
 _LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
 _SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
@@ -228,7 +226,7 @@ def _drivers_in(path: Path) -> set[str]:
             read = [wheel.read(one) for one in names if one.endswith(".dist-info/entry_points.txt")]
         points = configparser.ConfigParser(delimiters=("=",), interpolation=None)
         points.read_string("\n".join(text.decode() for text in read))
-    except (OSError, zipfile.BadZipFile, configparser.Error, ValueError) as error:
+    except (OSError, *NO_ZIP, configparser.Error, ValueError) as error:
         raise UserError(f"wheel {path} cannot be read: {error}") from None
     modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") for one in names}
     return modules | (set(points[GROUP]) if GROUP in points else set())
@@ -236,9 +234,8 @@ def _drivers_in(path: Path) -> set[str]:
 
 def check_wheels(wheels: Sequence[Path], target: Target) -> None:
     """Raise UserError for a wheel that the target cannot run, or whose package it has anyway."""
-    version, most = tuple(map(int, target.python.split("."))), int(target.glibc.split(".")[1])
-    known = [*(f"manylinux_2_{minor}" for minor in range(most + 1)), "linux"]  # built on the board
-    platforms = [*_platforms(target), *(f"{name}_{target.machine}" for name in known)]
+    version = tuple(map(int, target.python.split(".")))
+    platforms = [*_platforms(target), f"linux_{target.machine}"]  # The last: built on the board
     fits = set(cpython_tags(version, platforms=platforms))
     interpreter = f"cp{version[0]}{version[1]}"
     fits.update(compatible_tags(version, interpreter, platforms))
@@ -403,7 +400,7 @@ def download(target: Target, wanted: list[str], folder: Path) -> None:
 
 def _platforms(target: Target) -> list[str]:
     newest = int(target.glibc.split(".")[1])
-    tags = [*(f"_2_{minor}" for minor in _MANYLINUX if minor <= newest), "1", "2010", "2014"]
+    tags = [*(f"_2_{minor}" for minor in range(newest + 1)), "1", "2010", "2014"]
     return [f"manylinux{tag}_{target.machine}" for tag in tags]
 
 

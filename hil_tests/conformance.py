@@ -149,11 +149,9 @@ class Bench:
     def refuses(self, *actions: dict[str, float]) -> bool:
         """Whether each of these is a ValueError."""
         for action in actions:
-            try:
+            with contextlib.suppress(ValueError):
                 self.call("command", action)
                 return False
-            except ValueError:
-                pass
         return True
 
     def stays_within(self) -> bool:

@@ -336,7 +336,6 @@ def test_a_feed_that_falls_behind_drops_and_counts():
 def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
     """It is behind a router, its simulator has gone, and it goes on saying how it is."""
     listener = WireListener()
-    listener.simulator_gone.set()
     said = iter([Heard("phil/car/health", "health", b"", 1, 0)] * 1000)
 
     def hear(_timeout_s):

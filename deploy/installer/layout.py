@@ -30,11 +30,14 @@ import shutil
 import sys
 import time
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 from typing import Iterator, TextIO
 
 from deploy.installer.verify import Bundle
 from edge_runtime.util import UserError
+
+NO_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)  # What a damaged archive raises
 
 DEFAULT_ROOT = "/opt/phil"
 SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
@@ -223,8 +226,8 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
 def why_not_whole(folder: Path) -> str:
     """What is missing or changed in a release; empty where every file is as it was made."""
     try:
-        wanted = json.loads((folder / CONTENTS).read_bytes())
-    except (OSError, ValueError):
+        wanted = dict(json.loads((folder / CONTENTS).read_bytes()))
+    except (OSError, TypeError, ValueError):
         return f"{CONTENTS} cannot be read"
     found = hashes(folder)
     wrong = sorted(p for p in wanted.keys() | found.keys() if wanted.get(p) != found.get(p))
@@ -257,7 +260,7 @@ def unpack_wheel(data: bytes, name: str, site: Path) -> None:
                     (site / place).parent.mkdir(parents=True, exist_ok=True)
                     with open(str(site / place), "xb") as stream:
                         stream.write(wheel.read(member))
-    except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+    except NO_ZIP as error:
         raise UserError(f"{name} is not a wheel: {error}") from None
     except (FileExistsError, NotADirectoryError) as error:
         raise UserError(f"{name} holds a file that another wheel holds: {error.filename}") from None

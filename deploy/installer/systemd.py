@@ -212,7 +212,7 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
         # Before it makes a user and unpacks for a start that cannot come.
         raise UserError("--service systemd: no systemd runs this computer; use --service none")
     kept = None
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         kept = (root / "state" / _WAY).read_text()
     if (way, kept) == ("none", "systemd") and is_there() and not only_look:
         raise UserError("systemd runs this board: leave --service out, or `uninstall` first")

@@ -284,6 +284,14 @@ def test_packages_come_out_scripts_stay_in_and_no_two_wheels_hold_the_same_file(
             unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
 
 
+def damaged() -> bytes:
+    """A wheel whose compressed member does not unpack."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.py", "".join(map(str, range(999))))
+    return packed.getvalue().replace(packed.getvalue()[60:70], bytes(10))
+
+
 LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/../../x.py")
 
 
@@ -291,10 +299,10 @@ LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/.
     ("data", "match"),
     [
         *((wheel(name), "outside") for name in LEAVES),
-        *((data, "is not a wheel") for data in (b"", b"no zip", wheel("a.py")[:-30])),
+        *((data, "is not a wheel") for data in (b"", b"no zip", wheel("a.py")[:-30], damaged())),
     ],
     # A wheel holds the time at which it is made, and every worker must collect the same names.
-    ids=[*LEAVES, "empty", "no zip", "cut short"],
+    ids=[*LEAVES, "empty", "no zip", "cut short", "damaged"],
 )
 def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match):
     with pytest.raises(verify.UserError, match=match):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import msgspec
 import numpy as np
 
+from bridge.messages import DECODERS
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
@@ -158,7 +159,8 @@ def garbage_health(rig: Rig, number: int) -> Try:
 
 def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
-    decode, prefix, legal = _READ[topic]
+    decode, prefix = DECODERS[topic], "health_" if topic == "health" else ""
+    legal = "foreign_session" if topic in ("state", "command") else ""
     if topic == "state":
         decode = partial(wire.decode_state, layout=Layout(rig.task))
     sent: Counter[str] = Counter()
@@ -171,15 +173,6 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
             time.sleep(max(0.0, begin_s + number / PER_S - time.monotonic()))
     del sent[""]
     return Try(rejected=sent)
-
-
-_READ: dict[str, tuple[Callable[[bytes], object], str, str]] = {
-    "state": (wire.decode_state, "", "foreign_session"),
-    "command": (wire.decode_command, "", "foreign_session"),
-    "feedback": (wire.decode_feedback, "", ""),
-    "health": (wire.decode_health, "health_", ""),
-}
-"""Topic -> how it is read, the prefix of a reason in the report, and how what is valid counts."""
 
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:

@@ -151,9 +151,7 @@ class Rig:
         """The router process between edge and probe, not waited for."""
         return self._start("router", _INSIDE, "router", self.edge_endpoint, self._hub)
 
-    def wait_until_driving(
-        self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
-    ) -> None:
+    def wait_until_driving(self, ready: Callable[[], bool] = lambda: True) -> None:
         """Until it drives steadily, its brake off, and is ``ready``; a vehicle is re-armed."""
         rearmed_s = time.monotonic()
 
@@ -165,7 +163,7 @@ class Rig:
                 rearmed_s = time.monotonic()
             return self._is_driving() and ready()
 
-        wait_until(driving, "a steady drive", timeout_s)
+        wait_until(driving, "a steady drive")
 
     def brakes(self) -> list[tuple[float, bool]]:
         """When the simulated vehicle's brake was pressed (True) or released so far."""
