@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import queue
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +29,7 @@ CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
 MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
+HANG_S = 2.0  # A call that takes so long does not come back
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -59,23 +62,43 @@ def run(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
-    broken = 0
+    judged: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=_judge, args=(bench, judged), daemon=True).start()
+    kept, broken, hangs = 0, 0, False
     try:
-        for rule, is_kept in RULES.items():
-            try:
-                words = "" if is_kept(bench) else f"it says {bench.last}"
-            # A driver may raise anything, and the next rule is due.
-            except (Exception, SystemExit) as error:
-                words = f"{type(error).__name__}: {error}"
-            broken += bool(words)
+        for rule in RULES:
+            while not hangs:
+                with contextlib.suppress(queue.Empty):
+                    words = judged.get(timeout=0.2)
+                    break
+                hangs = bench.calls_for_s > HANG_S
+            if hangs:
+                words = f"{bench.called}() has not come back after {HANG_S:g} s"
+            kept, broken = kept + (not words), broken + bool(words)
             verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
             print(verdict, flush=True)
+            if hangs:
+                break
     finally:
-        with contextlib.suppress(Exception):  # the last rule says it, where it came so far
-            bench.vehicle.close()
+        # The last rule closes it, where it came so far; one that hangs would hang here, too.
+        with contextlib.suppress(Exception):
+            if not hangs:
+                bench.vehicle.close()
         log.close()
-    print(f"{bench.vehicle.name}: {len(RULES) - broken} rules kept, {broken} broken")
+    untried = f", {len(RULES) - kept - broken} not tried" if hangs else ""
+    print(f"{bench.vehicle.name}: {kept} rules kept, {broken} broken{untried}")
     return BROKEN if broken else 0
+
+
+def _judge(bench: Bench, judged: queue.Queue[str]) -> None:
+    """Put what is wrong by each rule, empty where it is kept, in their order."""
+    for is_kept in RULES.values():
+        try:
+            words = "" if is_kept(bench) else f"it says {bench.last}"
+        # A driver may raise anything, and the next rule is due.
+        except (Exception, SystemExit) as error:
+            words = f"{type(error).__name__}: {error}"
+        judged.put(words)
 
 
 class Bench:
@@ -87,15 +110,22 @@ class Bench:
         self.go = {name: limit.high for name, limit in vehicle.limits.items()}
         self.longest_s, self.well_formed = 0.0, True
         self.last: VehicleReport | None = None
+        self.called, self._called_s = "", math.inf  # The call under way, and since when
+
+    @property
+    def calls_for_s(self) -> float:
+        """How long the call under way has taken; -inf where there is none."""
+        return time.monotonic() - self._called_s
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
         """Call the driver with the time after the arguments, and behind it a command's speed."""
-        now_s = time.monotonic()
+        self.called, self._called_s = name, time.monotonic()
         speed_mps = (None,) if name == "command" else ()
         try:
-            return getattr(self.vehicle, name)(*arguments, now_s, *speed_mps, **options)
+            return getattr(self.vehicle, name)(*arguments, self._called_s, *speed_mps, **options)
         finally:
-            self.longest_s = max(self.longest_s, time.monotonic() - now_s)
+            self.longest_s = max(self.longest_s, self.calls_for_s)
+            self._called_s = math.inf
 
     def report(self, after_s: float = 0.0) -> VehicleReport:
         """What it says of itself, after a time in which it is asked for nothing else."""

@@ -1,6 +1,7 @@
 """Each rule of the conformance can fail, and the Hunter keeps them all over the mock chassis."""
 
 import math
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -119,6 +120,18 @@ def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys,
     assert len(lines) == len(RULES) + 1
     broken = [line for line in lines if line.startswith("broken")]
     assert any(rule in line for line in broken) if flaw else not broken, lines
+
+
+def test_a_driver_that_hangs_is_named_and_not_waited_for(monkeypatch, capsys):
+    class Hanging(MockVehicle):
+        def command(self, action, now_s, scenario_speed_mps=None):
+            threading.Event().wait()
+
+    monkeypatch.setattr(f"{__name__}.Driver", Hanging, raising=False)
+    assert exit_status(main, ["conformance", "--vehicle", f"{__name__}:Driver"]) == 1
+    *_, broken, last = capsys.readouterr().out.splitlines()
+    assert broken.endswith("command() has not come back after 2 s")
+    assert last == "mock: 1 rules kept, 1 broken, 14 not tried"
 
 
 def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
