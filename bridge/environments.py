@@ -160,10 +160,16 @@ def load_plugin(environment_id: str) -> None:
         with namespace(wanted) if wanted else contextlib.nullcontext():
             if callable(register):  # A module has registered them by being imported.
                 register()
-    if wanted and environment_id not in gymnasium.registry:  # A scenario may be named by its id
-        for scenario in known(group=SCENARIO_GROUP):
-            with contextlib.suppress(Exception):  # Another one's must not hide what is wrong
-                scenario.load()
+    failures = []
+    for scenario in known(group=SCENARIO_GROUP):  # One may be named by its id.
+        if environment_id in gymnasium.registry:
+            return
+        try:
+            scenario.load()
+        except (Exception, SystemExit) as error:  # It may be the one that is wanted, or not.
+            failures.append(f"{scenario.value}: {type(error).__name__}: {error}")
+    if failures and environment_id not in gymnasium.registry:
+        raise UserError(f"nobody registers it; these scenarios fail: {', '.join(failures)}")
 
 
 def describe(environment: Environment, period_s: float | None = None) -> Task:

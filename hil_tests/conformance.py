@@ -29,7 +29,7 @@ CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
 MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
-HANG_S = 2.0  # A call that takes so long does not come back
+HANG_S = 10.0  # A call that takes so long does not come back
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
     judged: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=_judge, args=(bench, judged), daemon=True).start()
+    judge = threading.Thread(target=_judge, args=(bench, judged), daemon=True)
+    judge.start()
     kept, broken, hangs = 0, 0, False
     try:
         for rule in RULES:
@@ -80,9 +81,10 @@ def run(arguments: argparse.Namespace) -> int:
             if hangs:
                 break
     finally:
-        # The last rule closes it, where it came so far; one that hangs would hang here, too.
-        with contextlib.suppress(Exception):
-            if not hangs:
+        bench.is_over = True  # After ^C nothing may be asked of it once it is closed.
+        judge.join(CALL_S if hangs else HANG_S)
+        with contextlib.suppress(Exception):  # The last rule closes it, where it came so far.
+            if not judge.is_alive():
                 bench.vehicle.close()
         log.close()
     untried = f", {len(RULES) - kept - broken} not tried" if hangs else ""
@@ -97,6 +99,8 @@ def _judge(bench: Bench, judged: queue.Queue[str]) -> None:
             words = "" if is_kept(bench) else f"it says {bench.last}"
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
+            if bench.is_over:
+                return
             words = f"{type(error).__name__}: {error}"
         judged.put(words)
 
@@ -111,6 +115,7 @@ class Bench:
         self.longest_s, self.well_formed = 0.0, True
         self.last: VehicleReport | None = None
         self.called, self._called_s = "", math.inf  # The call under way, and since when
+        self.is_over = False
 
     @property
     def calls_for_s(self) -> float:
@@ -119,6 +124,8 @@ class Bench:
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
         """Call the driver with the time after the arguments, and behind it a command's speed."""
+        if self.is_over:
+            raise InterruptedError
         self.called, self._called_s = name, time.monotonic()
         speed_mps = (None,) if name == "command" else ()
         try:

@@ -6,12 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bridge.environments import describe, make_environment
+from bridge.environments import SCENARIO_GROUP, describe, make_environment
 from bridge.episode import EpisodeRunner
 from bridge.messages import Origin
 from bridge.tests.harness import (
@@ -358,6 +359,16 @@ def test_a_scenario_is_known_by_its_id_in_a_process_that_has_not_imported_it():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == ("congestion\n", "")
+
+
+def test_a_scenario_that_does_not_load_is_named_where_its_id_is_asked_for(monkeypatch):
+    broken = EntryPoint("mine", "nowhere_at_all:ID", SCENARIO_GROUP)
+    points = {(SCENARIO_GROUP, None): [broken]}
+    monkeypatch.setattr(
+        "importlib.metadata.entry_points", lambda group, name=None: points.get((group, name), [])
+    )
+    with pytest.raises(UserError, match="these scenarios fail: nowhere_at_all:ID: ModuleNotFound"):
+        make_environment("mine/Env-v0")
 
 
 def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):

@@ -6,6 +6,7 @@ What one of them needs is imported for that one only.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import inspect
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -104,14 +105,16 @@ def installed_as(own_name: str) -> str:
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
     """The class, and its table: that of its name here, of a module:Class that of its own name.
 
-    Raises UserError for a table of nobody: a misspelt one would leave a speed cap at its default.
+    Raises UserError where another looks like it: a misspelt cap of speed would be none.
     """
     kind = find_vehicle(name)
     own = kind.name if ":" in name else name
-    unknown = tables.keys() - {own, *BUILT_IN, *(point.name for point in _others())}
-    if unknown:
-        found = f"[vehicle.{min(unknown)}] is the table of no vehicle that is known here"
-        raise UserError(f"{found}; that of {name} is [vehicle.{own}]")
+    others = {own, *BUILT_IN, *(point.name for point in _others())}
+    for table in tables.keys() - others:
+        if difflib.get_close_matches(own.lower(), [table.lower()]):
+            raise UserError(
+                f"[vehicle.{table}] is no table of {name}; did you mean [vehicle.{own}]?"
+            )
     return kind, tables.get(own, {})
 
 

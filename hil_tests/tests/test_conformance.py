@@ -128,9 +128,10 @@ def test_a_driver_that_hangs_is_named_and_not_waited_for(monkeypatch, capsys):
             threading.Event().wait()
 
     monkeypatch.setattr(f"{__name__}.Driver", Hanging, raising=False)
+    monkeypatch.setattr("hil_tests.conformance.HANG_S", 0.5)
     assert exit_status(main, ["conformance", "--vehicle", f"{__name__}:Driver"]) == 1
     *_, broken, last = capsys.readouterr().out.splitlines()
-    assert broken.endswith("command() has not come back after 2 s")
+    assert broken.endswith("command() has not come back after 0.5 s")
     assert last == "mock: 1 rules kept, 1 broken, 14 not tried"
 
 

@@ -167,14 +167,14 @@ def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path):
-    config = replace(TINY, episodes=1, evaluate_every_steps=0)
+    config = replace(TINY, episodes=2, evaluate_every_steps=0)
     with pytest.raises(UserError, match="holds no checkpoint to resume from"):
         check_directory(tmp_path, config, resume=True)
     (tmp_path / "config.toml").write_text(config.as_toml())
     (tmp_path / "config.json").write_text(json.dumps(config.as_dict()))
     words = ("train", "--out", str(tmp_path), "--config", str(tmp_path / "config.toml"))
     assert run_cli(main, [*words, "--resume"]) == 0
-    assert len(read_metrics(tmp_path)) == 1
+    assert len(read_metrics(tmp_path)) == 2
     # One that has had its checkpoint is not written over.
     (tmp_path / CHECKPOINT_FILE).unlink()
     with pytest.raises(UserError, match="holds no checkpoint to resume from"):

@@ -371,7 +371,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
     if resume and not started:
         # It may have been killed before the first one.
         begun, done = (run_dir / CONFIG_FILE).is_file(), len(read_metrics(run_dir))
-        if not begun or done >= config.checkpoint_every:
+        if not begun or done > config.checkpoint_every:
             raise UserError(f"{run_dir} holds no checkpoint to resume from")
         print(f"{run_dir} holds no checkpoint yet: it begins anew", file=sys.stderr)
     if resume:
