@@ -247,14 +247,21 @@ def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str
         observation = {entry_name(environment.unwrapped): observation}
     packed = {}
     for name, dtype, shape, _ in layout.parts:
-        try:
-            array = np.asarray(observation[name], dtype)
-        except (LookupError, TypeError, ValueError) as error:
-            raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
-        if array.shape != shape:
-            raise UserError(f"the observation {name} is {array.shape}, not {shape}")
-        packed[name] = array.tobytes()
+        packed[name] = array_of(observation, name, dtype, shape).tobytes()
     return packed
+
+
+def array_of(
+    observation: Mapping[str, Any], name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> np.ndarray:
+    """An entry of an observation as its task has it. Raises UserError where it does not fit."""
+    try:
+        array = np.asarray(observation[name], dtype)
+    except (LookupError, TypeError, ValueError) as error:
+        raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
+    if array.shape != shape:
+        raise UserError(f"the observation {name} is {array.shape}, not {shape}")
+    return array
 
 
 def outcome_of(info: Mapping[str, Any]) -> str:

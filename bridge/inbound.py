@@ -87,7 +87,8 @@ class CommandCheck:
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
-        if _action_fault(command.action, self._actions, COMMAND_ROUNDING):
+        is_stop = command.mode == SAFE_STOP
+        if is_stop and _action_fault(command.action, self._actions, COMMAND_ROUNDING):
             # It is a stop by its mode; who reads its action finds one that fits.
             stop = [row.stop or min(max(0.0, row.low), row.high) for row in self._actions]
             return msgspec.structs.replace(command, action=stop)

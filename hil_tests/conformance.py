@@ -68,13 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     kept, broken, hangs = 0, 0, False
     try:
         for rule in RULES:
-            while not hangs:
-                with contextlib.suppress(queue.Empty):
-                    words = judged.get(timeout=0.2)
-                    break
-                hangs = bench.calls_for_s > HANG_S
-            if hangs:
-                words = f"{bench.called}() has not come back after {HANG_S:g} s"
+            found = _next(judged, bench)
+            hangs = found is None
+            words = f"{bench.called}() has not come back after {HANG_S:g} s" if hangs else found
             kept, broken = kept + (not words), broken + bool(words)
             verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
             print(verdict, flush=True)
@@ -90,6 +86,14 @@ def run(arguments: argparse.Namespace) -> int:
     untried = f", {len(RULES) - kept - broken} not tried" if hangs else ""
     print(f"{bench.vehicle.name}: {kept} rules kept, {broken} broken{untried}")
     return BROKEN if broken else 0
+
+
+def _next(judged: queue.Queue[str], bench: Bench) -> str | None:
+    """What is wrong by the next rule, as it comes; None where a call does not come back."""
+    while bench.calls_for_s <= HANG_S:
+        with contextlib.suppress(queue.Empty):
+            return judged.get(timeout=0.2)
+    return None
 
 
 def _judge(bench: Bench, judged: queue.Queue[str]) -> None:

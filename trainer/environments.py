@@ -19,7 +19,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
-from bridge.episode import finite, outcome_of
+from bridge.episode import array_of, finite, outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Driver, Expert, Reason
@@ -262,18 +262,18 @@ class Adapted:
     def _seen(self, observation: Any) -> NDArray[Any]:
         kind = self.layout.dtype
         if kind.names is None:
-            return self._checked(observation, kind, self.layout.shape)
+            return self._learnable(
+                {bridge.PLAIN: observation}, bridge.PLAIN, kind, self.layout.shape
+            )
         seen = np.zeros((), kind)
         for name in kind.names:
-            seen[name] = self._checked(observation[name], kind[name].base, kind[name].shape)
+            seen[name] = self._learnable(observation, name, kind[name].base, kind[name].shape)
         return seen
 
-    def _checked(self, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """The array. UserError for one that no network could learn from."""
-        array = np.asarray(value, dtype)
-        if array.shape != shape:
-            raise UserError(f"an observation of {self.scenario} is {array.shape}, not {shape}")
-        if dtype.kind == "f" and not np.isfinite(array).all():
+    def _learnable(self, observation: Mapping[str, Any], name: str, *form: Any) -> NDArray[Any]:
+        """An entry; UserError for one that no network could learn from."""
+        array = array_of(observation, name, *form)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise UserError(f"an observation of {self.scenario} holds a number that is not finite")
         return array
 

@@ -95,10 +95,8 @@ def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words
 
 
 def test_a_driver_of_another_package_gets_its_own_table():
-    tables = {"milk_cart": {"wheels": 3}, "hunter": {"speed": 1}}
+    tables = {"milk_cart": {"wheels": 3}, "cart": {"wheels": 2}, "other": {"speed": 1}}
     for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):
-        if ":" in name:
-            tables["cart"] = {"wheels": 2}
         vehicle: Any = make_vehicle(name, tables, a_manifest())
         assert (vehicle.name, vehicle.wheels) == ("cart", wheels)
         assert vehicle_limits(name, tables, a_manifest()) == MockVehicle.limits

@@ -105,11 +105,11 @@ def installed_as(own_name: str) -> str:
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
     """The class, and its table: that of its name here, of a module:Class that of its own name.
 
-    Raises UserError where another looks like it: a misspelt cap of speed would be none.
+    Raises UserError where another looks like it: a misspelt speed cap would stay at its default.
     """
     kind = find_vehicle(name)
     own = kind.name if ":" in name else name
-    others = {own, *BUILT_IN, *(point.name for point in _others())}
+    others = {own, kind.name, *BUILT_IN, *(point.name for point in _others())}
     for table in tables.keys() - others:
         if difflib.get_close_matches(own.lower(), [table.lower()]):
             raise UserError(

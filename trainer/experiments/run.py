@@ -1,9 +1,9 @@
 """One unit from its first step to its record, and many of them in processes or on a Ray cluster.
 
 The record of a unit, one JSON object, is a line of ``<scenario>.jsonl`` in ``results/paper``
-(``guidance``: of that table). Its
-checkpoint and its actor lie in a directory of its own under ``runs``, which is not committed.
-Whatever is killed goes on from its last checkpoint, to the same bits.
+(``guidance``: of that table). Its checkpoint and its actor lie in a directory of its own under
+``runs``, which is not committed. Whatever is killed goes on from its last checkpoint, to the same
+bits.
 """
 
 import json

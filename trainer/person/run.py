@@ -24,7 +24,6 @@ from typing import Any
 from bridge.report import DISCARDED, GOAL
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
-from trainer.drivers import CHECKPOINT_FILE
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import find_algorithm
 from trainer.person.alone import BehindTheScenes, Check
@@ -55,8 +54,7 @@ def training_with_person(
     check_settings(config)
     with closing(open_person(arguments)) as person:
         make_directory(run_dir)
-        started = (run_dir / CHECKPOINT_FILE).is_file()
-        training = PersonRun(config, run_dir, person, started, arguments.speed)
+        training = PersonRun(config, run_dir, person, arguments.resume, arguments.speed)
         steps, human = training.recovered
         if steps:
             back = f"{steps} recorded steps after the checkpoint, {human} of them yours, are back"

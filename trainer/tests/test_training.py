@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +25,7 @@ from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.environments import make_environment
 from trainer.evaluation import evaluate
 from trainer.human.guide import ASKED, Asking
-from trainer.learner.config import LearnerConfig
+from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.pictures import moving_average, write_learning_curve
 from trainer.policy_file import export
@@ -280,6 +280,7 @@ def test_the_printed_preset_is_the_papers(tmp_path):
         out=tmp_path / "run", preset="printed", episodes=1, threads=1, settings=settings
     )
     said = json.loads((run.directory / "config.json").read_text())["learner"]
+    assert said == json.loads(json.dumps(asdict(replace(PRINTED_LEARNER, warmup_steps=100_000))))
     tables = {  # A5 and A6
         "gamma": 0.95, "batch_size": 128, "critic_learning_rate": 2e-4, "policy_delay": 1,
         "actor_learning_rate": 5e-4, "learning_rate_decay": 0.996, "tau": 1e-3,

@@ -204,11 +204,11 @@ def train(
         config = with_setting(config, assignment)
     run_dir = _new_directory(config) if out is None else Path(out)
     person = argparse.Namespace(
-        human=human, scenario=config.scenario, resume=resume, profile=profile, host=host,
+        human=human, scenario=config.scenario, profile=profile, host=host,
         port=port, speed=speed,
     )  # fmt: skip
     with claimed(run_dir):
-        check_directory(run_dir, config, resume)
+        person.resume = check_directory(run_dir, config, resume)
         return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
 
 
@@ -234,7 +234,7 @@ def _train(
             training = stack.enter_context(training_with_person(person, config, run_dir))
         else:
             check_person_options(person)
-            training = TrainingRun(config, run_dir, (run_dir / CHECKPOINT_FILE).is_file())
+            training = TrainingRun(config, run_dir, person.resume)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -363,8 +363,11 @@ def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     return replace(config, **{name: value})
 
 
-def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
-    """Refuse to overwrite a run, or to resume one under other settings; raises UserError."""
+def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
+    """Whether there is a checkpoint to go on from.
+
+    Raises UserError rather than overwrite a run, or resume one under other settings.
+    """
     started = (run_dir / CHECKPOINT_FILE).is_file()
     if started and not resume:
         raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
@@ -376,6 +379,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
         print(f"{run_dir} holds no checkpoint yet: it begins anew", file=sys.stderr)
     if resume:
         _check_settings(run_dir, config)
+    return started
 
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
