@@ -22,7 +22,6 @@ MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after th
 # and besides as many as a quick simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
-_NO_LEAP = ("", -1, -1)  # Session, episode, step
 MAX_LOST_STEPS = 10  # From one state to the next that is heard
 SKIPPED_EPISODES_PER_S = 1.0
 SKIPPED_STEPS_PER_PERIOD = 10.0
@@ -49,14 +48,15 @@ class LatestState:
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
         self._forgotten: Set[int] = set()
-        self._leap = _NO_LEAP  # The newest that was too far ahead, since the last accepted
+        # Session, episode and step of the newest that was too far ahead, since the last accepted
+        self._leap: Optional[Tuple[str, int, int]] = None
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
         rejection = self._judge(state, now_s)
         if rejection is not None:
             return self.reject(rejection)
-        self._session, self._heard_s, self._leap = state.session, now_s, _NO_LEAP
+        self._session, self._heard_s, self._leap = state.session, now_s, None
         self._lasts[state.session] = _Last((state.episode, state.step), now_s)
         self._lasts.move_to_end(state.session)
         while len(self._lasts) > _REMEMBERED_SESSIONS:
@@ -80,14 +80,14 @@ class LatestState:
             return Rejection(Reason.FOREIGN_SESSION, words)
         last = self._lasts.get(session)
         if last is not None:
-            position, leap = (state.episode, state.step), self._leap
-            refusal = _judge_position(position, last, now_s, self._period_s)
+            refusal = _judge_position((state.episode, state.step), last, now_s, self._period_s)
             if refusal is None or refusal.reason is not Reason.FUTURE:
                 return refusal
-            self._leap = session, *position
-            # A simulator that counts in leaps goes on from where it came to.
-            goes_on = leap[:2] == (session, position[0]) and position[1] - leap[2] <= MAX_LOST_STEPS
-            return None if goes_on and position[1] > leap[2] else refusal
+            leap, self._leap = self._leap, (session, state.episode, state.step)
+            if leap is not None and leap[:2] == (session, state.episode):
+                # A simulator that counts in leaps goes on from where it came to.
+                return None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
+            return refusal
         if hash(session) in self._forgotten:
             return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
         if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over

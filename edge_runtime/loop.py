@@ -27,7 +27,7 @@ from edge_runtime.link import Link
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
-from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Reason, Rejection, State
+from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Command, Health, Reason, Rejection, State
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     import numpy as np
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
     from edge_runtime.vehicles.base import VehicleRunner
 
-_HEALTH_PERIOD_S = 1.0 / TOPICS["health"]
+_HEALTH_PERIOD_S = 1.0 / HEALTH_HZ
 _JOIN_S = 0.5
 _RETRY_S = 0.1
 _FLOOD_PERIOD_S = 1.0

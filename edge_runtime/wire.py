@@ -34,16 +34,16 @@ MAX_PLAN, MAX_RIDE_S = 10, 1.0  # further actions of a command at most, and for 
 DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
 
-# How often a second each is sent at least; 0: once a control period, or when it is asked for.
-TOPICS: Dict[str, float] = {
-    "state": 0.0,  # simulator to edge
-    "command": 0.0,  # edge to simulator and vehicle
-    "feedback": 20.0,  # vehicle to all
-    "health": 2.0,  # edge to all
-    "alive": 0.0,  # liveliness token of the edge
-    "status": 0.0,  # queryable of the edge: JSON
-    "rearm": 0.0,  # queryable of the edge: an operator lets it drive again
-}
+TOPICS = (
+    "state",  # simulator to edge, once a control period
+    "command",  # edge to simulator and vehicle, in answer to it
+    "feedback",  # vehicle to all
+    "health",  # edge to all
+    "alive",  # liveliness token of the edge
+    "status",  # queryable of the edge: JSON
+    "rearm",  # queryable of the edge: an operator lets it drive again
+)
+FEEDBACK_HZ, HEALTH_HZ = 20.0, 2.0  # sent at least so often
 _VEHICLE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -55,7 +55,7 @@ def check_vehicle_id(vehicle_id: str) -> str:
 
 
 def key(vehicle_id: str, topic: str) -> str:
-    """The Zenoh key of a row of TOPICS, as in `phil/hunter01/state`."""
+    """The Zenoh key of one of TOPICS, as in `phil/hunter01/state`."""
     assert topic in TOPICS, topic
     return f"phil/{check_vehicle_id(vehicle_id)}/{topic}"
 

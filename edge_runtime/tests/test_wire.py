@@ -176,7 +176,8 @@ def test_the_health_of_an_earlier_version_is_understood_and_so_is_ours_by_it():
         msgspec.msgpack.encode({k: v for k, v in fields.items() if k not in later})
     )
     assert isinstance(health, Health)
-    assert (health.command_ms, health.temperature_c, health.rivals) == ({}, None, 0)
+    assert (health.command_ms, health.temperature_c) == ({}, None)
+    assert (health.load_1min, health.rss_mb, health.rivals) == (0.0, 0.0, 0)
     old_kind = msgspec.defstruct("Old", [("vehicle_id", str), ("mode", str), ("sent_ns", int)])
     old = msgspec.msgpack.decode(wire.encode(HEALTH), type=old_kind)
     assert old.mode == "standby"  # type: ignore[attr-defined]
@@ -231,7 +232,7 @@ def test_only_feedback_may_say_that_no_command_came_yet():
 
 
 def test_keys_and_their_rates():
-    assert (wire.TOPICS["feedback"], wire.TOPICS["health"]) == (20.0, 2.0)
+    assert (wire.FEEDBACK_HZ, wire.HEALTH_HZ) == (20.0, 2.0)
     assert wire.key("hunter01", "state") == "phil/hunter01/state"
     for bad in ("", "a/b", "*", "a" * 65, "a\n", "h\u00fcnter"):
         with pytest.raises(UserError):

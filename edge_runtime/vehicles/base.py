@@ -32,7 +32,7 @@ from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
+from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 if TYPE_CHECKING:
     from edge_runtime.manifest import Manifest
@@ -254,7 +254,7 @@ class VehicleRunner:
         self._watch = VehicleWatch(vehicle.control_period_s, vehicle.limits)
         self._silence_s = 2 * vehicle.control_period_s
         # As often as the topic says, and twice before its silence would be a fault.
-        self._period_s = min(1.0 / TOPICS["feedback"], vehicle.control_period_s / 2)
+        self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
         self._refuses = False  # the driver raised at the newest command
         self._failing = False
         self._next: Optional[_Task] = None  # the newest, until the driver takes it
