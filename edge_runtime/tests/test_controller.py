@@ -54,6 +54,7 @@ def test_a_vehicle_is_played_the_plan_until_it_ends_and_then_it_stops():
     while (due_s := controller.next_deadline_s() or 0.0) < 11.0:
         order = controller.tick(due_s + 1e-6)
         assert order is not None
+        assert order.inference_ns == 0
         told.append((round(due_s, 3), order.ridden, round(order.action[0], 3), order.reason))
     assert told[:6] == [
         (10.121, True, 0.2, ""), (10.221, True, 0.3, ""), (10.321, True, 0.4, ""),
