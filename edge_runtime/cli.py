@@ -12,12 +12,11 @@ import math
 import os
 import signal
 import sys
-import threading
 from importlib import import_module
 from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
 
 from edge_runtime import __version__
-from edge_runtime.util import UserError, ending_signals, printable
+from edge_runtime.util import UserError, ending_signals, printable, take_signals
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -220,14 +219,9 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
     So sessions are closed and files are finished. Outside of the main thread it does nothing.
     """
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {number: signal.signal(number, _interrupt) for number in ending_signals()}
-    try:
+    with contextlib.ExitStack() as undo:
+        take_signals(ending_signals(), _interrupt, undo)
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -237,24 +231,15 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     A second one ends the process, and so does the first where ``ask`` returns False: then nothing
     is left that could end in order. Outside of the main thread it does nothing.
     """
-    is_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in (SIGNALS if is_main else ())}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
     def stop(number: int, frame: Any) -> None:
-        restore()
+        undo.close()
         if not ask():
             os.kill(os.getpid(), number)
 
-    for number in before:
-        signal.signal(number, stop)
-    try:
+    with contextlib.ExitStack() as undo:
+        take_signals(SIGNALS, stop, undo)
         yield
-    finally:
-        restore()
 
 
 def _interrupt(number: int, frame: Any) -> NoReturn:

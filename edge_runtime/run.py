@@ -21,7 +21,7 @@ from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
-from edge_runtime.util import PathLike, ending_signals
+from edge_runtime.util import PathLike, ending_signals, take_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
@@ -35,20 +35,12 @@ _WAITING_PERIOD_S = 5.0
 class _StopSignal:
     """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
 
-    def __init__(self, until: Optional[threading.Event]) -> None:
+    def __init__(self, until: Optional[threading.Event], undo: contextlib.ExitStack) -> None:
         self.came = False
         self.on_stop: Callable[[], None] = lambda: None
-        self._before: Dict[int, Any] = {}
-        if threading.current_thread() is threading.main_thread():  # no other one may take signals
-            for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
-                self._before[number] = signal.signal(number, self._handle)
+        take_signals({signal.SIGTERM, signal.SIGINT, *ending_signals()}, self._handle, undo)
         if until is not None:
             threading.Thread(target=self._wait, args=(until,), daemon=True).start()
-
-    def restore(self) -> None:
-        """Give the signals back."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
     def _wait(self, until: threading.Event) -> None:
         until.wait()
@@ -111,12 +103,9 @@ def drive(
     try:
         loaded = load_config(config, {**flags, "vehicle": NONE if driver else vehicle})
         log.configure(loaded.log_level, loaded.log_format)
-        stop = _StopSignal(until)
-        try:
-            return _drive(loaded, stop, driver)
-        finally:
-            stop.restore()
-            log.close()
+        with contextlib.ExitStack() as undo:
+            undo.callback(log.close)
+            return _drive(loaded, _StopSignal(until, undo), driver)
     except BaseException:
         if driver is not None:
             driver.close()

@@ -4,13 +4,15 @@ user meets, text for a terminal, files to read, and signals that end a process.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
 import signal
 import stat
+import threading
 from pathlib import Path
-from typing import Any, BinaryIO, Dict, Set, Union
+from typing import Any, BinaryIO, Callable, Dict, Iterable, Set, Union
 
 PathLike = Union[str, "os.PathLike[str]"]
 DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
@@ -117,3 +119,13 @@ def ending_signals() -> Set[int]:
     found = {int(number) for number in signal.valid_signals()} - {int(one) for one in _NOT_OURS}
     ends = (signal.SIG_DFL, signal.default_int_handler)
     return {number for number in found if signal.getsignal(number) in ends}
+
+
+def take_signals(
+    numbers: Iterable[int], handler: Callable[[int, Any], Any], undo: contextlib.ExitStack
+) -> None:
+    """Let `handler` have these signals until `undo` closes. Nothing outside of the main thread."""
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            undo.callback(signal.signal, number, signal.getsignal(number))
+            signal.signal(number, handler)
