@@ -20,8 +20,8 @@ import onnx
 from bridge.environments import Environment, changed, describe, known_stops, make_environment
 from bridge.episode import Actuators, pack
 from edge_runtime.cli import Command, examples, positive_number
-from edge_runtime.envelope import read_envelope
 from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.link_quality import read_envelope
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
 from edge_runtime.policy import (
     MAX_POLICY_MIB,

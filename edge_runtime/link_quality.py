@@ -1,4 +1,7 @@
-"""How good the link is, and whether the policy's envelope (envelope.py) allows it. Pure.
+"""How good the link is, and whether the policy's envelope allows it. Pure. Contract, section 4.
+
+First the envelope: the networks in which the policy was shown to succeed. `hil_tests envelope`
+measures it, `--envelope` puts it into the manifest, under the signature. Then the live link.
 
 Each state says when it left, how many commands the simulator has heard, which one last and when.
 With the edge's own stamps these are NTP's four (RFC 5905, section 8):
@@ -21,14 +24,68 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING, Any, Deque, Dict, List, Tuple
 
+import msgspec
 import numpy as np
-from msgspec import UNSET
 
-from edge_runtime.envelope import read_envelope
+from edge_runtime.util import UserError
 
 if TYPE_CHECKING:
-    from edge_runtime.manifest import Manifest
+    from edge_runtime.manifest import Manifest, Task
     from edge_runtime.wire import State
+
+ENVELOPE_SCHEMA = 1
+
+
+class LinkLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """How much of each alone the policy bears, each way: mean delay, standard deviation, share of
+    messages lost one by one, mean run of lost messages, length of outages.
+    """
+
+    delay_ms: float
+    jitter_ms: float
+    loss_percent: float
+    burst_messages: float
+    outage_s: float
+
+
+class LinkEnvelope(msgspec.Struct, frozen=True, kw_only=True):
+    """The networks in which the policy succeeds with `promised_success`, as it was measured.
+
+    A network is inside where every value / limit is at most 1 and their sum at most `joint`, and
+    where every value / limit is at most `box`. `policy_id` names the file that was measured, before
+    the envelope was in it; `network` is the SHA-256 of its graph, which stays the same.
+    """
+
+    policy_id: str
+    env: str
+    condition: str
+    promised_success: float
+    confidence: float
+    control_period_s: float
+    limits: LinkLimits
+    joint: float
+    box: float = 0.0
+    network: str = ""
+    schema: int = ENVELOPE_SCHEMA
+
+
+def read_envelope(value: Any, task: Task) -> LinkEnvelope:
+    """The envelope in a JSON value. Raises UserError where it is none, or none of this task's."""
+    try:
+        envelope = msgspec.convert(value, LinkEnvelope)
+    except msgspec.ValidationError as error:
+        raise UserError(f"the envelope is not valid: {error}") from None
+    limits = [getattr(envelope.limits, name) for name in envelope.limits.__struct_fields__]
+    if envelope.schema != ENVELOPE_SCHEMA:
+        raise UserError(f"the envelope has schema {envelope.schema}, not {ENVELOPE_SCHEMA}")
+    finite = all(0.0 <= value < math.inf for value in (*limits, envelope.joint, envelope.box))
+    if not (finite and envelope.joint):
+        raise UserError("the envelope's limits must be 0 or more, its joint above 0, all finite")
+    if envelope.control_period_s != task.control_period_s:
+        found = f"the envelope was measured every {envelope.control_period_s:g} s"
+        raise UserError(f"{found}, the policy drives every {task.control_period_s:g} s")
+    return envelope
+
 
 # Windows in messages. A deviation of 300 is good to 4 %, and follows a change in 15 s at 10 Hz.
 # A share of 5 % needs 1,200 each way to be good to half a point.
@@ -153,7 +210,7 @@ class LinkQuality:
 
     def _note_heard(self, heard: Any, sent_ns: Any, heard_ns: Any) -> None:
         number, episode = self._sent.get(sent_ns, (0, -1))
-        if not number or UNSET in (heard, heard_ns) or heard_ns == self._heard_ns:
+        if not number or msgspec.UNSET in (heard, heard_ns) or heard_ns == self._heard_ns:
             return
         came, self._heard, self._heard_ns = heard - self._heard, heard, heard_ns
         if episode != self._answered:  # what was under way when the one before ended is forgotten

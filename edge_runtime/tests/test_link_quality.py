@@ -9,8 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.envelope import read_envelope
-from edge_runtime.link_quality import ARM_BELOW, LinkQuality
+from edge_runtime.link_quality import ARM_BELOW, LinkQuality, read_envelope
 from edge_runtime.manifest import Manifest
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import TASK, T
