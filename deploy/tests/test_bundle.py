@@ -92,6 +92,9 @@ def test_a_whole_bundle_is_the_same_again_and_the_boards_is_small(workshop, tmp_
         assert one.path.stat().st_size < MAX_JETPACK5_BYTES
 
 
+NO_FIT = "does not fit Python 3.8 on aarch64 with glibc 2.31"
+
+
 @pytest.mark.parametrize(
     ("name", "match"),
     [
@@ -101,18 +104,9 @@ def test_a_whole_bundle_is_the_same_again_and_the_boards_is_small(workshop, tmp_
         ("driver-1.0-cp38-none-any.whl", ""),
         ("driver-1.0-cp38-cp38-manylinux_2_30_aarch64.whl", ""),
         ("driver-1.0-cp37-abi3-manylinux_2_28_aarch64.whl", ""),
-        (
-            "driver-1.0-cp311-cp311-manylinux_2_17_aarch64.whl",
-            "does not fit Python 3.8 on aarch64 with glibc 2.31",
-        ),
-        (
-            "driver-1.0-cp38-cp38-manylinux_2_17_x86_64.whl",
-            "does not fit Python 3.8 on aarch64 with glibc 2.31",
-        ),
-        (
-            "driver-1.0-cp38-cp38-manylinux_2_35_aarch64.whl",
-            "does not fit Python 3.8 on aarch64 with glibc 2.31",
-        ),
+        ("driver-1.0-cp311-cp311-manylinux_2_17_aarch64.whl", NO_FIT),
+        ("driver-1.0-cp38-cp38-manylinux_2_17_x86_64.whl", NO_FIT),
+        ("driver-1.0-cp38-cp38-manylinux_2_35_aarch64.whl", NO_FIT),
         ("NumPy-9.0-py3-none-any.whl", "has a numpy of its own"),
         ("phil_edge_runtime-9.0-py3-none-any.whl", "has a phil-edge-runtime of its own"),
         ("driver.whl", "Invalid wheel filename"),
@@ -246,19 +240,18 @@ def test_a_mistake_is_said_before_any_download(workshop, tmp_path, capsys, monke
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bundle_that_does_not_fit_leaves_no_signature(workshop, tmp_path, monkeypatch):
-    monkeypatch.setattr(bundle_module, "write_private", Mock(side_effect=UserError("full")))
-    with pytest.raises(UserError, match="full"):
-        make_bundle(workshop.inputs(), HERE, tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
-    def interrupted(*_) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize(
+    ("place", "name", "error"),
+    [
+        (bundle_module, "write_private", UserError("full")),
+        (os, "replace", KeyboardInterrupt("now")),
+    ],
+)
+def test_a_bundle_that_is_not_finished_leaves_no_signature_and_no_key(
+    workshop, tmp_path, monkeypatch, place, name, error
+):
+    monkeypatch.setattr(place, name, Mock(side_effect=error))
+    with pytest.raises(type(error), match=str(error)):
         make_bundle(workshop.inputs(), HERE, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []
 

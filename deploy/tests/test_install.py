@@ -212,13 +212,8 @@ def test_a_bundle_for_another_computer_is_refused(board: Board, workshop, tmp_pa
 def test_a_policy_that_may_not_drive_there_changes_nothing(board: Board, workshop, tmp_path):
     good = workshop.make(0.1)
     assert board.install(good.path).returncode == 0
-    wheel = changed_wheel(
-        workshop.edge_wheel,
-        tmp_path / "w",
-        "edge_runtime/policy.py",
-        "range(13, 22)",
-        "range(18, 22)",
-    )
+    change = ("edge_runtime/policy.py", "range(13, 22)", "range(18, 22)")
+    wheel = changed_wheel(workshop.edge_wheel, tmp_path / "w", *change)
     done = board.install(workshop.make(0.2, wheels=[wheel, workshop.host]).path)
     assert done.returncode == 1
     assert "edge_runtime check" in done.stderr

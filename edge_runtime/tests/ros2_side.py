@@ -32,7 +32,7 @@ def serialize(type_name, message, little_endian=True):
 
 
 def deserialize(type_name: str, payload: bytes) -> Any:
-    """The message as a dictionary, arrays as lists and sequences of bytes as bytes."""
+    """The message as a dictionary, arrays as lists."""
     return _plain(STORE.deserialize_cdr(payload, type_name))
 
 
@@ -43,8 +43,6 @@ def _build(type_name, message):
         value = message[name]
         if isinstance(value, dict):
             value = _build(str(kind), value)
-        elif isinstance(value, bytes):
-            value = np.frombuffer(value, dtype=np.uint8)
         elif isinstance(value, list):
             value = np.array(value, dtype=np.float64)
         values[name] = value
@@ -53,7 +51,7 @@ def _build(type_name, message):
 
 def _plain(value):
     if isinstance(value, np.ndarray):
-        return value.tobytes() if value.dtype == np.uint8 else value.tolist()
+        return value.tolist()
     if hasattr(value, "__dataclass_fields__"):
         names = [name for name in value.__dataclass_fields__ if not name.startswith("__")]
         return {name: _plain(getattr(value, name)) for name in names}
@@ -81,7 +79,7 @@ class RosHunter:
         self.tokens, watcher = watch_tokens(session)
         prefix = f"{namespace}/" if namespace else ""
         odometry = session.declare_publisher(f"{prefix}odom")
-        self.put = odometry.put  # something else on the odometry's topic
+        self._put = odometry.put
         self._declared = [
             session.declare_subscriber(f"{prefix}cmd_vel", self._hear_twist),
             session.declare_subscriber(f"{prefix}ackermann_cmd", self._hear_drive),
@@ -127,7 +125,7 @@ class RosHunter:
             target_mps = 0.0 if is_late else self.asked_mps
             self.speed_mps += 0.3 * (target_mps - self.speed_mps)
             if not self.silent:
-                self.put(serialize(ODOMETRY, self.message()))
+                self._put(serialize(ODOMETRY, self.message()))
 
     def message(self):
         slope = math.tan(abs(self.inner_rad))

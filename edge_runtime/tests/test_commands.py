@@ -126,6 +126,7 @@ WRONG = {
     "vehicle = 3": "vehicle: Expected `str`",
     "[vehicle]\nname = 'mock'": r"vehicle: name is no table, .*\[vehicle.NAME\]",
     "[vehicle]\ndriver = 3": "vehicle: Expected `str`",
+    "vehicle_settings.hunter.scale = 0.05": r"vehicle_settings is no .* write \[vehicle.NAME\]",
 }
 
 
@@ -140,11 +141,6 @@ def test_wrong_config_files(settings, text):
 def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags):
     with pytest.raises(UserError, match=r"^((?!edge\.toml).)*$"):
         load_config(settings("log_level = 'debug'"), flags)
-
-
-def test_settings_of_a_vehicle_stand_in_its_table(settings):
-    with pytest.raises(UserError, match=r"vehicle_settings is no setting; write \[vehicle.NAME\]"):
-        load_config(settings("policy = 'p.onnx'\nvehicle_settings.hunter.scale = 0.05"), {})
 
 
 def test_flags_win_over_the_file(settings):

@@ -43,10 +43,13 @@ def answer(controller, step, now_s, output=GOOD, **changes):
     return controller.finish(output, QUICK_NS, now_s + 0.001)
 
 
+def riding(max_s, needs_rearm, vehicle=None):
+    limits = shared_limits([PEDAL], vehicle or {})
+    return Controller(limits, T, needs_rearm, ride=Ride(max_s, T, limits, plays=needs_rearm))
+
+
 def test_a_vehicle_is_played_the_plan_until_it_ends_and_then_it_stops():
-    slow = {"pedal": ActionLimit(-1.0, 0.4, 1.0)}
-    limits = shared_limits([PEDAL], slow)
-    controller = Controller(limits, T, True, ride=Ride(0.59, T, limits, plays=True))
+    controller = riding(0.59, True, {"pedal": ActionLimit(-1.0, 0.4, 1.0)})
     order = answer(controller, 0, 10.0)
     plan = [round(value, 6) for (value,) in order.plan or []]
     assert (order.action, plan) == ([pytest.approx(0.1)], [0.2, 0.3, 0.4, 0.4, 0.4])
@@ -64,8 +67,7 @@ def test_a_vehicle_is_played_the_plan_until_it_ends_and_then_it_stops():
 
 
 def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
-    limits = shared_limits([PEDAL], {})
-    controller = Controller(limits, T, False, ride=Ride(0.5, T, limits, plays=False))
+    controller = riding(0.5, False)
     for step, (arrived_s, sent_s, driven) in enumerate([
         (10.0, 5.0, True), (10.1, 5.1, True), (10.6, 5.6, True),  # lost: as late as it was sent
         (11.1, 5.7, False), (11.101, 5.8, False), (11.102, 5.9, True), (11.103, 6.0, True),
@@ -78,25 +80,22 @@ def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
 
 
 def test_an_end_of_the_episode_that_the_link_held_up_ends_the_ride():
-    limits = shared_limits([PEDAL], {})
-    controller = Controller(limits, T, True, ride=Ride(0.5, T, limits, plays=True))
+    controller = riding(0.5, True)
     answer(controller, 0, 10.0, sent_ns=10**10)
     order = answer(controller, 1, 10.4, sent_ns=round(10.1e9), final=True)
     assert (order.mode, order.reason) == ("safe_stop", "final_state")
     assert controller.next_deadline_s() is None
 
 
-@pytest.mark.parametrize("max_s", [-1.0, 0.05, 1.1, math.nan, math.inf])
-def test_a_ride_is_one_period_to_one_second(max_s):
-    with pytest.raises(UserError, match=r"ride_through.max_s .* use 0.1 to 1 s, or 0 for off"):
-        Ride(max_s, T, shared_limits([PEDAL], {}), plays=True)
-
-
-def test_a_ride_is_no_longer_than_a_second_at_any_rate():
-    limits = shared_limits([PEDAL], {})
+@pytest.mark.parametrize(
+    ("max_s", "period_s"),
+    [*((max_s, T) for max_s in (-1.0, 0.05, 1.1, math.nan, math.inf)), (1.2, 0.3)],
+)
+def test_a_ride_is_one_period_to_one_second_at_any_rate(max_s, period_s):
+    limits, words = shared_limits([PEDAL], {}), f"use {period_s} to 1 s, or 0 for off"
+    with pytest.raises(UserError, match=f"ride_through.max_s .* {words}"):
+        Ride(max_s, period_s, limits, plays=True)
     assert Ride(1.0, 0.3, limits, plays=True).periods == 3
-    with pytest.raises(UserError, match=r"use 0\.3 to 1 s, or 0 for off"):
-        Ride(1.2, 0.3, limits, plays=True)
 
 
 def said(order):

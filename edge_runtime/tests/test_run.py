@@ -12,7 +12,6 @@ import pytest
 
 import edge_runtime
 from edge_runtime.commands import render_status
-from edge_runtime.files import Hold
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import (
     WHITE,
@@ -269,27 +268,11 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
             time.sleep(3 * T)
 
 
-@pytest.fixture
-def lock(tmp_path):
-    with open(tmp_path / "hold", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield lock
-
-
-def test_it_is_free_when_the_lock_is_and_stays_so(lock, tmp_path):
-    hold = Hold(lock.name)
-    assert hold.is_on()
-    assert hold.refusal()
-    for change in (fcntl.LOCK_UN, fcntl.LOCK_EX):
-        fcntl.flock(lock, change)
-        assert not hold.is_on()
-        assert hold.refusal() == ""
-    assert not Hold(str(tmp_path / "absent")).is_on()
-
-
-def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path, lock):
-    settings, steps = tmp_path / "edge.toml", itertools.count()
-    settings.write_text(f"vehicle = 'mock'\nhold = '{lock.name}'\n")
+def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
+    settings, steps, hold = tmp_path / "edge.toml", itertools.count(), tmp_path / "hold"
+    settings.write_text(f"vehicle = 'mock'\nhold = '{hold}'\n")
+    installer = hold.open("w")
+    fcntl.flock(installer, fcntl.LOCK_EX)
     edge, simulator = edge_and_simulator("constant", "--config", str(settings))
 
     def feed(count):
@@ -305,7 +288,7 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path, 
     answer = simulator.query("rearm")
     assert not answer["accepted"]
     assert "installer" in answer["detail"]
-    lock.close()
+    installer.close()
     feed(6)
     assert simulator.next_command().session == "simulator-a"
     assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")

@@ -102,17 +102,20 @@ def test_run_cli_turns_errors_into_one_line(capsys):
         run_cli(partial(fails, OSError("about a socket")), [])
 
 
-def test_a_hold_where_the_file_system_has_no_locks_holds_nothing(tmp_path, monkeypatch):
-    path = tmp_path / "hold"
-    path.touch()
-    hold = Hold(str(path))
-    with monkeypatch.context() as patch:
-        patch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
-        assert not hold.is_on()
-    with path.open("rb") as installer:  # It was but for a moment.
-        fcntl.flock(installer, fcntl.LOCK_EX)
+def test_a_hold_lasts_as_long_as_a_lock_that_the_file_system_has(tmp_path, monkeypatch):
+    with (tmp_path / "hold").open("w") as installer:
+        hold = Hold(installer.name)
+        with monkeypatch.context() as patch:
+            patch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
+            assert not hold.is_on()
+        fcntl.flock(installer, fcntl.LOCK_EX)  # It was but for a moment.
         assert hold.is_on()
-    assert not hold.is_on()
+        assert hold.refusal()
+        for change in (fcntl.LOCK_UN, fcntl.LOCK_EX):  # once free, it is free
+            fcntl.flock(installer, change)
+            assert not hold.is_on()
+            assert hold.refusal() == ""
+    assert not Hold(str(tmp_path / "absent")).is_on()
 
 
 def test_quantiles_of_durations():

@@ -11,6 +11,7 @@ import edge_runtime
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import Simulator, make_state, run_command, wait_until
 from edge_runtime.tests.rigs import CAR, PEDAL, HunterRig, Ros2Rig, a_manifest
+from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mock import MockVehicle
@@ -138,19 +139,9 @@ def test_a_streamed_command_holds_for_two_periods_of_the_policy(make, period_s, 
     assert rig.core._heard.silence_s == pytest.approx(2 * period_s)
 
 
-class Noting(MockVehicle):
-    def __init__(self):
-        super().__init__()
-        self.closed = 0
-
-    def close(self):
-        super().close()
-        self.closed += 1
-
-
 def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, capsys):
     signed, endpoint, until = make_policy(value=1.0), free_endpoint(), threading.Event()
-    vehicle, ended = Noting(), []
+    vehicle, ended = BrokenVehicle(), []
     settings = {"public_key": str(signed.public_key), "vehicle_id": "cart7", "log_level": "error"}
 
     def drive():
@@ -170,7 +161,7 @@ def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, c
         wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps > 0.1, "it to move")
         until.set()
         thread.join(20.0)
-    assert (ended, vehicle.closed > 0) == ([True], True)
+    assert (ended, "close" in vehicle.asked) == ([True], True)
     assert "ready vehicle_id=cart7 vehicle=mock" in capsys.readouterr().out
 
 
@@ -184,12 +175,15 @@ def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, c
     ],
 )
 def test_drive_refuses_what_run_refuses_and_closes_the_driver(settings, words, tmp_path):
-    vehicle = Noting()
+    vehicle = BrokenVehicle()
     with pytest.raises(UserError, match=words):
         edge_runtime.drive(tmp_path / "absent.onnx", **{"vehicle": vehicle, **settings})
-    assert vehicle.closed == ("vehicle" not in settings)
+    assert vehicle.asked == ["close"] * ("vehicle" not in settings)
     vehicle.limits = None  # type: ignore[assignment]
-    for wrong, words in ((Noting, "is no edge_runtime.vehicles.base.Vehicle"), (vehicle, "limits")):
+    for wrong, words in (
+        (BrokenVehicle, "is no edge_runtime.vehicles.base.Vehicle"),
+        (vehicle, "limits"),
+    ):
         with pytest.raises(UserError, match=words):
             edge_runtime.drive(tmp_path / "absent.onnx", vehicle=cast(Any, wrong))
     with pytest.raises(AttributeError, match="no attribute 'drivee'"):
