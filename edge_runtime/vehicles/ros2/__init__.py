@@ -40,30 +40,25 @@ if TYPE_CHECKING:
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
 YAW_RATE, STEERING = "yaw_rate", "steering"
 _ANGULAR = (YAW_RATE, STEERING)
-_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_WORD = "[A-Za-z_][A-Za-z0-9_]*"
+_NAME = re.compile(f"/|/?{_WORD}(/{_WORD})*")
 _MAX_CHARS = 200
 
 # Below this the path's curvature, yaw rate over speed, is more noise than steering.
 STEERS_FROM_MPS = 0.2
 
 
-def check_ros_name(name: str, what: str = "ROS name") -> str:
-    """The name itself, as in `/hunter01/odom` or `/`; UserError if ROS would not take it."""
-    plain = name[1:] if name.startswith("/") else name
-    parts = plain.split("/") if plain else []
-    valid = len(name) <= _MAX_CHARS and all(_WORD.fullmatch(part) for part in parts)
-    if not name or not valid:
-        raise UserError(
-            f"{what} {name!r} is not valid: words of A-Z a-z 0-9 _ that begin with no digit,"
-            f" between slashes, {_MAX_CHARS} characters at most, like /hunter01/odom"
-        )
-    return name
-
-
 def topic_key(namespace: str, topic: str) -> str:
-    """The Zenoh key of a topic: below the namespace, or as it is where it begins with a slash."""
-    check_ros_name(namespace, "namespace")
-    check_ros_name(topic, "topic")
+    """The Zenoh key of a topic: below the namespace, or as it is where it begins with a slash.
+
+    Raises UserError for names that ROS would not take.
+    """
+    for what, name in (("namespace", namespace), ("topic", topic)):
+        if len(name) > _MAX_CHARS or not _NAME.fullmatch(name):
+            raise UserError(
+                f"{what} {name!r} is not valid: words of A-Z a-z 0-9 _ that begin with no digit,"
+                f" between slashes, {_MAX_CHARS} characters at most, like /hunter01/odom"
+            )
     whole = topic if topic.startswith("/") else f"{namespace}/{topic}"
     joined = "/".join(filter(None, whole.split("/")))
     if not joined:
