@@ -10,9 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.link_quality import ARM_BELOW, LinkQuality, read_envelope
-from edge_runtime.manifest import Manifest
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import TASK, T
+from edge_runtime.tests.rigs import a_manifest
 from edge_runtime.util import UserError
 
 MS = 1_000_000
@@ -25,9 +25,7 @@ ENVELOPE = {
 
 
 def manifest(**changes):
-    about: Any = {"algorithm": "test", "training": {}, "created": ""}
-    fields: Any = {name: getattr(TASK, name) for name in TASK.__struct_fields__}
-    return Manifest(**fields, **about, envelope={**ENVELOPE, **changes})
+    return a_manifest(envelope={**ENVELOPE, **changes})
 
 
 class Network:

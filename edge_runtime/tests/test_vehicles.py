@@ -5,6 +5,7 @@ import threading
 import time
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 import edge_runtime
@@ -53,10 +54,7 @@ def carts(tmp_path, monkeypatch):
     sys.modules.pop("carts", None)
 
 
-WHOLE = {
-    "throttle_mps2": 1.0, "brake_mps2": 2.0, "max_speed_mps": 5.0,
-    "full_steering_rad": 0.3, "wheelbase_m": 1.0,
-}  # fmt: skip
+WHOLE = msgspec.structs.asdict(CAR)
 
 
 @pytest.mark.parametrize(

@@ -162,11 +162,6 @@ class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
     twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
 
 
-def stamp_of(time_ns: int) -> Time:
-    """The wall clock's nanoseconds as a ROS time."""
-    return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-
-
 _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry)
 
 
@@ -221,7 +216,7 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
 def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
     """Speed and centre angle; no acceleration is given, because the speed is a ramp already."""
     return AckermannDriveStamped(
-        header=Header(stamp_of(time_ns), "base_link"),
+        header=Header(Time(*divmod(time_ns, 10**9)), "base_link"),
         drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
     )
 
