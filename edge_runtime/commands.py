@@ -99,16 +99,13 @@ def ask(
 ) -> Dict[str, Any]:
     """The JSON reply of a queryable of wire.TOPICS. Raises UserError where none comes in 2 s."""
     selector = key(vehicle_id, topic)
-    session = open_session(connect=connect, mode="client", tls=tls)
-    try:
+    with open_session(connect=connect, mode="client", tls=tls) as session:
         for reply in session.get(selector, timeout=_TIMEOUT_S):
             if reply.ok is not None:
                 answer = parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
                 if not isinstance(answer, dict):
                     raise UserError(_STRANGER.format(vehicle_id))
                 return answer
-    finally:
-        session.close()
     # A query without the right to it looks the same from here as a runtime that is not there.
     hint = f"; or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
     raise UserError(

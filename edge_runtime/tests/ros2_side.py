@@ -76,14 +76,17 @@ class RosHunter:
         self.silent = False
         self._commanded_s = -math.inf
         self._session = session = open_session(listen=listen, connect=connect, mode="router")
-        self.tokens, watcher = watch_tokens(session)
+        self.tokens: set = set()  # what a bridge watches
         prefix = f"{namespace}/" if namespace else ""
         odometry = session.declare_publisher(f"{prefix}odom")
         self._put = odometry.put
         self._declared = [
             session.declare_subscriber(f"{prefix}cmd_vel", self._hear_twist),
             session.declare_subscriber(f"{prefix}ackermann_cmd", self._hear_drive),
-            *(watcher, odometry),
+            session.liveliness().declare_subscriber(
+                "@/*/@ros2_lv/**", self._note_token, history=True
+            ),
+            odometry,
         ]
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -116,6 +119,10 @@ class RosHunter:
                 inner_rad = math.atan(WHEELBASE_M / (radius_m - TRACK_M / 2))
             self.inner_rad = math.copysign(inner_rad, yaw_radps)
 
+    def _note_token(self, sample):
+        change = self.tokens.add if "PUT" in str(sample.kind) else self.tokens.discard
+        change(str(sample.key_expr))
+
     def _hear_drive(self, sample):
         self.drives.append(deserialize(DRIVE, sample.payload.to_bytes()))
 
@@ -140,13 +147,3 @@ class RosHunter:
             "pose": {"pose": pose, "covariance": [0.0] * 36},
             "twist": {"twist": twist, "covariance": [0.0] * 36},
         }
-
-
-def watch_tokens(session):
-    """What a bridge watches: the tokens that are there now, by key; and the subscriber."""
-    here: set = set()
-
-    def change(sample):
-        (here.add if "PUT" in str(sample.kind) else here.discard)(str(sample.key_expr))
-
-    return here, session.liveliness().declare_subscriber("@/*/@ros2_lv/**", change, history=True)
