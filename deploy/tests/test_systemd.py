@@ -213,36 +213,22 @@ def test_a_trial_that_fails_says_why_and_is_taken_away(systemd, tmp_path, said, 
 
 
 ROOT = Path(__file__).parents[2]
-DOCKERFILE = ROOT / "deploy" / "container" / "Dockerfile"
+DOCKERFILE = (ROOT / "deploy/container/Dockerfile").read_text()
+INSTRUCTIONS = re.sub(r"(?m)^#.*\n|\\\n\s*", "", DOCKERFILE)
+"""A line each, without comments."""
 
 
-def instructions() -> list[tuple[str, str]]:
-    """(INSTRUCTION, arguments), with continued lines joined and comments left out."""
-    lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.startswith("#")]
-    joined = re.sub(r"\\\n\s*", " ", "\n".join(lines))
-    split = (line.partition(" ") for line in joined.split("\n"))
-    return [(word, rest.strip()) for word, _, rest in split]
-
-
-def only(word: str) -> str:
-    """The arguments of the last stage's only instruction of that name."""
-    everything = instructions()
-    begin = max(i for i, (each, _) in enumerate(everything) if each == "FROM")
-    (found,) = [rest for each, rest in everything[begin:] if each == word]
+def only(word: str, text: str = INSTRUCTIONS.rpartition("FROM ")[2]) -> str:
+    """The arguments of the only instruction of that name, in the last stage."""
+    (found,) = re.findall(rf"(?m)^{word} (.*)$", text)
     return found
-
-
-def installation() -> str:
-    (made,) = [rest for word, rest in instructions() if word == "RUN" and "install.pyz" in rest]
-    return made
 
 
 def test_it_runs_without_rights_and_asks_no_index():
     assert only("USER") == "10001:10001"
-    assert not re.search(r"\b(pip|apt-get|curl|wget|ADD)\b", DOCKERFILE.read_text())
-    copied = [rest for word, rest in instructions() if word == "COPY"]
-    assert copied == ["--from=install /opt/phil /opt/phil"]  # no bundle, so no private key
-    assert installation().startswith("--mount=type=bind")
+    assert not re.search(r"\b(pip|apt-get|curl|wget|ADD)\b", DOCKERFILE)
+    copied = only("COPY", INSTRUCTIONS)
+    assert copied == "--from=install /opt/phil /opt/phil"  # no bundle, so no private key
 
 
 def test_no_private_key_is_left_and_its_folder_is_there_to_be_mounted(tmp_path):
@@ -251,7 +237,7 @@ def test_no_private_key_is_left_and_its_folder_is_there_to_be_mounted(tmp_path):
     secrets.mkdir(parents=True)
     (secrets / "key.pem").write_text("private")
     (tmp_path / "current").symlink_to("releases/1")
-    installer, _, after = installation().partition(" && ")
+    installer, _, after = only("RUN --mount=type=bind,\\S+", INSTRUCTIONS).partition(" && ")
     assert "install.pyz" in installer
     shell = ["sh", "-c", after.replace("/opt/phil", str(tmp_path))]
     done = subprocess.run(shell, capture_output=True, text=True, timeout=60)
