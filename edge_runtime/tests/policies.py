@@ -60,7 +60,7 @@ def write_policy(
     takes about a second at SLOW_LOOPS `loops`, and in proportion at others. `graph` is another
     network, in ONNX's text form; it may name the constant `ten`.
     """
-    made = _own_graph(graph) if graph else _graph(kind, value, len(actions), loops)
+    made = _graph(graph, kind, value, len(actions), loops)
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
@@ -120,17 +120,12 @@ _ANSWERS = {
 }
 
 
-def _own_graph(text: str) -> onnx.GraphProto:
-    graph = onnx.parser.parse_graph(text)
-    graph.initializer.append(numpy_helper.from_array(np.array(10.0, np.float32), "ten"))
-    return graph
-
-
-def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
+def _graph(text: str, kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
     size = _SLOW_SIZE if kind == "slow" else 1
     weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
+        "ten": np.array(10.0, np.float32),
         "half_range": np.array([127.5], np.float32),
         "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
         "ones": np.ones((1, n_actions), np.float32),
@@ -140,7 +135,8 @@ def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphPro
         "recurrent": np.zeros((1, size, size), np.float32),
     }
     graph = onnx.parser.parse_graph(
-        f"""test_{kind} (uint8[batch, 2, 45, 80] frames) => (float[batch, {n_actions}] action) {{
+        text
+        or f"""test_{kind} (uint8[batch, 2, 45, 80] frames) => (float[batch, {n_actions}] action) {{
             pixels = Cast<to = 1>(frames)
             mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
             {_ANSWERS[kind]}
