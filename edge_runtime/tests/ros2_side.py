@@ -80,7 +80,7 @@ class RosHunter:
         prefix = f"{namespace}/" if namespace else ""
         odometry = session.declare_publisher(f"{prefix}odom")
         self._put = odometry.put
-        self._declared = [
+        self._declared: list = [
             session.declare_subscriber(f"{prefix}cmd_vel", self._hear_twist),
             session.declare_subscriber(f"{prefix}ackermann_cmd", self._hear_drive),
             session.liveliness().declare_subscriber(
