@@ -51,10 +51,7 @@ def test_run_without_a_vehicle_loads_no_more_than_it_needs(what, most_lines):
 
 
 def test_a_vehicle_loads_no_other_one():
-    making = """
-from edge_runtime.vehicles import find_vehicle
-find_vehicle("mock")()
-"""
+    making = "from edge_runtime.vehicles import find_vehicle; find_vehicle('mock')()"
     assert {path.parent.name for path in loaded_by(making)} == {"edge_runtime", "vehicles"}
 
 
