@@ -1,21 +1,27 @@
 """``python -m hil_tests bench``: the loop against the least that could answer, and what it costs.
 
-Two processes answer the same states: the edge runtime, and `bench_floor.py`. Their blocks take
-turns, so that the machine disturbs both alike. Then the runtime's memory, idle load and start.
+Two processes answer the same states: the edge runtime, and the floor, which is this file run by
+itself. Their blocks take turns, so that the machine disturbs both alike. Then the runtime's memory,
+idle load and start.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
+import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
+import msgspec
 import numpy as np
+import onnxruntime
 import zenoh
 
 from bridge.ports import add_options
@@ -89,7 +95,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     where = ("--connect", endpoint, "--vehicle-id", OURS)
     with ExitStack() as stack:
         session = stack.enter_context(open_session(listen=endpoint, mode="router"))
-        ours, floor = (stack.enter_context(Contender(session, name)) for name in (OURS, FLOOR))
+        ours, floor = (Contender(session, name, stack) for name in (OURS, FLOOR))
         starts_s: list[float] = []
         while len(starts_s) < STARTS:
             begun_s = time.perf_counter()
@@ -97,7 +103,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             starts_s.append(ours.rouse() - begun_s)
             if len(starts_s) < STARTS:
                 edge.end()
-        words = ("hil_tests.bench_floor", arguments.policy, endpoint, FLOOR)
+        words = ("hil_tests.bench_loop", arguments.policy, endpoint)
         stack.enter_context(Process(*words, ready="ready"))
         for contender in (ours, floor):
             contender.rouse()
@@ -119,7 +125,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
 class Contender:
     """Sends states to a process. A block of them is an episode."""
 
-    def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
+    def __init__(self, session: zenoh.Session, vehicle_id: str, stack: ExitStack) -> None:
         self.vehicle_id = vehicle_id
         self.arrivals: dict[int, float] = {}  # when the answer to each step came
         self.modes: Counter[str] = Counter()  # how many answers had each
@@ -127,13 +133,12 @@ class Contender:
         shape = (PICTURES, 2, 45, 80)
         self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
         self._step = self._episode = 0
-        self._publisher = session.declare_publisher(
+        publisher = session.declare_publisher(
             wire.key(vehicle_id, "state"), congestion_control=zenoh.CongestionControl.DROP
         )
-        self.put: Callable[[bytes], None] = self._publisher.put
-        self._subscriber = session.declare_subscriber(
-            wire.key(vehicle_id, "command"), self._on_command
-        )
+        self.put: Callable[[bytes], None] = stack.enter_context(publisher).put
+        commands = wire.key(vehicle_id, "command")
+        stack.enter_context(session.declare_subscriber(commands, self._on_command))
 
     def prepare(self, final: bool = False) -> tuple[int, bytes]:
         """The next step and its state."""
@@ -175,13 +180,6 @@ class Contender:
                 raise CommandTimeoutError(f"{self.vehicle_id} does not answer step {step}")
             time.sleep(0.0001)
         return self.arrivals[step] - begun_s
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._subscriber.undeclare()
-        self._publisher.undeclare()
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         arrived_s = time.perf_counter()
@@ -251,9 +249,9 @@ def compare(ours: Sequence[np.ndarray], floor: Sequence[np.ndarray]) -> dict[str
 def memory(process: Process, contender: Contender, steps: int) -> list[float]:
     """Resident memory, MB, at the start and after each tenth of ``steps`` answers, one by one."""
     samples = [process.resident_mb()]
-    for _ in range(MEMORY_SAMPLES):
+    for tenth in range(MEMORY_SAMPLES):
         contender.arrivals.clear()
-        for _ in range(steps // MEMORY_SAMPLES):
+        for _ in range(steps * tenth // MEMORY_SAMPLES, steps * (tenth + 1) // MEMORY_SAMPLES):
             contender.ask()
         samples.append(process.resident_mb())
     return samples
@@ -289,3 +287,44 @@ def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str, str]]:
 
 def _bar(bar: str, met: bool) -> str:
     return f"{bar}  {'met' if met else 'MISSED'}"
+
+
+def answer(policy: str, connect: str) -> None:
+    """The floor: answer states until SIGTERM by a Zenoh callback, onnxruntime and a put.
+
+    No validation, no watchdog, no limits: what the edge runtime costs is measured against this.
+    """
+    end = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: end.set())
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    network = onnxruntime.InferenceSession(policy, options, providers=["CPUExecutionProvider"])
+    decode = msgspec.msgpack.Decoder(wire.State).decode
+
+    def on_state(sample: zenoh.Sample) -> None:
+        state = decode(bytes(sample.payload))
+        frames = np.frombuffer(state.observation["frames"], np.uint8).reshape(1, 2, 45, 80)
+        (actions,) = network.run(["action"], {"frames": frames})
+        command = wire.Command(
+            session=state.session, episode=state.episode, step=state.step, mode=wire.DRIVE,
+            action=actions[0].tolist(), policy_id="0" * 64, received_ns=state.sent_ns,
+            inference_ns=0, sent_ns=state.sent_ns,
+        )  # fmt: skip
+        publisher.put(wire.encode(command))
+
+    with (
+        open_session(connect=connect, mode="peer") as session,
+        session.declare_publisher(
+            wire.key(FLOOR, "command"),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        ) as publisher,
+        session.declare_subscriber(wire.key(FLOOR, "state"), on_state),
+    ):
+        print("ready", flush=True)
+        end.wait()
+
+
+if __name__ == "__main__":
+    answer(*sys.argv[1:])

@@ -9,6 +9,7 @@ import sys
 import tomllib
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import doctor
 from hil_tests.__main__ import main
-from hil_tests.bench_loop import compare, rows
+from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process
 
 ROOT = Path(__file__).parents[2]
@@ -190,6 +191,13 @@ def test_ratios_have_an_interval_that_widens_where_blocks_differ():
     ours = [block * factor for block, factor in zip(floor, np.linspace(1, 2, 8), strict=True)]
     low, high = compare(ours, floor)["p50"]["interval"]
     assert 1.0 < low < compare(ours, floor)["p50"]["ratio"] < high < 2.0
+
+
+@pytest.mark.parametrize("steps", [5, 10, 23])
+def test_the_memory_is_that_of_as_many_steps_as_are_reported(steps):
+    process, contender = Mock(), Mock()
+    assert len(memory(process, contender, steps)) == MEMORY_SAMPLES + 1
+    assert contender.ask.call_count == steps
 
 
 def report(ratio=1.1, end_mb=100.0, grown_mb=0.1, idle=0.01, start_s=1.0):
