@@ -34,21 +34,22 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
 from multiprocessing import get_context
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
 from bridge.policy_file import network_of_file
 from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, read_json
 from hil_tests.trace import failing_drive, shrunk
 from trainer.drivers import load_driver
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.experiments.data import success_estimate
-from trainer.options import read_json, set_threads
+from trainer.options import set_threads
 from trainer.util import cores, die_with_parent
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
@@ -302,16 +303,51 @@ def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[st
     return least and drivers.result(drivers.submit(_work, shrunk, *least))
 
 
-def confirm(drivers: Drivers, known: Mapping[str, Any], seeds: range) -> dict[str, Any]:
+class Edge(msgspec.Struct):
+    """The networks on both sides of an edge; no network is outside where none breaks the policy."""
+
+    inside: str
+    outside: str | None
+
+
+class Known(msgspec.Struct):
+    """What an envelope's file needs, so that it can be confirmed."""
+
+    policy_id: str
+    policy: str
+    env: str
+    condition: str
+    promised_success: float
+    confidence: float
+    edges: Annotated[dict[str, Edge], msgspec.Meta(min_length=1)]
+
+
+def read_known(path: str) -> Known:
+    """The envelope in a file; UserError where there is none, or nothing to confirm."""
+    value = read_json(path, "envelope")
+    try:
+        known = msgspec.convert(value, Known)
+        if known.condition not in CONDITIONS:
+            raise UserError(f"there is no condition {known.condition!r}")
+        for edge in known.edges.values():
+            for spec in (edge.inside, edge.outside or "none"):
+                parse_spec(spec)
+    except (msgspec.ValidationError, UserError) as error:
+        what = "no envelope of hil_tests envelope, with edges to confirm"
+        raise UserError(f"{path} is {what}: {error}") from None
+    return known
+
+
+def confirm(drivers: Drivers, known: Known, seeds: range) -> dict[str, Any]:
     """Drive every edge's two networks; whether inside kept the promise, and outside did not."""
     rows = []
-    for name, edge in known["edges"].items():
-        for side in ("inside", "outside"):
-            if (spec := edge[side]) is None:
+    for name, edge in known.edges.items():
+        for side, spec in (("inside", edge.inside), ("outside", edge.outside)):
+            if spec is None:
                 continue
             successes = sum(drivers.drive(parse_spec(spec), seeds))
             found = success_estimate(successes, len(seeds))
-            as_told = (found.value >= known["promised_success"]) == (side == "inside")
+            as_told = (found.value >= known.promised_success) == (side == "inside")
             what = {"edge": name, "side": side, "network": spec, "successes": successes}
             share = {"share": found.value, "low": found.low, "high": found.high}
             rows.append({**what, **share, "as_told": as_told})
@@ -343,29 +379,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
 
 
-def _known(path: str) -> Mapping[str, Any]:
-    known = read_json(Path(path), "envelope")
-    if not ({"policy_id", "promised_success", "edges"} <= known.keys() and known["edges"]):
-        raise UserError(f"{path} is no envelope of hil_tests envelope, with edges to confirm")
-    return known
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Find an envelope, or confirm one: 0, or 1 where an edge is not confirmed."""
     check_writable(arguments.out)
     began_s, jobs = time.monotonic(), arguments.jobs or cores()
-    known = _known(arguments.confirm) if arguments.confirm else {}
-    asked = {"env": arguments.env, "condition": arguments.condition}
-    env, condition = (str(known.get(name, asked[name])) for name in asked)
-    policy = arguments.policy or known.get("policy") or f"results/policies/{env}.onnx"
+    known = read_known(arguments.confirm) if arguments.confirm else None
+    told = known or arguments  # A file tells what was driven.
+    env, condition = told.env, told.condition
+    policy = arguments.policy or told.policy or f"results/policies/{env}.onnx"
     environment = make_environment(env, condition)
     policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
-    if known and known["policy_id"] != policy_id:
+    if known and known.policy_id != policy_id:
         raise UserError(f"{arguments.confirm} is of another policy than {policy}")
     found: dict[str, Any] = {
         "schema": 1, "policy_id": policy_id, "policy": policy, "env": env, "condition": condition,
-        "promised_success": known.get("promised_success", arguments.promise),
-        "confidence": known.get("confidence", arguments.confidence), "seed": arguments.seed,
+        "promised_success": known.promised_success if known else arguments.promise,
+        "confidence": told.confidence, "seed": arguments.seed,
         "control_period_s": environment.control_period_s,
         "network": network_of_file(policy) if policy.endswith(".onnx") else "",
     }  # fmt: skip

@@ -252,15 +252,33 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(rig, tmp
 
 
 @pytest.mark.parametrize(
-    ("text", "options"),
-    [("{}", []), ("[]", []), ('{"edges": {}}', []), ("", ["--promise", "0.4"]),
-     ("", ["--confidence", "0.1"])],
-)  # fmt: skip
-def test_what_cannot_be_searched_or_confirmed_is_one_line(tmp_path, capsys, text, options):
+    ("damage", "says"),
+    [
+        ([], "`object`, got `array`"),
+        ({}, "missing required field `policy_id`"),
+        ({"edges": {}}, "of length >= 1 - at `$.edges`"),
+        ({"edges": {"delay_ms": {"inside": "none"}}}, "missing required field `outside`"),
+        ({"edges": {"delay_ms": {"inside": "none", "outside": "x"}}}, "'x' is not understood"),
+        ({"condition": "windy"}, "no condition 'windy'"),
+        ({"promised_success": "most"}, "`float`, got `str` - at `$.promised_success`"),
+    ],
+)
+def test_a_damaged_envelope_cannot_be_confirmed_and_is_one_line(tmp_path, capsys, damage, says):
     given_, out = tmp_path / "given.json", tmp_path / "out.json"
-    given_.write_text(text)
-    words = ["envelope", "--out", str(out), *options, *(["--confirm", str(given_)] if text else [])]
+    whole = json.loads((ROOT / "results/envelope/left_turn.json").read_text())
+    given_.write_text(json.dumps({**whole, **damage} if damage else damage))
+    words = ["envelope", "--confirm", str(given_), "--out", str(out)]
     assert exit_status(main, words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "given.json is no envelope of hil_tests envelope, with edges to confirm: " in line
+    assert says in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("options", [["--promise", "0.4"], ["--confidence", "0.1"]])
+def test_shares_that_cannot_be_searched_are_one_line(tmp_path, capsys, options):
+    out = tmp_path / "out.json"
+    assert exit_status(main, ["envelope", "--out", str(out), *options]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not out.exists()
 
