@@ -21,8 +21,13 @@ from typing import NamedTuple
 from edge_runtime.safety import Event
 from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
 from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
-from edge_runtime.wire import DRIVE
-from hil_tests.faults.observe import REACTION_LIMIT_S, CanMonitor, CommandSeen, Heard
+from hil_tests.faults.observe import (
+    REACTION_LIMIT_S,
+    CanMonitor,
+    CommandSeen,
+    Heard,
+    drives_between,
+)  # fmt: skip
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Try, at_any_phase, fault
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
@@ -99,10 +104,7 @@ def _when_over(
     quiet_s = time.monotonic()
     wrong = _stayed(rig, stop, stands_s, quiet_s) + _named(rig, expect, on_s)
     told_s = _told_s(rig.monitor, on_s, quiet_s)
-    rig.rearm()
-    rearmed_s = time.monotonic()
-    rig.wait_until_driving(ready=lambda: rig.chassis.moves)
-    recovered_s = rig.recovered_after_s(rearmed_s)
+    recovered_s = rig.drive_again(ready=lambda: rig.chassis.moves)
     return Try(told_s - known_s, recovered_s, stop.reason, wrong=wrong)
 
 
@@ -135,9 +137,7 @@ def _stayed(rig: Rig, stop: CommandSeen, stands_s: float, until_s: float) -> lis
         wrong.append(f"stopped for {stop.reason}")
     if rig.chassis.moved_between(stands_s, until_s):
         wrong.append("moved before it was re-armed")
-    if any(c.mode == DRIVE and stop.seen_s < c.seen_s < until_s for c in rig.timeline.commands):
-        wrong.append("was commanded to drive before it was re-armed")
-    return wrong
+    return wrong + drives_between(rig.timeline.commands, stop.seen_s, until_s)
 
 
 def _kept_to_its_own(monitor: CanMonitor) -> list[str]:

@@ -6,6 +6,7 @@ probe, of the edge runtime's log and of the simulated vehicle can be taken from 
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -112,6 +113,14 @@ def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float)
     """A line for each reason of the safe stops in between, where the drive was to go on."""
     seen = [c for c in list(commands) if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
     return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
+
+
+def drives_between(
+    commands: Iterable[CommandSeen], begin_s: float, end_s: float = math.inf
+) -> list[str]:
+    """Wrong where it drove in between, before it was re-armed."""
+    drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in list(commands))
+    return ["drove before it was re-armed"] if drove else []
 
 
 def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:

@@ -44,6 +44,7 @@ E = TypeVar("E")
 VEHICLE_ID = "faults"
 RIDE_S = 0.5  # Of the rows with ride-through
 SESSION = "campaign"
+LOOPBACK = "127.0.0.1"
 HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _INSIDE = "hil_tests.faults.inside"
@@ -187,6 +188,13 @@ class Rig:
     def rearm(self) -> None:
         """As an operator does, until the runtime takes it."""
         wait_until(self.try_rearm, "the vehicle to be re-armed")
+
+    def drive_again(self, ready: Callable[[], bool] = lambda: True) -> float:
+        """Re-arm it; s until the first drive command, once it drives steadily and is ``ready``."""
+        self.rearm()
+        rearmed_s = time.monotonic()
+        self.wait_until_driving(ready)
+        return self.recovered_after_s(rearmed_s)
 
     def try_rearm(self) -> bool:
         """Ask once; whether the runtime took it."""
@@ -411,19 +419,22 @@ def free_bus() -> str:
 
 
 class Link:
-    """A TCP link from ``endpoint`` to ``target`` that can be cut, stalled and restored."""
+    """A TCP link from ``endpoint`` to ``target``, an endpoint of this machine.
+
+    It can be cut, stalled and restored.
+    """
 
     def __init__(self, target: str) -> None:
-        self.endpoint = free_endpoint()
         self.last_state_s = float("-inf")
         """When the last bytes of a state went to whoever connected, monotonic s."""
-        self._target = address(target)
+        self._target = (LOOPBACK, int(target.rpartition(":")[2]))
         self._flowing = threading.Event()
         self._flowing.set()
         self._is_cut = False
         self._lock = threading.Lock()
         self._open: list[socket.socket] = []
-        self._listener = socket.create_server(address(self.endpoint))
+        self._listener = socket.create_server((LOOPBACK, 0))
+        self.endpoint = f"tcp/{LOOPBACK}:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
@@ -478,12 +489,6 @@ class Link:
                     self.last_state_s = time.monotonic()
         _shut(source)
         _shut(sink)
-
-
-def address(endpoint: str) -> tuple[str, int]:
-    """Host and port of ``tcp/HOST:PORT``."""
-    host, port = endpoint.split("/", 1)[1].rsplit(":", 1)
-    return host, int(port)
 
 
 def _shut(end: socket.socket) -> None:

@@ -18,7 +18,7 @@ from edge_runtime.manifest import Task
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import SHAPE, SLOW_LOOPS, TASK, write_policy
 from edge_runtime.util import UserError
-from hil_tests.faults import hunter, messages, ride  # noqa: F401 (they fill the table)
+from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
