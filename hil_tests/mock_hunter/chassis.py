@@ -12,7 +12,6 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
-from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as words
 
 STEERING, REAR_RIGHT, REAR_LEFT = range(3)
@@ -67,13 +66,6 @@ FAULTS: dict[str, str] = {
 }
 LATE_S = 0.4
 LIE_MPS = 3.0
-
-
-def check_fault(name: str) -> str:
-    """The name. Raises UserError for one that is not known."""
-    if name not in FAULTS:
-        raise UserError(f"no fault {name!r}; choose from {', '.join(FAULTS)}")
-    return name
 
 
 class Control(StrEnum):
