@@ -9,7 +9,7 @@ import argparse
 import math
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
     check_report(out)
     axes, rows = _choose(arguments)
     jobs = arguments.jobs or cores()
-    result: dict[str, Any] = {"command": _this_command()}
+    command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
+    result: dict[str, Any] = {"command": command}
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
-    text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
+    text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{command}`", ""]
     if axes:
         latency = run_latency(_task(arguments, policy), axes, arguments.target, jobs, out)
         result["latency"] = latency
@@ -109,15 +110,16 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[Row]]
     known = {axis.name: axis for axis in sweep.NETWORK_AXES}
     named = arguments.rows.split(",") if arguments.rows else []
     axes = [known[name] for name in named if name in known] if named else list(known.values())
-    faults = [name for name in named if name not in known]
-    if faults and arguments.only == "latency":
-        raise UserError(f"no latency axis {faults[0]!r}; choose from {', '.join(known)}")
+    faults = [name for name in named if name not in known] if named else ["*"]
+    if arguments.only == "latency":
+        if named and faults:
+            raise UserError(f"no latency axis {faults[0]!r}; choose from {', '.join(known)}")
+        faults = []
     if arguments.only == "faults":
-        if named and not faults:
+        if not faults:
             raise UserError(f"{arguments.rows} names latency axes, no fault")
         axes = []
-    without_faults = arguments.only == "latency" or (named and not faults)
-    return axes, [] if without_faults else choose_rows(faults or ["*"])
+    return axes, choose_rows(faults)
 
 
 def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:
@@ -127,10 +129,6 @@ def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:
         policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
         arguments.runs, arguments.public_key,
     )  # fmt: skip
-
-
-def _this_command() -> str:
-    return "python -m hil_tests " + shlex.join(sys.argv[1:])
 
 
 def run_latency(
@@ -202,16 +200,15 @@ def fault_verdict(row: Found) -> str:
     return "MISSED: " + ", ".join(faults) if faults else met
 
 
-Cells = Mapping[str, Callable[[Found], str]]  # What is said of something, and how it is read
-_OF_A_ROW: Cells = {
-    "episodes": lambda row: str(row["episodes"]),
-    "success (95 %)": lambda row: _share(row["success"]),
-    "collisions": lambda row: f"{row['collision_rate']:.0%}",
-    "surviving distance, m (95 %)": lambda row: _interval(row["surviving_distance_m"]),
-    "time, s": lambda row: f"{row['episode_time_s']:.2f}",
-    "latency p50 / p99, ms": lambda row: _numbers(row["latency_ms"], 1),
-    "safe stops an episode": lambda row: f"{row['safe_stops_per_episode']:.2f}",
-    "ticks without a new command": lambda row: f"{row['ticks_without_new_command']:.0%}",
+_OF_A_ROW = {
+    "episodes": "{episodes}",
+    "success (95 %)": "{success[value]:.0%} ({success[low]:.0%} to {success[high]:.0%})",
+    "collisions": "{collision_rate:.0%}",
+    "surviving distance, m (95 %)": "{way[value]:.2f} ({way[low]:.2f} to {way[high]:.2f})",
+    "time, s": "{episode_time_s:.2f}",
+    "latency p50 / p99, ms": "{latency}",
+    "safe stops an episode": "{safe_stops_per_episode:.2f}",
+    "ticks without a new command": "{ticks_without_new_command:.0%}",
 }
 
 
@@ -229,26 +226,15 @@ def render_latency(latency: Found) -> str:
         *(f"![{name}]({path})\n" for name, path in latency["figures"].items()),
     ]
     for axis in latency["axes"]:
-        rows = [
-            (
-                f"{value:g} {axis['unit']}",
-                *(tell(latency["rows"][spec]) for tell in _OF_A_ROW.values()),
-            )
-            for value, spec in zip(axis["values"], axis["specs"], strict=True)
-        ]
+        rows = []
+        for value, spec in zip(axis["values"], axis["specs"], strict=True):
+            row = latency["rows"][spec]
+            told = {"way": row["surviving_distance_m"], "latency": _numbers(row["latency_ms"], 1)}
+            cells = (text.format(**row, **told) for text in _OF_A_ROW.values())
+            rows.append((f"{value:g} {axis['unit']}", *cells))
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
         lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
-
-
-def _share(estimate: Mapping[str, float]) -> str:
-    """As in "95 % (83 to 99)"."""
-    return f"{estimate['value']:.0%} ({estimate['low']:.0%} to {estimate['high']:.0%})"
-
-
-def _interval(estimate: Mapping[str, float]) -> str:
-    value, low, high = (f"{estimate[name]:.2f}" for name in ("value", "low", "high"))
-    return f"{value} ({low} to {high})"
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -280,9 +266,7 @@ def draw_axes(swept: Found) -> Figure:
         panel.set_visible(False)
     figure.supylabel("success")
     drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
-    handles, title = (
-        figure.axes[0].get_legend_handles_labels(),
-        f"{drives}; bands: Wilson's 95 % interval",
-    )
+    title = f"{drives}; bands: Wilson's 95 % interval"
+    handles = figure.axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
     return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
+import os
 import sys
 
 from edge_runtime.cli import program, run_cli
@@ -23,9 +23,7 @@ def main() -> None:
 
 def _run(argv: list[str]) -> int:
     if argv and argv[0] in FOLDERS:
-        sys.argv[1:] = argv[1:]
-        sys.path.insert(0, "")  # As `python -m` does: one's own modules lie there
-        runpy.run_module(argv[0], run_name="__main__", alter_sys=True)  # ends by itself
+        os.execv(sys.executable, [sys.executable, "-m", *argv])
     commands = {name: (f"{name}.__main__", summary) for name, summary in FOLDERS.items()}
     what = "Human-guided driving policies, from training to the board."
     return program("phil", what, commands, "phil hil_tests demo", "phil trainer train --help")(argv)
