@@ -10,9 +10,10 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import can
 import zenoh
@@ -136,15 +137,20 @@ class Probe:
     """A Zenoh router between the two ends that stamps what passes; ``put`` sends anything.
 
     It listens for the edge runtime and connects to the simulator, so that it still hears the edge
-    when the simulator is gone, and the other way round.
+    when the simulator is gone, and the other way round. It ends with the ``stack``.
     """
 
     def __init__(
-        self, listen: str, connect: str | None, vehicle_id: str, timeline: Timeline
+        self,
+        listen: str,
+        connect: str | None,
+        vehicle_id: str,
+        timeline: Timeline,
+        stack: ExitStack,
     ) -> None:
         self.timeline = timeline
         self.health: list[wire.Health] = []
-        self._session = open_session(listen=listen, connect=connect, mode="router")
+        session = stack.enter_context(open_session(listen=listen, connect=connect, mode="router"))
         handlers: dict[str, Callable[[zenoh.Sample], None]] = {
             "state": lambda sample: self.note_state(bytes(sample.payload), time.monotonic()),
             "command": self._on_command,
@@ -153,27 +159,20 @@ class Probe:
         }
         # BLOCK: a message that the campaign says it sent has been sent.
         self._publishers = {
-            topic: self._session.declare_publisher(
+            topic: session.declare_publisher(
                 wire.key(vehicle_id, topic),
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 allowed_destination=zenoh.Locality.REMOTE,  # it hears the others, not itself
             )
             for topic in handlers
         }
-        self._declared: list[Any] = list(self._publishers.values())
         for topic, handler in handlers.items():
-            declared = self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
-            self._declared.append(declared)
+            stack.enter_context(self._publishers[topic])
+            stack.enter_context(session.declare_subscriber(wire.key(vehicle_id, topic), handler))
 
     def put(self, topic: str, payload: bytes) -> None:
         """Send bytes as they are."""
         self._publishers[topic].put(payload)
-
-    def close(self) -> None:
-        """Undeclare all, then close."""
-        for declared in self._declared:
-            declared.undeclare()
-        self._session.close()
 
     def note_state(self, payload: bytes, seen_s: float) -> None:
         """Remember a state that a policy may answer."""

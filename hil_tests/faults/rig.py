@@ -105,8 +105,7 @@ class Rig:
             if not sender:
                 self.simulator = self.start_simulator()
             connect = None if sender else self._simulator_endpoint
-            self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
-            self._closing.callback(self.probe.close)
+            self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline, self._closing)
             self.edge_endpoint = self._hub  # Where the edge runtime connects
             if between == "link":
                 self.link = Link(self._hub)
@@ -144,9 +143,11 @@ class Rig:
         )  # fmt: skip
 
     def start_recorder(self, path: Path) -> Process:
-        """`bridge record` of this drive, not waited for."""
+        """`bridge record` of this drive, once it listens."""
         record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
-        return self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
+        recorder = self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
+        recorder.wait_for_line("recording")
+        return recorder
 
     def start_router(self) -> Process:
         """The router process between edge and probe, not waited for."""

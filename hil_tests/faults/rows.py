@@ -352,7 +352,8 @@ for _word, _done in (
 @drives_on("recorder says so and ends; the recording is readable; drives on")
 def disk_full(rig: Rig, number: int) -> Try:
     """Disk full while recording."""
-    path, recorder = _start_recorder(rig, number)
+    path = rig.directory / f"{number}.mcap"
+    recorder = rig.start_recorder(path)
     # No file may grow beyond a limit: the same failing write as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
     status = recorder.wait()
@@ -367,7 +368,8 @@ def disk_full(rig: Rig, number: int) -> Try:
 @drives_on("at most 1 s of the recording is lost; drives on")
 def recorder_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the recorder."""
-    path, recorder = _start_recorder(rig, number)
+    path = rig.directory / f"{number}.mcap"
+    recorder = rig.start_recorder(path)
     time.sleep(RECORDED_S)
     sent = len(rig.timeline.states)
     recorder.kill()
@@ -389,13 +391,6 @@ def states_in(path: Path) -> list[State]:
 
 def _too_few(states: list[State]) -> list[str]:
     return [f"only {len(states)} states can be read"] if len(states) < _FEWEST_STATES else []
-
-
-def _start_recorder(rig: Rig, number: int) -> tuple[Path, Process]:
-    path = rig.directory / f"{number}.mcap"
-    recorder = rig.start_recorder(path)
-    recorder.wait_for_line("recording")
-    return path, recorder
 
 
 SHORT_S, RIDING_S = 0.4, 0.3

@@ -108,13 +108,10 @@ def test_zenoh_lets_in_only_who_shows_a_certificate_of_the_authority(parties, en
     def bare(place, **tls):
         """Zenoh itself, past all checks of ours."""
         settings = {
-            "mode": "client", "connect/endpoints": [place], "scouting/multicast/enabled": False,
-            "transport/link/tls": tls,
+            "mode": "client", "connect": {"endpoints": [place]},
+            "scouting": {"multicast": {"enabled": False}}, "transport": {"link": {"tls": tls}},
         }  # fmt: skip
-        config = zenoh.Config()
-        for name, value in settings.items():
-            config.insert_json5(name, json.dumps(value))
-        return zenoh.open(config)
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 
     ca = {"root_ca_certificate": str(parties / "ca/ca.pem")}
     own, foreign = (
