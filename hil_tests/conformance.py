@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import queue
 import threading
 import time
 from collections.abc import Callable
@@ -30,6 +29,7 @@ MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
 HANG_S = 10.0  # A call that takes so long does not come back
+LOOKS_EVERY_S = 0.2
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -62,20 +62,14 @@ def run(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
-    judged: queue.Queue[str] = queue.Queue()
-    judge = threading.Thread(target=_judge, args=(bench, judged), daemon=True)
+    judge, hangs = threading.Thread(target=_judge, args=(bench,), daemon=True), False
     judge.start()
-    kept, broken, hangs = 0, 0, False
     try:
-        for rule in RULES:
-            found = _next(judged, bench)
-            hangs = found is None
-            words = f"{bench.called}() has not come back after {HANG_S:g} s" if hangs else found
-            kept, broken = kept + (not words), broken + bool(words)
-            verdict = f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}"
-            print(verdict, flush=True)
-            if hangs:
-                break
+        while judge.is_alive() and bench.calls_for_s <= HANG_S:
+            judge.join(LOOKS_EVERY_S)
+        if hangs := judge.is_alive():
+            bench.is_over = True
+            bench.tell(f"{bench.called}() has not come back after {HANG_S:g} s")
     finally:
         bench.is_over = True  # After ^C nothing may be asked of it once it is closed.
         judge.join(CALL_S if hangs else HANG_S)
@@ -83,30 +77,25 @@ def run(arguments: argparse.Namespace) -> int:
             if not judge.is_alive():
                 bench.vehicle.close()
         log.close()
-    untried = f", {len(RULES) - kept - broken} not tried" if hangs else ""
-    print(f"{bench.vehicle.name}: {kept} rules kept, {broken} broken{untried}")
+    broken = bench.broken.count(True)
+    untried = f", {len(RULES) - len(bench.broken)} not tried" if hangs else ""
+    print(
+        f"{bench.vehicle.name}: {len(bench.broken) - broken} rules kept, {broken} broken{untried}"
+    )
     return BROKEN if broken else 0
 
 
-def _next(judged: queue.Queue[str], bench: Bench) -> str | None:
-    """What is wrong by the next rule, as it comes; None where a call does not come back."""
-    while bench.calls_for_s <= HANG_S:
-        with contextlib.suppress(queue.Empty):
-            return judged.get(timeout=0.2)
-    return None
-
-
-def _judge(bench: Bench, judged: queue.Queue[str]) -> None:
-    """Put what is wrong by each rule, empty where it is kept, in their order."""
+def _judge(bench: Bench) -> None:
+    """Tell what is wrong by each rule, in their order."""
     for is_kept in RULES.values():
         try:
             words = "" if is_kept(bench) else f"it says {bench.last}"
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
-            if bench.is_over:
-                return
             words = f"{type(error).__name__}: {error}"
-        judged.put(words)
+        if bench.is_over:
+            return
+        bench.tell(words)
 
 
 class Bench:
@@ -119,6 +108,7 @@ class Bench:
         self.longest_s, self.well_formed = 0.0, True
         self.last: VehicleReport | None = None
         self.called, self._called_s = "", math.inf  # The call under way, and since when
+        self.broken: list[bool] = []  # For each rule that was tried
         self.is_over = False
 
     @property
@@ -126,14 +116,20 @@ class Bench:
         """How long the call under way has taken; -inf where there is none."""
         return time.monotonic() - self._called_s
 
+    def tell(self, words: str) -> None:
+        """Print what is wrong by the next rule; empty where it is kept."""
+        rule = list(RULES)[len(self.broken)]
+        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
+        self.broken.append(bool(words))
+
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
-        """Call the driver with the time after the arguments, and behind it a command's speed."""
+        """Call the driver as the runtime does: with the time, and with a command's speed."""
         if self.is_over:
             raise InterruptedError
         self.called, self._called_s = name, time.monotonic()
-        speed_mps = (None,) if name == "command" else ()
+        more = {"command": (self._called_s, None), "close": ()}.get(name, (self._called_s,))
         try:
-            return getattr(self.vehicle, name)(*arguments, self._called_s, *speed_mps, **options)
+            return getattr(self.vehicle, name)(*arguments, *more, **options)
         finally:
             self.longest_s = max(self.longest_s, self.calls_for_s)
             self._called_s = math.inf
@@ -209,8 +205,8 @@ class Bench:
         """Whether it may be closed twice, and nothing moves it then."""
         self.call("brake", latch=False)
         self.until(moves=False)
-        self.vehicle.close()
-        self.vehicle.close()
+        self.call("close")
+        self.call("close")
         try:
             return not self.goes(limit_s=1.0)
         except Exception:  # what is closed may say so

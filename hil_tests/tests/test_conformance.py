@@ -122,17 +122,18 @@ def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys,
     assert any(rule in line for line in broken) if flaw else not broken, lines
 
 
-def test_a_driver_that_hangs_is_named_and_not_waited_for(monkeypatch, capsys):
-    class Hanging(MockVehicle):
-        def command(self, action, now_s, scenario_speed_mps=None):
-            threading.Event().wait()
-
-    monkeypatch.setattr(f"{__name__}.Driver", Hanging, raising=False)
+@pytest.mark.parametrize(("call", "kept", "not_tried"), [("command", 1, 14), ("close", 15, 0)])
+def test_a_driver_that_hangs_is_named_and_not_waited_for(
+    call, kept, not_tried, monkeypatch, capsys
+):
+    hanging = type("Hanging", (MockVehicle,), {call: lambda *_: threading.Event().wait()})
+    monkeypatch.setattr(f"{__name__}.Driver", hanging, raising=False)
     monkeypatch.setattr("hil_tests.conformance.HANG_S", 0.5)
-    assert exit_status(main, ["conformance", "--vehicle", f"{__name__}:Driver"]) == 1
+    words = ["conformance", "--vehicle", f"{__name__}:Driver", "--period-s", "0.02"]
+    assert exit_status(main, words) == 1
     *_, broken, last = capsys.readouterr().out.splitlines()
-    assert broken.endswith("command() has not come back after 0.5 s")
-    assert last == "mock: 1 rules kept, 1 broken, 14 not tried"
+    assert broken.endswith(f"{call}() has not come back after 0.5 s")
+    assert last == f"mock: {kept} rules kept, 1 broken, {not_tried} not tried"
 
 
 def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
