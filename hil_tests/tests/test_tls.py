@@ -46,27 +46,24 @@ def parties(tmp_path_factory):
 def session(endpoint, folder, mode="client", rules=None):
     """Connect with the files of a folder, plain without one."""
     tls = None if folder is None else load_tls(folder)
-    opened = open_session(connect=endpoint, mode=mode, tls=tls, access=rules)
-    return contextlib.closing(opened)
+    return open_session(connect=endpoint, mode=mode, tls=tls, access=rules)
 
 
 def listener(endpoint, folder, rules):
-    tls = load_tls(folder)
-    return contextlib.closing(open_session(listen=endpoint, mode="router", tls=tls, access=rules))
+    return open_session(listen=endpoint, mode="router", tls=load_tls(folder), access=rules)
 
 
 class Intruder:
     """Says all that it should not about hunter01, and listens for all that it should not hear."""
 
-    def __init__(self, opened: zenoh.Session) -> None:
+    def __init__(self, opened: zenoh.Session, stack: contextlib.ExitStack) -> None:
         self._session = opened
         self.heard: set[str] = set()
-        self._subscribers = [
-            opened.declare_subscriber(keys, self._hear, allowed_origin=zenoh.Locality.REMOTE)
-            for keys in ("**", "phil/**", "phil/hunter01/state", "phil/hunter01/command")
-        ]
+        for keys in ("**", "phil/**", "phil/hunter01/state", "phil/hunter01/command"):
+            hears: Any = {"handler": self._hear, "allowed_origin": zenoh.Locality.REMOTE}
+            stack.enter_context(opened.declare_subscriber(keys, **hears))
         tokens = ("phil/hunter01/*", self._hear)
-        self._subscribers.append(opened.liveliness().declare_subscriber(*tokens, history=True))
+        stack.enter_context(opened.liveliness().declare_subscriber(*tokens, history=True))
 
     def speak(self) -> None:
         state = wire.encode(make_state(10**6, session="intruder"))
@@ -83,10 +80,6 @@ class Intruder:
         replies += self._session.liveliness().get("phil/hunter01/alive", timeout=1.0)
         # A session answers for itself, from its own memory; nobody else may.
         return {key for r in replies if r.ok and own not in (key := str(r.ok.key_expr))}
-
-    def close(self) -> None:
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
 
     def _hear(self, sample: Any) -> None:
         self.heard.add(str(sample.key_expr))
@@ -252,15 +245,13 @@ def drive_among(intruders, endpoint, flags, folder):
         wait_until_driving(edge)
         with contextlib.ExitStack() as opened:
             present = {
-                name: Intruder(opened.enter_context(session(endpoint, files)))
+                name: Intruder(opened.enter_context(session(endpoint, files)), opened)
                 for name, files in intruders.items()
             }
             time.sleep(SETTLE_S)
             for intruder in present.values():
                 intruder.speak()
             loot = {name: (each.heard, each.ask()) for name, each in present.items()}
-            for intruder in present.values():
-                intruder.close()
         assert run.wait() == 0, run.errors
         assert edge.end() == 0
     return read(out), edge.log, loot
@@ -304,8 +295,8 @@ def test_an_operator_re_arms_its_own_vehicle_only(parties):
     with (
         listener(endpoint, parties / "router", rules_for_listener(["hunter01", "hunter02"])),
         session(endpoint, parties / "edge-hunter01", "peer", rules_for_edge("hunter01")) as edge,
+        edge.declare_queryable("phil/hunter01/rearm", rearmed),
     ):
-        queryable = edge.declare_queryable("phil/hunter01/rearm", rearmed)
         time.sleep(SETTLE_S)
         for name in STRANGERS:
             with pytest.raises(UserError, match=f"{name} may not ask"):
@@ -314,7 +305,6 @@ def test_an_operator_re_arms_its_own_vehicle_only(parties):
         own = load_tls(parties / "operator-hunter01")
         assert ask(endpoint, "hunter01", "rearm", own) == {"accepted": True}
         assert calls == ["phil/hunter01/rearm"]
-        queryable.undeclare()
 
 
 @pytest.mark.parametrize(
@@ -327,12 +317,11 @@ def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, i
     with (
         listener(endpoint, parties / who, rules_for_listener(["hunter01"])) as simulator,
         session(endpoint, parties / "edge-hunter01", "peer", rules_for_edge("hunter01")) as edge,
+        edge.declare_subscriber("phil/hunter01/state", states.append),
     ):
-        subscriber = edge.declare_subscriber("phil/hunter01/state", states.append)
         time.sleep(SETTLE_S)
         simulator.put("phil/hunter01/state", b"go")
         time.sleep(SETTLE_S)
-        subscriber.undeclare()
     assert len(states) == int(is_believed)
 
 
@@ -345,12 +334,11 @@ def test_a_forged_token_of_another_vehicle_ends_no_edge(parties, tmp_path, is_th
         edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
         posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
         liveliness = opened.enter_context(posing).liveliness()
-        tokens = [liveliness.declare_token(f"phil/hunter01/alive{end}") for end in ("", "/0-elder")]
+        for end in ("", "/0-elder"):
+            opened.enter_context(liveliness.declare_token(f"phil/hunter01/alive{end}"))
         edge = edge or opened.enter_context(EdgeProcess(*flags))
         time.sleep(4 * SETTLE_S)  # it looks twice within a second of the link
         assert edge.end() == 0
-        for token in tokens:
-            token.undeclare()
     assert "another" not in edge.log
 
 
@@ -387,16 +375,13 @@ def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path, rights, hea
             opened.enter_context(session(endpoint, parties / name))
             for name in ("edge-hunter01", *(f"simulator-{each}" for each in VEHICLES))
         )
-        subscribers = [
-            edge.declare_subscriber(key, lambda sample: found.append(str(sample.key_expr)))
-            for key in ("phil/**", "phil/hunter01/state", "phil/hunter02/state")
-        ]
+        for key in ("phil/**", "phil/hunter01/state", "phil/hunter02/state"):
+            hear = edge.declare_subscriber(key, lambda sample: found.append(str(sample.key_expr)))
+            opened.enter_context(hear)
         time.sleep(SETTLE_S)
         for simulator, vehicle in zip(simulators, VEHICLES, strict=True):
             simulator.put(f"phil/{vehicle}/state", b"go")
         time.sleep(SETTLE_S)
-        for subscriber in subscribers:
-            subscriber.undeclare()
     assert set(found) == heard
 
 

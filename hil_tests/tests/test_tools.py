@@ -22,7 +22,8 @@ from edge_runtime.util import UserError
 from hil_tests import doctor
 from hil_tests.__main__ import main
 from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
-from hil_tests.processes import POLICY, PUBLIC_KEY, Process
+from hil_tests.processes import POLICY, PUBLIC_KEY
+from hil_tests.sweep import simulate
 
 ROOT = Path(__file__).parents[2]
 BY_NAME = {check.name: check for check in doctor.CHECKS}
@@ -126,15 +127,11 @@ VEHICLE = "hunter01"
 
 def left_turn_over_tls(certificates, endpoint):
     """The report of one left turn in real time, driven by whoever connects with a certificate."""
-    out = certificates / "episode.json"
-    words = [
-        "bridge", "simulate", "--env", "left_turn", "--clock", "realtime", "--episodes", "1",
-        "--listen", endpoint, "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
-        "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
-    ]  # fmt: skip
-    with Process(*words) as simulator:
-        simulator.succeed(120.0)
-    return json.loads(out.read_text())
+    return simulate(
+        endpoint, certificates / "episode.json", 120.0, "--env", "left_turn", "--clock", "realtime",
+        "--episodes", "1", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
+        "--tls", str(certificates / f"simulator-{VEHICLE}"),
+    )  # fmt: skip
 
 
 @pytest.mark.board
