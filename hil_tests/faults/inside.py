@@ -163,10 +163,9 @@ def route(listen: str, connect: str) -> None:
     """Route until SIGTERM."""
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())
-    session = open_session(listen=listen, connect=connect, mode="router")
-    print("ready", flush=True)
-    end.wait()
-    session.close()
+    with open_session(listen=listen, connect=connect, mode="router"):
+        print("ready", flush=True)
+        end.wait()
 
 
 if __name__ == "__main__":

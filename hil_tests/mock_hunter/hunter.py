@@ -95,28 +95,16 @@ MODELS: dict[str, Parameters] = {
 TUNABLE = [field.name for field in fields(Parameters)]
 
 
-def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> Parameters:
+def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
     """A model's row with some numbers replaced; UserError for a number that cannot be."""
-    for name, value in (changes or {}).items():
+    for name, value in changes.items():
         if name not in TUNABLE:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
         may_be_zero = name == "dead_time_s"
         if not (0.0 < value < math.inf or (may_be_zero and value == 0.0)):
             least = "at least" if may_be_zero else "above"
             raise UserError(f"parameter {name} must be {least} 0 and finite, not {value}")
-    return replace(MODELS[model], **(changes or {}))
-
-
-def read_changes(texts: list[str]) -> dict[str, float]:
-    """Read the values of `--set NAME=VALUE`; UserError for one that is none."""
-    changes = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            changes[name] = float(value)
-        except ValueError:
-            raise UserError(f"--set {text!r} is not valid: use NAME=VALUE") from None
-    return changes
+    return replace(MODELS[model], **changes)
 
 
 class Setpoint(NamedTuple):

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any
 
 import can
 
@@ -23,7 +24,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.chassis import FAULTS
-from hil_tests.mock_hunter.hunter import MODELS, TUNABLE, MockHunter, make_parameters, read_changes
+from hil_tests.mock_hunter.hunter import MODELS, TUNABLE, MockHunter, make_parameters
 
 Switch = tuple[str, bool]  # A fault's name, and whether it is switched on
 _WORDS = {"on": True, "off": False}
@@ -113,26 +114,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
     add("--model", default="hunter-2.0", choices=list(MODELS))
     add("--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help=bits)
-    add("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
-    late = "from the start, or later"
-    add("--fault", action="append", type=_fault, metavar="NAME[@S]", help=late)
+    append: Any = {"action": "append", "default": []}
+    add("--set", type=_setting, metavar="NAME=VALUE", help="a parameter's value", **append)
+    add("--fault", type=_fault, metavar="NAME[@S]", help="from the start, or later", **append)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
-    parameters = make_parameters(arguments.model, read_changes(arguments.set or []))
+    parameters = make_parameters(arguments.model, dict(arguments.set))
     name, tell = parse_bus(arguments.bus), partial(print, flush=True)
     if name.interface == "virtual":
         raise UserError(
             f"--bus {arguments.bus}: a virtual bus ends with its process, and nobody could reach"
             f" the mock; use {MULTICAST_BUS} or socketcan:vcan0"
         )
-    bus = open_bus(name)
-    try:
+    with open_bus(name) as bus:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
         server = Server(hunter, bus, tell)
-        for after_s, name in arguments.fault or ():
-            switch = partial(server.orders.put, (name, True))
+        for after_s, fault in arguments.fault:
+            switch = partial(server.orders.put, (fault, True))
             if after_s:
                 later = threading.Timer(after_s, switch)
                 later.daemon = True
@@ -149,9 +149,14 @@ def run(arguments: argparse.Namespace) -> int:
         threading.Thread(target=read_orders, args=reader, daemon=True).start()
         tell(f"ready bus={arguments.bus} model={arguments.model}")
         server.run()
-    finally:
-        bus.shutdown()
     return 0
+
+
+def _setting(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    with contextlib.suppress(ValueError):
+        return name, float(value)
+    raise argparse.ArgumentTypeError(f"{text!r} is not valid: use NAME=VALUE")
 
 
 def _fault(text: str) -> tuple[float, str]:

@@ -5,6 +5,7 @@ import math
 import struct
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import can
@@ -568,16 +569,15 @@ def status_after(bus, wanted, patience_s=PATIENCE_S):
 @pytest.fixture
 def served():
     """A bus with a mock at its other end, that end, and what the mock says."""
-    near, far = (can.Bus(interface="virtual", channel="test_process") for _ in range(2))
     said: list[str] = []
-    server = Server(MockHunter(MODELS["hunter-2.0"], time.monotonic()), far, said.append)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    yield near, far, said
-    server.stop()
-    thread.join()
-    near.shutdown()
-    far.shutdown()
+    one = partial(can.Bus, interface="virtual", channel="test_process")
+    with one() as near, one() as far:
+        server = Server(MockHunter(P, time.monotonic()), far, said.append)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        yield near, far, said
+        server.stop()
+        thread.join()
 
 
 def test_inside_a_process_it_answers_on_a_virtual_bus(served, monkeypatch):
@@ -610,8 +610,7 @@ def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "utf-8:strict")  # as in a desktop's locale
     name = free_bus()
     chassis = ChassisProcess(name, "--fault", "estop@0.3")
-    bus = open_bus(parse_bus(name))
-    try:
+    with chassis.process, open_bus(parse_bus(name)) as bus:
         assert status_after(bus, lambda data: data[0] == 1)  # the fault of the command line
         chassis.switch("estop", False)
         assert status_after(bus, lambda data: data[0] == 0)
@@ -620,9 +619,7 @@ def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
         chassis.switch("remote", True)
         assert status_after(bus, lambda data: data[1] == 2)
         assert chassis.truth[-1].control == "remote"
-    finally:
-        bus.shutdown()
-        assert chassis.process.end() == 0
+    assert chassis.process.end() == 0
 
 
 def test_orders_come_in_turn_and_those_that_are_none_are_told():
