@@ -213,14 +213,14 @@ class Bench:
             return True
 
 
-def _is_range(low: float, high: float, slew_per_s: float) -> bool:
-    return -math.inf < low < high < math.inf and slew_per_s > 0.0
-
-
 # In this order, because one begins where another ends.
 RULES: dict[str, Callable[[Bench], bool]] = {
     "each action has a finite range": lambda it: (
-        all(_is_range(*limit[:3]) for limit in it.vehicle.limits.values()) and bool(it.go)
+        bool(it.go)
+        and all(
+            -math.inf < one.low < one.high < math.inf and one.slew_per_s > 0.0
+            for one in it.vehicle.limits.values()
+        )
     ),
     "no command moves it before `enable`": lambda it: not it.goes(limit_s=5 * it.period_s),
     "enabled, it stands until the first command": lambda it: (

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as codec
 from edge_runtime.vehicles.hunter.protocol import LINK_LOST, fault_bits
+from edge_runtime.vehicles.mapping import clamp
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import (
     BITS,
@@ -135,12 +136,12 @@ def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Pa
     if setpoint is None:
         change_mps, rate_mps2 = -body.speed_mps, p.braking_mps2
     else:
-        gap_mps = _limit(setpoint.speed_mps, p.max_speed_mps) - body.speed_mps
+        gap_mps = clamp(setpoint.speed_mps, p.max_speed_mps) - body.speed_mps
         change_mps = gap_mps * (1 - math.exp(-step_s / p.speed_time_constant_s))
         rate_mps2 = p.braking_mps2 if body.speed_mps * change_mps < 0 else p.acceleration_mps2
-        turn_rad = _limit(setpoint.inner_rad, p.max_inner_rad) - body.inner_rad
-        inner_rad += _limit(turn_rad, p.steering_rate_radps * step_s)
-    speed_mps = body.speed_mps + _limit(change_mps, rate_mps2 * step_s)
+        turn_rad = clamp(setpoint.inner_rad, p.max_inner_rad) - body.inner_rad
+        inner_rad += clamp(turn_rad, p.steering_rate_radps * step_s)
+    speed_mps = body.speed_mps + clamp(change_mps, rate_mps2 * step_s)
     steering_radps = (inner_rad - body.inner_rad) / step_s
     after = body._replace(speed_mps=speed_mps, inner_rad=inner_rad, steering_radps=steering_radps)
     return roll(after, step_s, parameters)
@@ -163,10 +164,6 @@ def curvature(inner_rad: float, parameters: Parameters) -> float:
     slope = math.tan(abs(inner_rad))
     amount = slope / (parameters.wheelbase_m + slope * parameters.track_m / 2)
     return math.copysign(amount, inner_rad)
-
-
-def _limit(value: float, most: float) -> float:
-    return min(max(value, -most), most)
 
 
 class Wire(NamedTuple):
