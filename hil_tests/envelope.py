@@ -24,15 +24,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import resource
 import shlex
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
-from itertools import combinations
+from itertools import combinations, repeat
 from multiprocessing import get_context
 from typing import Annotated, Any
 
@@ -238,30 +239,20 @@ def _side_by_side(work: Sequence[Callable[[], Any]]) -> list[Any]:
 
 
 class Drivers(ProcessPoolExecutor):
-    """Processes that drive, each with an environment and the policy; ``spent`` has each task's
-    processor seconds and drives.
-    """
+    """Processes that drive, each with an environment and the policy."""
 
     def __init__(self, jobs: int, *task: str | None) -> None:
         begin: Any = _begin
         super().__init__(jobs, get_context("spawn"), begin, task)
-        self.spent: list[tuple[float, int]] = []
+        self.driven: list[int] = []  # How many drives each `drive` was
 
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
 
-    def result(self, future: Future[tuple[float, Any]], drives: int = 0) -> Any:
-        """Wait for what `_work` gives, and count it."""
-        cpu_s, found = future.result()
-        self.spent.append((cpu_s, drives))
-        return found
-
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
         """Drive each seed behind a network; whether it succeeded."""
-        parts = [seeds[start : start + CHUNK] for start in range(0, len(seeds), CHUNK)]
-        futures = [self.submit(_work, _drive, spec, part) for part in parts]
-        found = (self.result(*pair) for pair in zip(futures, map(len, parts), strict=True))
-        return [success for part in found for success in part]
+        self.driven.append(len(seeds))
+        return list(self.map(partial(_work, _succeeds, spec), seeds, chunksize=CHUNK))
 
 
 _mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
@@ -275,19 +266,16 @@ def _begin(policy: str, env: str, condition: str, public_key: str | None) -> Non
     _mine[:] = environment, load_driver(policy, environment, public_key, True)[0], condition
 
 
-def _work(work: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Processor seconds of ``work(environment, driver, condition, ...)``, and what it gives."""
-    began_s = time.process_time()
-    found = work(*_mine, *arguments)
-    return time.process_time() - began_s, found
+def _work(work: Callable[..., Any], *arguments: Any) -> Any:
+    """``work(environment, driver, condition, ...)``, with those of this process."""
+    return work(*_mine, *arguments)
 
 
-def _drive(env: Any, driver: Any, condition: str, spec: LatencySpec, seeds: range) -> list[bool]:
-    drives = drive_episodes(env, driver, seeds, condition, latency=spec)
-    outcomes = [drive.outcome for drive in drives]
-    if UNKNOWN in outcomes:
+def _succeeds(env: Any, driver: Any, condition: str, spec: LatencySpec, seed: int) -> bool:
+    (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
+    if result.outcome == UNKNOWN:
         raise UserError("the environment does not say of each drive whether it succeeded")
-    return [outcome == GOAL for outcome in outcomes]
+    return result.outcome == GOAL
 
 
 def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
@@ -296,11 +284,10 @@ def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[st
     Of each network's first one it is the one with the fewest, since that shrinks soonest.
     """
     broken = [parse_spec(edge["outside"]) for edge in edges.values() if edge["outside"]]
-    seeds = range(seed, seed + FRESH)
-    futures = [drivers.submit(_work, failing_drive, spec, seeds) for spec in broken]
-    failed = filter(None, map(drivers.result, futures))
+    seeds = repeat(range(seed, seed + FRESH))
+    failed = filter(None, drivers.map(partial(_work, failing_drive), broken, seeds))
     least = min(failed, key=lambda found: sum(map(len, found[2].values())), default=None)
-    return least and drivers.result(drivers.submit(_work, shrunk, *least))
+    return least and drivers.submit(_work, shrunk, *least).result()
 
 
 class Edge(msgspec.Struct):
@@ -408,8 +395,9 @@ def run(arguments: argparse.Namespace) -> int:
             search = Search(drivers.drive, *rule, arguments.seed, jobs * CHUNK)
             found |= {**find_region(search), "tried": search.tried}
             found["trace"] = find_trace(drivers, found["edges"], arguments.seed)
-    cpu_s, drives = map(sum, zip(*drivers.spent, strict=True))
-    found |= {"drives": drives, "seconds": round(time.monotonic() - began_s, 1), "cpu_s": cpu_s}
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)  # All of them have ended.
+    found |= {"drives": sum(drivers.driven), "seconds": round(time.monotonic() - began_s, 1)}
+    found["cpu_s"] = spent.ru_utime + spent.ru_stime
     found["command"] = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
     write_json_out(arguments.out, found)
     shown = ("limits", "joint", "box", "confirmed", "drives", "seconds")

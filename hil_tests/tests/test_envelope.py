@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -161,15 +162,13 @@ class Found:
             for name, count in disturbed.items()
         }
 
-    def submit(self, _work, call, *arguments):
-        return call, arguments
+    def map(self, work, specs, _seeds):
+        assert work.args == (trace.failing_drive,)
+        return [self.failures[f"loss{spec.up.loss_percent:.0f}"] for spec in specs]
 
-    def result(self, asked):
-        call, arguments = asked
-        if call is trace.failing_drive:
-            return self.failures[f"loss{arguments[0].up.loss_percent:.0f}"]
+    def submit(self, _work, call, seed, network, whole):
         assert call is trace.shrunk
-        return {"network": arguments[1]}
+        return Mock(result=lambda: {"network": network})
 
 
 @pytest.mark.parametrize(
