@@ -11,7 +11,6 @@ RIDE_S later than without it. A fault of the vehicle and a stop end it at once.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import resource
 import signal
@@ -19,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from pathlib import Path
@@ -292,12 +291,10 @@ def slow_inference(rig: Rig, number: int) -> Try:
     """Inference of about 2.5 T for 0.5 s."""
     begin_s = time.monotonic()
     rig.bright(True)
-    try:
-        stop = rig.stop_command(begin_s)
-        last_s = rig.last_answered_s(stop.seen_s)
-        sleep_until(begin_s + BRIGHT_S)
-    finally:
-        rig.bright(False)
+    stop = rig.stop_command(begin_s)
+    last_s = rig.last_answered_s(stop.seen_s)
+    sleep_until(begin_s + BRIGHT_S)
+    rig.bright(False)
     ended_s = time.monotonic()
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
@@ -399,23 +396,14 @@ _LATER_S = REACTION_LIMIT_S + RIDE_S
 _VEHICLE = {"ride_s": RIDE_S, "vehicle": "mock"}
 
 
-@contextlib.contextmanager
-def _stopped(process: Process, number: int) -> Iterator[float]:
-    """It neither hears nor says anything; since when."""
-    time.sleep(SETTLED_S)
-    at_any_phase(number)
-    process.send(signal.SIGSTOP)
-    try:
-        yield time.monotonic()
-    finally:
-        process.send(signal.SIGCONT)
-
-
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
 def ride_states_lost(rig: Rig, number: int) -> Try:
     """No states for 0.4 s."""
-    with _stopped(rig.simulator, number) as begin_s:
-        sleep_until(begin_s + SHORT_S)
+    time.sleep(SETTLED_S)
+    begin_s = time.monotonic()
+    rig.simulator.send(signal.SIGSTOP)
+    sleep_until(begin_s + SHORT_S)
+    rig.simulator.send(signal.SIGCONT)
     return _rode(rig, begin_s)
 
 
@@ -424,7 +412,6 @@ def ride_states_lost(rig: Rig, number: int) -> Try:
 def ride_link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.4 s, both ways, then all at once."""
     time.sleep(SETTLED_S)
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.link.stall()
     sleep_until(begin_s + SHORT_S)
@@ -460,10 +447,13 @@ def _is_ended(rig: Rig) -> float:
 
 def _stops(reason: str, do: Callable[[Rig], float], rig: Rig, number: int) -> Try:
     """It stops after what is done while it rides, and stays stopped."""
-    with _stopped(rig.simulator, number) as begin_s:
-        sleep_until(begin_s + RIDING_S)
-        since_s = do(rig)
-        stop = rig.stop_command(begin_s)
+    time.sleep(SETTLED_S)
+    begin_s = time.monotonic()
+    rig.simulator.send(signal.SIGSTOP)
+    sleep_until(begin_s + RIDING_S)
+    since_s = do(rig)
+    stop = rig.stop_command(begin_s)
+    rig.simulator.send(signal.SIGCONT)
     rig.switch(VEHICLE, None)
     time.sleep(LASTS_S)
     wrong = drives_between(rig.timeline.commands, stop.seen_s)

@@ -228,7 +228,6 @@ class MockHunter:
         elif name in _OF_A_PERSON:
             event = _OF_A_PERSON[name][0 if on else 1]
             self.chassis = rules.advance(self.chassis, event)
-        self.advance(now_s)
 
     def due(self, now_s: float) -> list[Wire]:
         """The frames to send now. After a pause one report, not one for each missed period."""
