@@ -293,8 +293,7 @@ class Rig:
         recent = [c for c in self.timeline.commands[-10:] if now_s - c.seen_s < settled_s]
         steady = len(recent) >= _SETTLED_COMMANDS and {c.mode for c in recent} == {"drive"}
         brakes = self.brakes()
-        fresh = now_s - self.last_drive_s() < settled_s
-        return steady and fresh and not (brakes and brakes[-1][1])
+        return steady and not (brakes and brakes[-1][1])
 
     def _start(self, name: str, *arguments: str) -> Process:
         def on_line(seen_s: float, line: str) -> None:
