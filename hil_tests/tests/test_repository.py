@@ -3,7 +3,6 @@
 import argparse
 import ast
 import importlib
-import importlib.util
 import os
 import re
 import shlex
@@ -160,14 +159,6 @@ LEAST_WRITING = {"edge_runtime": 2, "bridge": 6, "trainer": 7, "deploy": 4, "hil
 """Commands with an --out of those packages."""
 
 
-PROGRAMS = sorted(
-    name
-    for folder in ARROWS
-    for path in sources(folder)
-    for name in re.findall(r'(?:prog=|program\(\s*)"python -m (\S+)"', path.read_text())
-)
-
-
 class ParsedError(Exception):
     """The arguments are good; what they ask for is not done."""
 
@@ -186,17 +177,14 @@ def only_parse(monkeypatch):
     return helps
 
 
-def main_of(program):
-    spec = importlib.util.find_spec(program)
-    assert spec is not None
-    is_package = spec.submodule_search_locations is not None
-    return importlib.import_module(f"{program}.__main__" if is_package else program).main
+def main_of(folder):
+    return importlib.import_module(f"{folder}.__main__").main
 
 
-def help_of(program, words, helps):
+def help_of(folder, words, helps):
     helps.clear()
     with pytest.raises(SystemExit) as ended:
-        main_of(program)([*words, "--help"])
+        main_of(folder)([*words, "--help"])
     assert ended.value.code == 0
     return helps[-1]
 
@@ -213,33 +201,33 @@ def examples_in(text):
     return [shlex.split(line, comments=True) for line in lines]
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_every_command_shows_examples_that_it_takes(program, only_parse):
-    shown = help_of(program, [], only_parse)
+@pytest.mark.parametrize("folder", ARROWS)
+def test_every_command_shows_examples_that_it_takes(folder, only_parse):
+    shown = help_of(folder, [], only_parse)
     commands = [[name] for name in subcommands_in(shown)]
-    assert bool(commands) == (program in ARROWS)
+    assert commands
     for words in [[], *commands]:
-        found = examples_in(help_of(program, words, only_parse))
-        assert found, f"python -m {program} {' '.join(words)} --help has no example"
+        found = examples_in(help_of(folder, words, only_parse))
+        assert found, f"python -m {folder} {' '.join(words)} --help has no example"
         for example in found:
-            assert example[: 1 + len(words)] == [program, *words]
+            assert example[: 1 + len(words)] == [folder, *words]
             # `train --set` alone lists the settings and ends; it drives nothing.
             lists = example[-1] == "--set"
             with pytest.raises(SystemExit if lists else ParsedError) as ended:
-                main_of(program)(example[1:])
+                main_of(folder)(example[1:])
             assert not lists or ended.value.args == (0,)
 
 
-@pytest.mark.parametrize(("program", "least"), LEAST_WRITING.items())
+@pytest.mark.parametrize(("folder", "least"), LEAST_WRITING.items())
 @pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)], ids=" ".join)
-def test_an_empty_name_of_what_is_written_is_refused(program, least, empty, only_parse):
+def test_an_empty_name_of_what_is_written_is_refused(folder, least, empty, only_parse):
     """It would be the directory where one stands, or, taken for no name, none at all."""
-    commands = subcommands_in(help_of(program, [], only_parse))
-    writing = [name for name in commands if "--out " in help_of(program, [name], only_parse)]
+    commands = subcommands_in(help_of(folder, [], only_parse))
+    writing = [name for name in commands if "--out " in help_of(folder, [name], only_parse)]
     assert len(writing) >= least
     for name in writing:
         with pytest.raises(SystemExit) as ended:
-            main_of(program)([name, *empty])
+            main_of(folder)([name, *empty])
         assert ended.value.code == 2
         assert f"{name}: an empty value after --out (see" in only_parse[-1]
 
