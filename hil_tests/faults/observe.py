@@ -32,6 +32,7 @@ RECOVERY_LIMIT_S = 1.0
 """From the end of the fault to the first drive command, with no vehicle attached."""
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
+HEARD = (0x111, 0x211, 0x221)  # Set-points, the chassis's state, its speed
 _POLL_S = 0.1
 
 
@@ -214,12 +215,11 @@ class Heard(NamedTuple):
 
 
 class CanMonitor(can.Listener):
-    """Hears all frames of a CAN bus in a thread, and keeps those of the identifiers asked for."""
+    """Hears all frames of a CAN bus in a thread, and keeps those of HEARD."""
 
-    def __init__(self, bus: str, can_ids: tuple[int, ...]) -> None:
+    def __init__(self, bus: str) -> None:
         self.heard: list[Heard] = []
         self.strange: list[Heard] = []  # Frames that are not the Hunter's: nobody should send any
-        self._can_ids = frozenset(can_ids)
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=_POLL_S)
 
@@ -237,7 +237,7 @@ class CanMonitor(can.Listener):
         # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
         seen_s = msg.timestamp + time.monotonic() - time.time()
         heard = Heard(seen_s, msg.arbitration_id, bytes(msg.data))
-        if heard.can_id in self._can_ids:
+        if heard.can_id in HEARD:
             self.heard.append(heard)
         if heard.can_id not in FRAMES or msg.is_extended_id:
             self.strange.append(heard)

@@ -196,7 +196,7 @@ FAST = bytes.fromhex("03 E8 00 00 00 00 00 00")
 
 @pytest.fixture
 def monitor(request):
-    one = observe.CanMonitor(f"virtual:{request.node.name}", (0x111, 0x221))
+    one = observe.CanMonitor(f"virtual:{request.node.name}")
     yield one
     one.close()
 
@@ -236,5 +236,5 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
 )
 def test_any_movement_in_between_is_found(truth, moved):
     chassis = ChassisProcess.__new__(ChassisProcess)
-    chassis.truth = [Truth(since_s, "can", moves) for since_s, moves in truth]
+    chassis.truth = [Truth(*each) for each in truth]
     assert chassis.moved_between(1.0, 2.0) == moved

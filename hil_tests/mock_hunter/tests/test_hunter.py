@@ -618,7 +618,7 @@ def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
         chassis.process.wait_for_line("is no order")
         chassis.switch("remote", True)
         assert status_after(bus, lambda data: data[1] == 2)
-        assert chassis.truth[-1].control == "remote"
+        chassis.process.wait_for_line("control=remote ")
     assert chassis.process.end() == 0
 
 
