@@ -119,7 +119,7 @@ def garbage_states(rig: Rig, number: int) -> Try:
     return _put_garbage(rig, "state", make_state(1, rig.task, session=_FOREIGN), number)
 
 
-@drives_on(_COUNTED, counted="simulator")
+@drives_on(_COUNTED, counted="simulator", flows=False, new_rig_each_try=True)
 def garbage_commands(rig: Rig, number: int) -> Try:
     """10,000 random and mutated commands; future, old, wrong size."""
     done = _put_garbage(rig, "command", _command(rig, session=_FOREIGN), number)

@@ -20,7 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -85,6 +85,9 @@ class Row:
     new_rig_each_try: bool = False
     by_arrival: bool = False
     """Whether the age of an answer is taken by the probe's clock (the edge's is stepped)."""
+    goes_on: bool = False  # Whether the drive goes on through the fault
+    counted: Literal["", "edge", "simulator"] = ""
+    """Who must have counted just the messages that a try sent to be rejected."""
 
 
 ROWS: list[Row] = []
@@ -107,37 +110,31 @@ def fault(
     return add
 
 
-def drives_on(
-    expected: str = "drives on", counted: Literal["", "edge", "simulator"] = "", **options: Any
-) -> Callable[[DoFault], DoFault]:
+def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
     """As `fault`, for one through which the drive goes on.
 
     The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
-    rejected. Who ``counted`` them must have counted just these. The simulator's counts stand in its
-    report, for which the drive has to end.
+    rejected.
     """
-    if counted == "simulator":
-        options = {"flows": False, "new_rig_each_try": True, **options}
+    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True, **options}
+    return fault(expected, GAP, **through)
 
-    def add(do: DoFault) -> DoFault:
-        @wraps(do)
-        def run(rig: Rig, number: int) -> Try:
-            before = rig.edge_counts() if counted == "edge" else Counter()
-            begin_s = time.monotonic()
-            done = do(rig, number)
-            end_s = time.monotonic()
-            found = Counter(done.rejected)
-            if counted == "edge":
-                found = rig.edge_counts() - before
-            if counted == "simulator":
-                rig.end_drive()
-                found = rig.simulator_counts()
-            return drove_on(rig, begin_s, end_s, done, found)
 
-        through: dict[str, Any] = {"recovery_limit_s": None, "flows": True, **options}
-        return fault(expected, GAP, **through)(run)
-
-    return add
+def do_fault(row: Row, rig: Rig, number: int) -> Try:
+    """Do the fault of a row once, and judge it where the drive was to go on."""
+    before = rig.edge_counts() if row.counted == "edge" else Counter()
+    begin_s = time.monotonic()
+    done = row.run(rig, number)
+    if not row.goes_on:
+        return done
+    end_s = time.monotonic()
+    found = Counter(done.rejected)
+    if row.counted == "edge":
+        found = rig.edge_counts() - before
+    if row.counted == "simulator":
+        rig.end_drive()  # It writes its counts at its end.
+        found = rig.simulator_counts()
+    return drove_on(rig, begin_s, end_s, done, found)
 
 
 def drove_on(rig: Rig, begin_s: float, end_s: float, done: Try, counted: Counter[str]) -> Try:

@@ -21,7 +21,7 @@ from edge_runtime.util import UserError
 from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
+from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase, do_fault
 from hil_tests.processes import POLICY, in_parallel, trusting
 
 SLOW_S = 2.5 * TASK.control_period_s
@@ -164,7 +164,7 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
         rig.wait_until_driving()
         at_any_phase(number)
         begin_s = time.monotonic()
-        done = row.run(rig, number)
+        done = do_fault(row, rig, number)
     except (OSError, UserError) as error:  # a time-out, or a process that is gone
         outcome.failures.append(f"try {number}: {error}")
         return False
