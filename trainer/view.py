@@ -48,7 +48,7 @@ from edge_runtime.util import UserError, counted
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS, Reason
 from trainer.learner.networks import FRAMES_SPACE
-from trainer.person.controls import Amount, amount, vector
+from trainer.person.interface import Amount, amount, vector
 from trainer.person.recording import Step, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun

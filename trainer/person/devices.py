@@ -19,9 +19,18 @@ from numpy.typing import NDArray
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.coach import Coaching
-from trainer.person.controls import Amount, amount, controls_of, keyboard_of, vector
-from trainer.person.interface import WISH_HELP, WISHES, Moving, Reading, View, Wish
-from trainer.person.profile import SHIPPED, Profile, read_profile
+from trainer.person.controls import SHIPPED, Profile, controls_of, keyboard_of, read_profile
+from trainer.person.interface import (
+    WISH_HELP,
+    WISHES,
+    Amount,
+    Moving,
+    Reading,
+    View,
+    Wish,
+    amount,
+    vector,
+)
 from trainer.scenarios.picture import draw_scene
 
 WISH_KEYS: dict[int, Wish] = {

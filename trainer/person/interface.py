@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from edge_runtime.cli import number, whole_number
 from edge_runtime.util import UserError
-from trainer.person.controls import Amount
 
 if TYPE_CHECKING:  # It needs torch, which takes two seconds.
     from trainer.person.coach import Coaching
 
+Amount = float | tuple[float, ...]
+"""An action in [-1, 1]: one number, or a tuple of them where the environment has several."""
 Wish = Literal["pause", "restart", "discard", "quit"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard`` also
 marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting."""
@@ -30,6 +31,22 @@ WISH_HELP = (
     "    Q: quit, all is kept"
 )
 PERSON = "person"  # ``RunConfig.human`` of every device: a run may go on with another one
+
+
+def amount(action: Any) -> Amount:
+    """An action of any kind as one."""
+    values = np.asarray(action, float).reshape(-1).tolist()
+    return values[0] if len(values) == 1 else tuple(values)
+
+
+def distance(one: Amount, other: Amount) -> float:
+    """How far two actions are apart, in the number that differs most."""
+    return float(np.abs(np.subtract(one, other)).max())
+
+
+def vector(action: Amount) -> Any:
+    """An action as the environment takes it, float32 [n]."""
+    return np.atleast_1d(np.asarray(action, np.float32))
 
 
 @dataclass(frozen=True)

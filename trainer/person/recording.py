@@ -28,8 +28,7 @@ from edge_runtime.util import UserError, open_regular
 from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
 from trainer.learner.replay import Layout
-from trainer.person.controls import Amount, vector
-from trainer.person.interface import Control
+from trainer.person.interface import Amount, Control, vector
 from trainer.training.delayed import Store
 
 TOPIC = "person/step"

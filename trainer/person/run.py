@@ -4,6 +4,10 @@ The policy acts in the loop's thread, from a copy of the actor as of the last fi
 next update begins in the first control period after the last one's end. An episode's steps are
 stored at its end, when it is known whether the person discards it. A run with a person is not
 repeatable anyway.
+
+Copies of the policy are validated in a process of its own, while the person drives on. A thread
+would share Python's lock with the person's loop: on a busy machine every second control period
+began late.
 """
 
 from __future__ import annotations
@@ -16,31 +20,37 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import closing, contextmanager
-from functools import partial
+from functools import cache, partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from bridge.report import DISCARDED, GOAL
+import torch
+from numpy.typing import NDArray
+
+from bridge.report import DISCARDED, GOAL, EpisodeResult
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
+from trainer.drivers import TogetherDriver
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import find_algorithm
-from trainer.person.alone import BehindTheScenes, Check
+from trainer.learner.networks import Actor
 from trainer.person.coach import Coach, typical_curve
-from trainer.person.controls import amount, vector
-from trainer.person.interface import Person, open_person
+from trainer.person.interface import Person, amount, open_person, vector
 from trainer.person.recording import DIRECTORY, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
 from trainer.training.delayed import ticks_late
 from trainer.training.learning import Action, LearningThread, Observation
-from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
+from trainer.training.metrics import EpisodeMetrics, Trials, read_metrics, spent
 from trainer.training.run import TrainingRun, divergence_said
-from trainer.util import Purpose, episode_seed
+from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_blocked
 
 NICENESS = 10
-"""Of the updates' thread, and those that torch starts from it: the person's loop goes first."""
+"""Of the validations' process and of the updates' thread, and those that torch starts from it: the
+person's loop goes first."""
 LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
 PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share", "human_shift")
 """What makes a scripted human imperfect."""
@@ -343,3 +353,80 @@ def _step_aside() -> None:
     """Lower the priority of the thread that calls this, where threads have one (Linux)."""
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+
+
+class Check(NamedTuple):
+    """A policy to be validated."""
+
+    actor: Actor
+    episode: int  # So many had been driven
+    human_s: float  # So much had the person given
+    seeds: dict[int, int]
+    """Episode -> its seed, of those that the policy is to try, beside the validation's own."""
+
+
+class BehindTheScenes:
+    """The parent's end: nothing that it does waits for the process."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._config = config
+        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start)
+        self._begun: tuple[Check, Future[list[EpisodeResult]]] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a validation is under way."""
+        return self._begun is not None and not self._begun[1].done()
+
+    def begin(self, check: Check) -> None:
+        """Start to validate."""
+        # Not as tensors: torch would share their memory with the process.
+        weights = {name: value.numpy() for name, value in check.actor.state_dict().items()}
+        seeds = list(check.seeds.values())
+        try:
+            with interrupts_blocked():
+                self._begun = check, self._process.submit(_drive, self._config, weights, seeds)
+        except BrokenExecutor:
+            self._begun = None  # It was killed; `take` has said so.
+
+    def take(self) -> tuple[Check, list[EpisodeResult]] | None:
+        """What the validation that was begun has come to; None where there is nothing new, or it
+        failed: then it says why on stderr.
+        """
+        if self._begun is None or self.busy:
+            return None
+        (check, answer), self._begun = self._begun, None
+        if error := answer.exception():
+            print(f"no validation beside the drive: {error}", file=sys.stderr)
+            return None
+        return check, answer.result()
+
+    def close(self) -> None:
+        """Break off what is under way."""
+        self.kill()
+        self._process.shutdown(cancel_futures=True)
+
+    def kill(self) -> None:
+        """End the process at once, whatever it does."""
+        for process in list((self._process._processes or {}).values()):
+            process.kill()
+
+
+def _start() -> None:
+    threading.Thread(target=die_with_parent, daemon=True).start()
+    os.nice(NICENESS)
+    torch.set_num_threads(1)
+
+
+_trials = cache(Trials)  # Of the one config
+
+
+def _drive(
+    config: RunConfig, weights: dict[str, NDArray[Any]], seeds: list[int]
+) -> list[EpisodeResult]:
+    """The process's end."""
+    trials = _trials(config)
+    env = trials.envs[0]
+    actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)
+    actor.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    return trials.drive(TogetherDriver(actor.eval().act), seeds)

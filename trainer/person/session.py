@@ -26,8 +26,17 @@ from trainer.environments import Adapted, layout_of, make_environment, scenario_
 from trainer.human.guide import Action, Driver, Observation
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
-from trainer.person.controls import Amount, amount, vector
-from trainer.person.interface import HUMANS, Person, Reading, View, add_person, open_person
+from trainer.person.interface import (
+    HUMANS,
+    Amount,
+    Person,
+    Reading,
+    View,
+    add_person,
+    amount,
+    open_person,
+    vector,
+)
 from trainer.person.recording import Recorder, Step, layout_text
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS

@@ -11,8 +11,16 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from trainer.person.controls import Amount, amount, distance
-from trainer.person.interface import WISHES, Control, Moving, Reading, Wish
+from trainer.person.interface import (
+    WISHES,
+    Amount,
+    Control,
+    Moving,
+    Reading,
+    Wish,
+    amount,
+    distance,
+)
 
 SILENCE_S = 0.5  # A driver who is not heard for this long has let go
 MAX_SLEW = 0.5

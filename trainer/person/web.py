@@ -32,8 +32,8 @@ from PIL import Image
 
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
-from trainer.person.controls import controls_of, distance, keyboard_of
-from trainer.person.interface import WISH_HELP, Moving, Reading, View
+from trainer.person.controls import controls_of, keyboard_of
+from trainer.person.interface import WISH_HELP, Moving, Reading, View, distance
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 

@@ -10,6 +10,7 @@ import pytest
 from bridge import rerun
 from trainer.environments import make_environment
 from trainer.person.coach import Coaching, Episode
+from trainer.person.controls import SHIPPED, read_profile
 from trainer.person.devices import (
     COACH_LEFT,
     COACH_WIDTH,
@@ -19,7 +20,6 @@ from trainer.person.devices import (
     Window,
     pygame,
 )
-from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.browser import first_view
 from trainer.person.tests.people import LET_GO
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl

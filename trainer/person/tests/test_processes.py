@@ -17,7 +17,7 @@ import pytest
 
 from edge_runtime.util import UserError
 from trainer.drivers import CHECKPOINT_FILE
-from trainer.person.controls import vector
+from trainer.person.interface import vector
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.browser import (

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from trainer.person.profile import SHIPPED, SHORTEST, Pedal, Steering, read_profile
+from trainer.person.controls import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 
 PLACE = st.floats(-1.0, 1.0)
 DEAD_ZONE = st.floats(0.0, 0.9)

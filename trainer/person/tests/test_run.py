@@ -10,8 +10,7 @@ import pytest
 from edge_runtime.tests.harness import wait_until
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.learner.networks import Actor
-from trainer.person.alone import BehindTheScenes, Check
-from trainer.person.run import PersonRun, UnhurriedLearning
+from trainer.person.run import BehindTheScenes, Check, PersonRun, UnhurriedLearning
 from trainer.training.config import RunConfig
 
 CONFIG = LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1)

@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.person.controls import distance
-from trainer.person.interface import WISHES, Moving, Reading
+from trainer.person.interface import WISHES, Moving, Reading, distance
 from trainer.person.takeover import MAX_SLEW, NEXT, SILENCE_S, Input, Intent, Seat, TakeOver
 from trainer.person.tests.people import LET_GO
 
