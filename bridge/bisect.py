@@ -16,13 +16,11 @@ from typing import Any
 
 from bridge.fork import ForkedDrive, add_common, find_fork, trainer_command
 from bridge.progress import ProgressBar
-from bridge.report import GOAL, UNKNOWN
+from bridge.report import GOAL, SNAPSHOTS, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import write_json_out
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.util import UserError
-
-SNAPSHOTS = "snapshots"  # Of a training run: directories that are such runs themselves
 
 
 def _add_arguments(parser: Any) -> None:

@@ -63,13 +63,17 @@ class _Clock:
         self.wall_clock_stalls = 0
         """States of lock-step that the edge runtime did not answer in wall time, or only with a
         safe stop because of it: it was gone, or got no processor. Always 0 in real time."""
+        self.check = check
         self._publish = publish
-        self._check = check
         self._spec = spec
         self._hold = CommandHold(0.0, self._period_s)
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()  # Lock-step's
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
+
+    def rejected(self) -> Counter[str]:
+        """What was not believed so far, by reason."""
+        return Counter(dict(self.check.rejected))  # Another thread may go on counting.
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
@@ -84,7 +88,7 @@ class _Clock:
         injected, and no answer is awaited.
         """
         with self._arrived:
-            self._check.end(state.step, self._hold.newest_step)
+            self.check.end(state.step, self._hold.newest_step)
         self._publish(self._stamped(state))
 
     def close(self) -> None:
@@ -92,7 +96,7 @@ class _Clock:
 
     def _stamped(self, state: State) -> bytes:
         """The state as it leaves now: with the wall clock, and what was heard of the commands."""
-        heard = self._check.heard
+        heard = self.check.heard
         return encode(msgspec.structs.replace(state, sent_ns=time.time_ns(), **heard))
 
 
@@ -101,14 +105,14 @@ class LockStepClock(_Clock):
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode at virtual time 0; ``seed`` decides the link's delays and losses."""
-        self._check.begin(episode)
+        self.check.begin(episode)
         self._link: VirtualLink[State] = VirtualLink(
             self._spec,
             seed,
             self._period_s,
             self._observation_bytes,
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
-            on_stale=lambda: self._check.reject(Reason.STALE.value),
+            on_stale=lambda: self.check.reject(Reason.STALE.value),
         )
         self._hold = self._link.hold
         self._answered_at_s: float | None = None
@@ -120,7 +124,7 @@ class LockStepClock(_Clock):
 
     def exchange(self, state: State) -> Decision:
         """Let virtual time run from this tick to the end of its command window."""
-        self._check.sent(state.step)
+        self.check.sent(state.step)
         self._link.send_state(state.step, state)
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
@@ -131,7 +135,7 @@ class LockStepClock(_Clock):
         payload = self._stamped(arrival.message)
         # What came between two ticks is read all the same, so that faults are counted.
         while not self._inbox.empty():
-            self._check.read(self._inbox.get()[0], time.time_ns())
+            self.check.read(self._inbox.get()[0], time.time_ns())
         published_s = time.monotonic()
         self._publish(payload)
         if arrival.overtaken:
@@ -148,14 +152,14 @@ class LockStepClock(_Clock):
                 payload, received_s = self._inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
-            if (command := self._check.read(payload, time.time_ns())) is None:
+            if (command := self.check.read(payload, time.time_ns())) is None:
                 continue
             if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
                 self.wall_clock_stalls += command.reason in WALL_CLOCK_REASONS
                 return command, received_s
             if command.mode != SAFE_STOP:  # In safe stop the edge repeats its last answer.
-                self._check.reject(Reason.STALE.value)
+                self.check.reject(Reason.STALE.value)
         self._edge_silent = True
         self.wall_clock_stalls += 1
         return None
@@ -194,7 +198,7 @@ class RealTimeClock(_Clock):
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode now; ``seed`` decides the link's delays and losses."""
         with self._arrived:
-            self._check.begin(episode)
+            self.check.begin(episode)
             self._start_s = self._begun_s = time.monotonic()
             self._link = make_link(self._spec, seed)
             self._hold = CommandHold(self._start_s, self._period_s)
@@ -230,7 +234,7 @@ class RealTimeClock(_Clock):
         payload = self._stamped(state)
         with self._arrived:
             self._sent_s[state.step] = time.monotonic()
-            self._check.sent(state.step)
+            self.check.sent(state.step)
         self._send(self._link.up, payload, self._publish)
         return tick_s
 
@@ -258,11 +262,11 @@ class RealTimeClock(_Clock):
     def _arrive_at_vehicle(self, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            if (command := self._check.read(payload, time.time_ns())) is None:
+            if (command := self.check.read(payload, time.time_ns())) is None:
                 return
             answered_step, sent_s = self._hold.newest_step, self._sent_s[command.step]
             if not self._hold.admit(command, now_s, sent_s):
-                self._check.reject(Reason.STALE.value)
+                self.check.reject(Reason.STALE.value)
                 return
             if command.step > answered_step:
                 self.latencies_ms.append((now_s - sent_s) * 1e3)
@@ -282,18 +286,13 @@ class VehicleClock(RealTimeClock):
     """The clock of ``--loop vehicle``. ``tracking`` keeps what was asked, and what became of it."""
 
     def __init__(
-        self,
-        publish: Publish,
-        check: CommandCheck,
-        spec: LatencySpec,
-        task: Task,
-        feedback: FeedbackCheck,
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
     ) -> None:
         self.tracking = TrackingLog()
         self.feedback_ages_ms: list[float] = []
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
-        self.feedback_check = feedback
+        self.feedback_check = FeedbackCheck(check.session, task)
         super().__init__(publish, check, spec, task)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -325,9 +324,10 @@ class VehicleClock(RealTimeClock):
         )
 
     def rejected(self) -> Counter[str]:
-        """Return the feedback that was not believed, as ``feedback_REASON``."""
-        counts = dict(self.feedback_check.rejected)  # the delay line's thread goes on counting
-        return Counter({f"feedback_{name}": count for name, count in counts.items()})
+        """The same, and the feedback that was not believed, as ``feedback_REASON``."""
+        counts = dict(self.feedback_check.rejected)
+        feedback = {f"feedback_{name}": count for name, count in counts.items()}
+        return super().rejected() + Counter(feedback)
 
     def report(self, action_names: Sequence[str]) -> dict[str, Any]:
         """Return the report's part ``vehicle``."""

@@ -120,7 +120,6 @@ class EpisodeRunner:
     origin: Origin
     """Of the drive, to be told with every scene; each episode has a seed of its own."""
     apply: Apply = policy_action
-    rejected: Callable[[], Mapping[str, int]] = dict
 
     def __post_init__(self) -> None:
         self._layout, self._period_s = Layout(self.task), self.task.control_period_s
@@ -225,7 +224,7 @@ class EpisodeRunner:
         applied, braked = self._applied
         stamps = Scene(
             episode=state.episode, step=state.step, sim_time_s=state.sim_time_s,
-            round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.rejected()),
+            round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.clock.rejected()),
             task=self.task, origin=self.origin, applied=applied, braked=braked,
             ridden=self._ridden,
         )  # fmt: skip

@@ -36,15 +36,15 @@ from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.record import RecordingWriter, new_recording
 from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.replay import controller_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
 from edge_runtime.config import add_trust
-from edge_runtime.controller import Controller, Received, shared_limits
+from edge_runtime.controller import Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import Policy, infer, load_policy
-from edge_runtime.ride import Ride
 from edge_runtime.util import UserError, counted, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
 
@@ -222,12 +222,8 @@ class PolicyAnswers:
     def __init__(self, policy: Policy, plan_periods: int = 0) -> None:
         self._policy, self._now_s = policy, 0.0
         self._period_s = policy.manifest.control_period_s
-        limits, text = shared_limits(policy.manifest.action, {}), policy.layout.task_text
-        ride_s = plan_periods * self._period_s
-        ride = Ride(ride_s, self._period_s, limits, plays=False) if plan_periods else None
-        self._controller = Controller(
-            limits, self._period_s, needs_rearm=False, task=text, ride=ride
-        )
+        limits = shared_limits(policy.manifest.action, {})
+        self._controller = controller_of(policy, limits, plan_periods, needs_rearm=False)
 
     def answer(self, state: State, known: Command | None = None) -> Command | None:
         """The command for a state.

@@ -39,9 +39,9 @@ class CommandCheck:
     """
 
     def __init__(self, session: str, task: Task) -> None:
+        self.session = session
         self.rejected: Counter[str] = Counter()
         self.policy_ids: list[str] = []
-        self._session = session
         self._actions, self._period_s = task.action, task.control_period_s
         self._episode = 0
         self._newest_step = -1
@@ -76,7 +76,7 @@ class CommandCheck:
         if isinstance(command, Rejection):
             self.reject(command.reason.value)
             return None
-        if command.session == self._session and command.sent_ns not in self._stamps:
+        if command.session == self.session and command.sent_ns not in self._stamps:
             self._stamps.append(command.sent_ns)
             heard = self.heard.get("heard", 0) + 1
             self.heard = {"heard": heard, "heard_sent_ns": command.sent_ns, "heard_ns": now_ns}
@@ -100,7 +100,7 @@ class CommandCheck:
 
     def _fault(self, command: Command) -> str:
         """Why a well-formed command answers nothing in this episode; empty if it does."""
-        if command.session != self._session:
+        if command.session != self.session:
             return Reason.FOREIGN_SESSION.value
         plan = command.plan or []
         for action in (command.action, *plan) if command.mode == DRIVE else ():

@@ -325,6 +325,16 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     return _Replay(drive, policy, shared_limits(policy.manifest.action, limits)).run()
 
 
+def controller_of(
+    policy: Policy, limits: Limits, plan_periods: int, needs_rearm: bool, is_armed: bool = True
+) -> Controller:
+    """The edge runtime's decision logic; its commands carry plans of so many periods."""
+    period_s, task = policy.manifest.control_period_s, policy.layout.task_text
+    ride_s = plan_periods * period_s
+    ride = Ride(ride_s, period_s, limits, plays=needs_rearm) if plan_periods else None
+    return Controller(limits, period_s, needs_rearm, is_armed, task, ride)
+
+
 class _Replay:
     def __init__(self, drive: RecordedDrive, policy: Policy, limits: Limits) -> None:
         self._drive, self._policy, self._limits = drive, policy, limits
@@ -348,12 +358,8 @@ class _Replay:
         """A runtime as it was when it met this exchange first."""
         needs_rearm = self._drive.vehicle != NONE
         is_armed = first.answers[0].reason != Event.NOT_ARMED.value
-        layout, period_s = self._policy.layout, self._policy.manifest.control_period_s
-        ride_s = self._drive.plan_periods * period_s
-        ride = Ride(ride_s, period_s, self._limits, plays=needs_rearm) if ride_s else None
-        return Controller(
-            self._limits, period_s, needs_rearm, is_armed, task=layout.task_text, ride=ride
-        )
+        plans = self._drive.plan_periods
+        return controller_of(self._policy, self._limits, plans, needs_rearm, is_armed)
 
     def _answer(self, state: State, exchange: Exchange) -> None:
         self._pass_time(exchange.begun_s)

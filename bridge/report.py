@@ -27,6 +27,7 @@ OUTCOMES = (GOAL, COLLISION, "timeout", "off_road")
 STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
 DISCARDED = "discarded"
 """The person threw it away: it is shown, and nothing learns from it."""
+SNAPSHOTS = "snapshots"  # In a training run: directories that are such runs themselves
 
 
 def failed(outcome: str) -> bool:

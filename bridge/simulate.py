@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import time
 from argparse import Namespace
-from collections import Counter
 from typing import Any
 
 import msgspec
@@ -20,7 +19,7 @@ from bridge.environments import (
     scenarios,
 )
 from bridge.episode import EpisodeRunner, policy_action, vehicle_action
-from bridge.inbound import CommandCheck, FeedbackCheck
+from bridge.inbound import CommandCheck
 from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
@@ -97,13 +96,9 @@ def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
     endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
     task = describe(environment, asked.period)
     with open_port(asked.listen, asked.vehicle_id, asked.tls, asked.connect, wait_s) as port:
+        kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
         check = CommandCheck(port.session, task)
-        clock: Clock
-        if asked.loop == VEHICLE:
-            feedback = FeedbackCheck(port.session, task)
-            clock = VehicleClock(port.publish_state, check, asked.latency, task, feedback)
-        else:
-            clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency, task)
+        clock = kind(port.publish_state, check, asked.latency, task)
         with contextlib.closing(clock), ProgressBar("episodes", asked.episodes) as bar:
             bar.show("waiting for an edge runtime")
             port.hear("command", clock.receive)
@@ -112,7 +107,7 @@ def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
             if isinstance(clock, VehicleClock):
                 port.hear("feedback", clock.receive_feedback)
                 clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-            return _drive(asked, environment, port, clock, check, bar, task, manifest)
+            return _drive(asked, environment, port, clock, bar, task, manifest)
 
 
 def _drive(
@@ -120,7 +115,6 @@ def _drive(
     environment: Environment,
     port: SimulatorPort,
     clock: Clock,
-    check: CommandCheck,
     bar: ProgressBar,
     task: Task,
     manifest: Manifest | None,
@@ -153,8 +147,6 @@ def _drive(
         task,
         Origin(session=port.session, environment=asked.env, latency=network, **how),
         apply=vehicle_action(action_names, pedal_for_speed) if vehicle else policy_action,
-        # Copies, made at once: other threads go on counting.
-        rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
     # Where it says nothing, the edge runtime compares by itself what the states say.
     if manifest is not None and manifest.text != task.text:
@@ -176,9 +168,7 @@ def _drive(
         bar.advance({}, told=told)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
-    by_simulator = Counter({**check.rejected}) + Counter(edge.unreadable)
-    if vehicle is not None:
-        by_simulator += vehicle.rejected()
+    by_simulator = clock.rejected() + edge.unreadable
     return make_report(
         results,
         runner.safe_stops.events,
@@ -188,7 +178,7 @@ def _drive(
             "scenario": task.task,
             **how,
             "latency_spec": network,
-            "policy_ids": check.policy_ids,
+            "policy_ids": clock.check.policy_ids,
             "deadline_misses": runner.deadline_misses,
             "ridden_steps": runner.ridden_steps,
             "tick_overruns": clock.tick_overruns,

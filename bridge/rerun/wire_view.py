@@ -1,4 +1,7 @@
-"""``python -m bridge view``: the wire in rerun, as a listener of its own or from a recording."""
+"""``python -m bridge view``: the wire in rerun, as a listener of its own or from a recording.
+
+Or, live, in Foxglove: the copies that `bridge record` makes for viewers, as a WebSocket.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,11 @@ import rerun.blueprint as rrb
 
 from bridge.messages import DECODERS, Heard, Pace, Scene, images_of, is_picture, period_of
 from bridge.ports import add_options, open_listener, wait_to_be_told
+from bridge.record import Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.rerun import (
     APPLIED,
+    LOOPBACK,
     POLICY,
     SERVE,
     SUFFIX,
@@ -71,9 +76,11 @@ def run(arguments: Any) -> int:
     if arguments.foxglove and arguments.recording is not None:
         raise UserError(f"Foxglove opens {arguments.recording} by itself")
     if arguments.foxglove:
-        from bridge.foxglove_view import serve
-
-        return _watch(arguments, serve(arguments.foxglove))
+        try:
+            import foxglove
+        except ImportError:
+            raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
+        return _watch(arguments, _served(foxglove, arguments.foxglove))
     sink = check_sink(arguments.sink)
     if arguments.recording is not None:
         _show_recording(arguments, sink)
@@ -109,6 +116,29 @@ def _show_recording(arguments: Any, sink: str) -> None:
 def _drawn(sink: str) -> Iterator[Callable[[Heard], None]]:
     with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
         yield WireLog(recording, 0.0 if sink.endswith(SUFFIX) else draw.PICTURE_INTERVAL_S).write
+
+
+@contextlib.contextmanager
+def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
+    """What shows a message in Foxglove; UserError where nothing can be served at the port."""
+    context, channels = foxglove.Context(), dict[str, Any]()
+
+    def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
+        if topic not in channels:
+            told = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.descriptors)
+            kind: Any = {"message_encoding": "protobuf", "schema": told, "context": context}
+            channels[topic] = foxglove.Channel(topic, **kind)
+        channels[topic].log(data, log_time=now_ns)
+
+    try:
+        server = foxglove.start_server(name="phil", host=LOOPBACK, port=port, context=context)
+    except RuntimeError as error:
+        raise UserError(f"cannot serve Foxglove at port {port}: {error}") from None
+    try:
+        print(f"open ws://{LOOPBACK}:{port} in Foxglove", flush=True)
+        yield ViewerCopies(add).write
+    finally:
+        server.stop()
 
 
 def _watch(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
-from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
+from bridge.inbound import NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
 from bridge.ports import connect_client
 from bridge.tests.harness import (
@@ -238,9 +238,8 @@ class VehicleRig(Rig):
 
     def __init__(self, spec="none", dead_s=0.03):
         self.dead_s, self.silent_from = dead_s, 99
-        self.check = FeedbackCheck("here", TASK)
-        commands = CommandCheck("here", TASK)
-        self.clock = VehicleClock(self.publish, commands, parse_spec(spec), TASK, self.check)
+        self.clock = VehicleClock(self.publish, CommandCheck("here", TASK), parse_spec(spec), TASK)
+        self.check = self.clock.feedback_check
         self.close = self.clock.close
 
     def publish(self, payload):

@@ -262,7 +262,6 @@ def test_somebodys_robot_of_another_kind_is_served_recorded_replayed_and_shown(
 class ScriptedClock:
     """Drives for a while with one steering, brakes, and drives again."""
 
-    latencies_ms: tuple = ()
     drive, brake_until = 10, 32
 
     def begin(self, episode, seed):
@@ -279,6 +278,9 @@ class ScriptedClock:
 
     def newest_answer(self):
         return None
+
+    def rejected(self):
+        return {}
 
     def finish(self, state):
         self.states.append(state)

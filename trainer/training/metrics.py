@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.bisect import SNAPSHOTS
 from bridge.network import parse_spec
-from bridge.report import GOAL, EpisodeResult, failed
+from bridge.report import GOAL, SNAPSHOTS, EpisodeResult, failed
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.drivers import BEST_FILE, TogetherDriver
