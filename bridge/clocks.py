@@ -17,7 +17,7 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -292,6 +292,7 @@ class VehicleClock(RealTimeClock):
         self.feedback_ages_ms: list[float] = []
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
+        self._action_names = [row.name for row in task.action]
         self.feedback_check = FeedbackCheck(check.session, task)
         super().__init__(publish, check, spec, task)
 
@@ -329,10 +330,10 @@ class VehicleClock(RealTimeClock):
         feedback = {f"feedback_{name}": count for name, count in counts.items()}
         return super().rejected() + Counter(feedback)
 
-    def report(self, action_names: Sequence[str]) -> dict[str, Any]:
+    def report(self) -> dict[str, Any]:
         """Return the report's part ``vehicle``."""
         return {
-            **self.tracking.report(action_names),
+            **self.tracking.report(self._action_names),
             "feedback_age_ms": quantiles(self.feedback_ages_ms),
             "moving_starts": self.moving_starts,
         }

@@ -19,23 +19,24 @@ from bridge.environments import Environment, entry_name
 from bridge.messages import Origin, Scene
 from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
-from edge_runtime.manifest import Layout, Task
+from edge_runtime.manifest import Action, Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import State
+from edge_runtime.wire import Feedback, State
+
+PEDAL = "pedal"
 
 
 class Actuators:
-    """Applies actions to an environment; ``stops`` are those of the policy's safe stop.
+    """Applies actions to an environment; ``actions`` are the policy's, with their safe stops.
 
-    An environment's own ``brake_action`` and ``press_brake`` come before them.
+    An environment's own ``brake_action`` and ``press_brake`` come before those.
     """
 
-    def __init__(self, environment: Environment, stops: Sequence[float | None]) -> None:
-        self._own = environment.unwrapped
+    def __init__(self, environment: Environment, actions: Sequence[Action]) -> None:
+        self._own, self._actions = environment.unwrapped, actions
         space: Any = environment.action_space
-        self._space, self._stops = space, stops
-        self._shape = space.shape
+        self._space, self._shape = space, space.shape
         self.hands_off: np.ndarray = np.clip(0.0, space.low, space.high).astype(space.dtype)
         """Zero, or the nearest in range: what is done before the first command."""
         self.last = self.hands_off
@@ -51,8 +52,22 @@ class Actuators:
         own = getattr(self._own, "brake_action", None)
         if own is not None:
             return self.within(own)
-        pairs = zip(self._stops, self.last.ravel().tolist(), strict=True)
-        return self.within([last if stop is None else stop for stop, last in pairs])
+        pairs = zip(self._actions, self.last.ravel().tolist(), strict=True)
+        return self.within([last if row.stop is None else row.stop for row, last in pairs])
+
+    def reached(self, feedback: Feedback) -> np.ndarray:
+        """What a vehicle's actuators have reached.
+
+        Where it tells the speed of the scenario's car and the environment knows which pedal leads
+        to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
+        for what the last step missed, while errors of pedals would add up.
+        """
+        pedal_for_speed = getattr(self._own, "pedal_for_speed", None)
+        speed_mps, action = feedback.scenario_speed_mps, list(feedback.action)
+        for place, row in enumerate(self._actions):
+            if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
+                action[place] = float(pedal_for_speed(speed_mps))
+        return self.within(action)
 
     def within(self, action: Any) -> np.ndarray:
         """The numbers as an action of the environment, within its range."""
@@ -63,7 +78,6 @@ class Actuators:
 
 Apply = Callable[[Actuators, Decision], np.ndarray]
 """Returns the action of one tick, and presses or releases the brake."""
-PEDAL = "pedal"
 
 
 def policy_action(actuators: Actuators, decision: Decision) -> np.ndarray:
@@ -76,30 +90,14 @@ def policy_action(actuators: Actuators, decision: Decision) -> np.ndarray:
     return actuators.within(decision.command.action)
 
 
-def vehicle_action(
-    action_names: Sequence[str], pedal_for_speed: Callable[[float], float] | None = None
-) -> Apply:
-    """Return what applies what the vehicle's actuators have reached.
+def vehicle_action(actuators: Actuators, decision: Decision) -> np.ndarray:
+    """What the vehicle's actuators have reached.
 
-    Where the vehicle tells the speed of the scenario's car and the environment knows which pedal
-    leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
-    for what the last step missed, while errors of pedals would add up. Without feedback the car
-    brakes fully; an environment that is only steered does so whenever the vehicle brakes.
-    ``action_names`` are those of the policy's actions, in order.
+    Without feedback the car brakes fully; an environment that is only steered does so whenever the
+    vehicle brakes.
     """
-    place = list(action_names).index(PEDAL) if PEDAL in action_names else None
-
-    def apply(actuators: Actuators, decision: Decision) -> np.ndarray:
-        actuators.brake(bool(decision.brake_reason))
-        if decision.feedback is None:
-            return actuators.stop()
-        action = list(decision.feedback.action)
-        speed_mps = decision.feedback.scenario_speed_mps
-        if speed_mps is not None and pedal_for_speed is not None and place is not None:
-            action[place] = float(pedal_for_speed(speed_mps))
-        return actuators.within(action)
-
-    return apply
+    actuators.brake(bool(decision.brake_reason))
+    return actuators.reached(decision.feedback) if decision.feedback else actuators.stop()
 
 
 PublishScene = Callable[[Any, Scene], None]
@@ -124,7 +122,7 @@ class EpisodeRunner:
     def __post_init__(self) -> None:
         self._layout, self._period_s = Layout(self.task), self.task.control_period_s
         self.safe_stops = SafeStopLog(self._period_s)
-        self._actuators = Actuators(self.environment, [row.stop for row in self.task.action])
+        self._actuators = Actuators(self.environment, self.task.action)
         self.deadline_misses = 0
         self.command_ages_ms: list[float] = []
         """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
@@ -188,7 +186,13 @@ class EpisodeRunner:
             # An environment need not report accelerations; then they count as zero.
             lateral_mps2.append(abs(_number(info, "lateral_acceleration_mps2")))
             longitudinal_mps2.append(abs(_number(info, "longitudinal_acceleration_mps2")))
-            self._note(state, decision, _speed_mps(info) or 0.0)
+            self.deadline_misses += not decision.fresh
+            self._ridden = decision.ridden
+            self.ridden_steps += decision.ridden > 0
+            if decision.command_age_s is not None:
+                self.command_ages_ms.append(decision.command_age_s * 1e3)
+            self.safe_stops.observe(episode, state.step, decision, _speed_mps(info) or 0.0)
+            self.on_tick(episode, state.step, decision)
             ended = bool(terminated or truncated)
         final = self._state(episode, result.steps, observation, info, final=True)
         self._show(final)
@@ -229,15 +233,6 @@ class EpisodeRunner:
             ridden=self._ridden,
         )  # fmt: skip
         self.publish_scene(self.environment, stamps)
-
-    def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
-        self.deadline_misses += not decision.fresh
-        self._ridden = decision.ridden
-        self.ridden_steps += decision.ridden > 0
-        if decision.command_age_s is not None:
-            self.command_ages_ms.append(decision.command_age_s * 1e3)
-        self.safe_stops.observe(state.episode, state.step, decision, speed_mps)
-        self.on_tick(state.episode, state.step, decision)
 
 
 def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str, bytes]:

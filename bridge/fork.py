@@ -202,7 +202,7 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Rebuild the drive until the fork; its seed goes before. UserError: it is another."""
         drive, layout = self._drive, Layout(self._drive.task)
-        actuators = Actuators(self.env, [row.stop for row in drive.task.action])
+        actuators = Actuators(self.env, drive.task.action)
         options = {"standing": True} if drive.origin.standing else None
         seen, info = self.env.reset(seed=drive.origin.seed, options=options)
         for step in range(self._fork):

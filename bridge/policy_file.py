@@ -179,7 +179,7 @@ def drive(
     actions: list[np.ndarray] = []
     space: Any = environment.action_space
     space.seed(seed)
-    actuators = Actuators(environment, [row.stop for row in policy.manifest.action])
+    actuators = Actuators(environment, policy.manifest.action)
     episode, over = 0, True
     seen: Any = None
     while len(actions) < steps:

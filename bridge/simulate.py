@@ -120,8 +120,6 @@ def _drive(
     manifest: Manifest | None,
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
-    action_names = [action.name for action in task.action]
-    pedal_for_speed = getattr(environment.unwrapped, "pedal_for_speed", None)
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
     network = str(asked.latency)
     if manifest is not None and manifest.text == task.text:
@@ -146,7 +144,7 @@ def _drive(
         on_tick,
         task,
         Origin(session=port.session, environment=asked.env, latency=network, **how),
-        apply=vehicle_action(action_names, pedal_for_speed) if vehicle else policy_action,
+        apply=vehicle_action if vehicle else policy_action,
     )
     # Where it says nothing, the edge runtime compares by itself what the states say.
     if manifest is not None and manifest.text != task.text:
@@ -189,6 +187,6 @@ def _drive(
             "rejected_by_edge": dict(edge.rejected),
             "rejected_by_simulator": dict(by_simulator),
             "wall_s": wall_s,
-            "vehicle": vehicle.report(action_names) if vehicle else None,
+            "vehicle": vehicle.report() if vehicle else None,
         },
     )

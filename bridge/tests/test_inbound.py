@@ -13,7 +13,8 @@ from bridge.report import SafeStopLog
 from bridge.tests.harness import make_command, make_feedback
 from bridge.tests.toy import ToyEnv
 from bridge.virtual_link import NO_COMMAND, CommandHold
-from edge_runtime.tests.policies import TASK, T
+from edge_runtime.manifest import Action
+from edge_runtime.tests.policies import STEERING, TASK, T
 from edge_runtime.wire import Health, encode
 
 
@@ -269,10 +270,9 @@ class PedalEnv(ToyEnv):
     ],
 )
 def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied):
-    env, names = environment(), names.split()
-    env.action_space = spaces.Box(-1.0, 1.0, (len(names),), np.float32)
-    apply = vehicle_action(names, getattr(env, "pedal_for_speed", None))
-    action = apply(Actuators(env, [-1.0]), decide(make_feedback(3, **changes)))
+    env, rows = environment(), [Action(name=name, low=-1, high=1) for name in names.split()]
+    env.action_space = spaces.Box(-1.0, 1.0, (len(rows),), np.float32)
+    action = vehicle_action(Actuators(env, rows), decide(make_feedback(3, **changes)))
     assert (action.dtype, action.tolist()) == (np.float32, pytest.approx(applied))
 
 
@@ -287,13 +287,13 @@ class SteeredEnv(ToyEnv):
 
 
 def test_a_steered_car_brakes_when_its_vehicle_does():
-    environment, apply = SteeredEnv(), vehicle_action(["steering"])
-    actuators = Actuators(environment, [None])
+    environment = SteeredEnv()
+    actuators = Actuators(environment, [STEERING])
     stop = decide(make_feedback(3, mode="safe_stop", action=[0.5]))
-    assert apply(actuators, stop).tolist() == [0.5]
-    assert apply(actuators, decide(make_feedback(3))).tolist() == [0.5]
+    assert vehicle_action(actuators, stop).tolist() == [0.5]
+    assert vehicle_action(actuators, decide(make_feedback(3))).tolist() == [0.5]
     silent = decide(make_feedback(3), after_s=1.0)
-    assert apply(actuators, silent).tolist() == [pytest.approx(0.1)]
+    assert vehicle_action(actuators, silent).tolist() == [pytest.approx(0.1)]
     assert environment.pressed == [True, False, True]
 
 

@@ -10,6 +10,7 @@ ever overwritten: sittings add up.
 import ast
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from itertools import groupby
 from pathlib import Path
@@ -110,11 +111,11 @@ class Recorder:
 
     def write(self, step: Step) -> None:
         """Keep a step; from here on no kill takes it away. UserError on a full disk."""
-        data = msgspec.msgpack.encode(step)
-        place = (self._channel, step.time_ns, data, step.time_ns, self.index)
+        data, index = msgspec.msgpack.encode(step), self.index
         self.index += 1
-        self._write_out(lambda: self._mcap.add_message(*place))
-        self._write_out(self._mcap.flush)
+        with self._one_line():
+            self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, index)
+            self._mcap.flush()
 
     def close(self) -> None:
         """Write the index and close the file; a sitting without steps leaves none behind."""
@@ -123,16 +124,18 @@ class Recorder:
         self._closed = True
         try:
             if not self._torn:  # An index would tell of a step that the disk did not take.
-                self._write_out(self._mcap.finish)
-                self._write_out(self._file.close)
+                with self._one_line():
+                    self._mcap.finish()
+                    self._file.close()
         finally:
             close_torn(self._file)
         if self.index == 0:
             self.path.unlink()
 
-    def _write_out(self, write: Callable[[], None]) -> None:
+    @contextmanager
+    def _one_line(self) -> Iterator[None]:
         try:
-            write()
+            yield
         except OSError as error:
             self._torn = True
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
