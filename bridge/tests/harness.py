@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,13 @@ from mcap.records import Chunk, ChunkIndex, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from bridge.__main__ import main
+from bridge.environments import describe, make_environment
+from bridge.fork import ForkedDrive, RecordedEpisode
+from bridge.messages import Origin
+from bridge.record import RecordingWriter
+from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, exit_status, wait_until
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.wire import Command, Feedback, State, decode_state
@@ -94,9 +101,55 @@ def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
     return path
 
 
-def start_simulate(endpoint: str, out: Path, env: str, *options: str) -> BridgeProcess:
+def start_simulate(endpoint: str, out: Path, env: str, *options: str, **more: Any) -> BridgeProcess:
     fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
-    return BridgeProcess(*fixed, *options)
+    return BridgeProcess(*fixed, *options, **more)
+
+
+def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
+    """Start ``python -m bridge record``, and wait until there is a recording."""
+    run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
+    # A file is made before its first bytes are in it.
+    wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin", 100.0)
+    return run
+
+
+def record_drive(
+    folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = (), **more: Any
+) -> Path:
+    """Record a drive of the three processes; its report is ``report.json`` beside it."""
+    endpoint, path = free_endpoint(), folder / "drive.mcap"
+    simulating = ("--wait-edge-s", "100", *options)
+    with (
+        start_simulate(endpoint, folder / "report.json", env, *simulating, **more) as simulator,
+        start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5") as recorder,
+        start_edge(endpoint, policy, *edge),
+    ):
+        assert simulator.wait(200.0) == 0, simulator.errors
+        assert recorder.wait() == 0, recorder.errors
+    return path
+
+
+@contextlib.contextmanager
+def writing(path: Path, dropped: int = 0) -> Iterator[RecordingWriter]:
+    with contextlib.closing(RecordingWriter(path)) as writer:
+        yield writer
+        writer.finish(dropped)
+
+
+def record_in_process(
+    path: Path, env: str, policy: Path, seed: int, latency: str, condition: str = "nominal"
+) -> EpisodeResult:
+    """Record a drive in lock-step as the processes would, without them."""
+    origin = Origin(
+        session="s", environment=env, condition=condition, seed=seed, standing=False,
+        clock="lockstep", loop="policy", latency=latency,
+    )  # fmt: skip
+    environment = make_environment(env, condition)
+    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
+    with writing(path) as out:
+        loaded = load_policy(policy, allow_unsigned=True)
+        return ForkedDrive(nothing, environment, 0, loaded, out=out).run()
 
 
 def simulate(folder: Path, endpoint: str, env: str, options: Sequence[str]) -> dict[str, Any]:

@@ -19,25 +19,19 @@ import pytest
 
 from bridge.bisect import first_change
 from bridge.environments import describe, make_environment
-from bridge.fork import ForkedDrive, RecordedEpisode
-from bridge.messages import Origin
 from bridge.policy_file import make_policy as make_any_policy
-from bridge.record import RecordingWriter
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.tests.harness import (
     LEFT_TURN,
     TOY,
-    BridgeProcess,
     bridge_status,
     flip_chunk,
     make_policy,
     read,
-    start_edge,
-    start_simulate,
+    record_drive,
+    record_in_process,
+    writing,
 )
-from edge_runtime.policy import load_policy
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import wait_until
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"
@@ -60,23 +54,6 @@ def parking_policy(folder: Path) -> Path:
     task = describe(make_environment(PARKING))
     path = folder / "parking.onnx"
     path.write_bytes(make_any_policy(model.SerializeToString(), task, "test", {}))
-    return path
-
-
-def record(folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = ()) -> Path:
-    """A drive of the three processes, as a person would record it."""
-    endpoint, path = free_endpoint(), folder / "drive.mcap"
-    with start_simulate(
-        endpoint, folder / "report.json", env, "--wait-edge-s", "100", *options
-    ) as simulator:
-        to = ("--connect", endpoint, "--wait-s", "100", "--linger-s", "0.5")
-        with BridgeProcess("record", "--out", str(path), *to) as recorder:
-            wait_until(
-                lambda: path.exists() and path.stat().st_size > 0, "the recording to begin", 100.0
-            )
-            with start_edge(endpoint, policy, *edge):
-                assert simulator.wait(200.0) == 0, simulator.errors
-            assert recorder.wait() == 0, recorder.errors
     return path
 
 
@@ -107,7 +84,7 @@ def test_without_a_change_the_fork_is_the_recorded_drive_to_the_bit(tmp_path, en
     policy = SHIPPED / f"{env}.onnx"
     for attempt in range(8):  # Where the machine stood still, the edge runtime has stopped.
         (folder := tmp_path / str(attempt)).mkdir()
-        path = record(folder, env, policy, *TWO, "--seed", "3", "--latency", latency)
+        path = record_drive(folder, env, policy, *TWO, "--seed", "3", "--latency", latency)
         driven = read(folder / "report.json")
         if not driven["wall_clock_stalls"]:
             break
@@ -122,23 +99,14 @@ def test_without_a_change_the_fork_is_the_recorded_drive_to_the_bit(tmp_path, en
 
 def test_an_environment_of_others_is_rebuilt_whatever_stood_still(tmp_path):
     """Its steps take so long that on a busy machine the edge runtime stops now and then."""
-    path = record(tmp_path, PARKING, parking_policy(tmp_path), "--latency", "50ms+-30ms")
+    path = record_drive(tmp_path, PARKING, parking_policy(tmp_path), "--latency", "50ms+-30ms")
     (row,) = read(tmp_path / "report.json")["per_episode"]
     assert fork_of(path, "--at", row["time_s"] / 2, "--env", PARKING)["recorded"] == row
 
 
 def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
     policy, path = parking_policy(tmp_path), tmp_path / "drive.mcap"
-    environment = make_environment(PARKING)
-    origin = Origin(
-        session="s", environment=PARKING, condition="nominal", seed=4, standing=False,
-        clock="lockstep", loop="policy", latency="50ms+-30ms,loss=5%",
-    )  # fmt: skip
-    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
-    with contextlib.closing(RecordingWriter(path)) as out:
-        loaded = load_policy(policy, None, allow_unsigned=True)
-        row = ForkedDrive(nothing, environment, 0, loaded, out=out).run()
-        out.finish(dropped=0)
+    row = record_in_process(path, PARKING, policy, seed=4, latency="50ms+-30ms,loss=5%")
     found = is_recorded_to_the_bit(path, 0, policy, row.time_s, "--env", PARKING)
     assert found["fork"] == asdict(row)
 
@@ -147,7 +115,7 @@ def test_a_drive_with_plans_is_the_same_to_the_bit(tmp_path):
     settings, loses = tmp_path / "edge.toml", ("--latency", "loss=30%")
     settings.write_text("[ride_through]\nmax_s = 0.3\n")
     config = ("--config", str(settings))
-    path = record(tmp_path, "left_turn", OURS, "--seed", "3", *loses, edge=config)
+    path = record_drive(tmp_path, "left_turn", OURS, "--seed", "3", *loses, edge=config)
     found = fork_of(path, "--at", "1s", "--policy", OURS)
     assert found["differs_from_s"] is None
     assert found["fork"] == found["recorded"]
@@ -178,14 +146,13 @@ def test_a_fork_that_nobody_can_drive_says_so(refusal):
 
 def rewritten(path: Path, out: Path, change) -> Path:
     """The recording with ``change(topic, message)`` in the place of each message, None: without."""
-    with contextlib.closing(RecordingWriter(out)) as writer:
+    with writing(out) as writer:
         recording = Recording(path)
         for heard in heard_of(recording, choose_vehicle(recording, None)):
             message = msgspec.msgpack.decode(heard.payload)
             if (message := change(heard.topic, message)) is not None:
                 payload = msgspec.msgpack.encode(message)
                 writer.write(heard._replace(payload=payload, size=len(payload)))
-        writer.finish(dropped=0)
     return out
 
 

@@ -16,7 +16,7 @@ from bridge.messages import Scene, encode_scene
 from bridge.record import RawImage, describe
 from bridge.rerun import free_port
 from bridge.tests import harness
-from bridge.tests.test_recording import heard, writing
+from bridge.tests.test_recording import heard
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import make_state
@@ -37,7 +37,7 @@ FILE = "chunk-000/file-000"
 
 
 def recorded(path, task):
-    with writing(path) as writer:
+    with harness.writing(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for (episode, step), mode in STEPS.items():

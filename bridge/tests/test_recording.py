@@ -34,7 +34,6 @@ from bridge.replay import RecordedDrive, replay_in_process
 from bridge.tests.harness import (
     LEFT_TURN,
     SLOW_TOY,
-    BridgeProcess,
     bridge_status,
     chunks,
     flip,
@@ -43,9 +42,12 @@ from bridge.tests.harness import (
     make_policy,
     messages_of,
     read,
+    record_drive,
     rerun,
     start_edge,
+    start_record,
     start_simulate,
+    writing,
 )
 from bridge.tests.test_inbound import health
 from bridge.tests.test_replay import Hand
@@ -73,13 +75,6 @@ def told(stored: Stored) -> tuple[str, int, bytes]:
 
 def told_in(path: Path) -> list[tuple[str, int, bytes]]:
     return list(map(told, Recording(path).messages()))
-
-
-@contextlib.contextmanager
-def writing(path: Path, dropped: int = 0):
-    with contextlib.closing(RecordingWriter(path)) as writer:
-        yield writer
-        writer.finish(dropped)
 
 
 def test_the_picture_is_what_the_policy_saw(tmp_path):
@@ -135,13 +130,6 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     replay_in_process(drive, policy, Config())
 
 
-def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
-    run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
-    # A file is made before its first bytes are in it.
-    wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin")
-    return run
-
-
 def states_in(path: Path) -> list[tuple[int, Any]]:
     """Return the states of a recording with the times of their arrival (ns)."""
     found = [
@@ -155,16 +143,9 @@ def states_in(path: Path) -> list[tuple[int, Any]]:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    folder, endpoint = tmp_path_factory.mktemp("drive"), free_endpoint()
-    recording, out = folder / "drive.mcap", folder / "r.json"
-    with (
-        start_simulate(endpoint, out, SLOW_TOY) as run,
-        start_record(endpoint, recording) as recorder,
-        start_edge(endpoint, make_policy(folder)),
-    ):
-        assert run.wait() == 0, run.errors
-        assert recorder.wait(PATIENCE_S) == 0, recorder.errors
-    return recording, read(out)
+    folder = tmp_path_factory.mktemp("drive")
+    recording = record_drive(folder, SLOW_TOY, make_policy(folder))
+    return recording, read(folder / "report.json")
 
 
 def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):

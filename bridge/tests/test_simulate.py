@@ -25,6 +25,7 @@ from bridge.tests.harness import (
     make_command,
     make_policy,
     read,
+    record_drive,
     refused,
     rerun,
     simulate,
@@ -37,7 +38,6 @@ from bridge.tests.harness import (
 from bridge.virtual_link import NO_COMMAND, Decision
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import wait_until
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy, write_rover
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -234,21 +234,13 @@ def test_somebodys_robot_of_another_kind_is_served_recorded_replayed_and_shown(
     site, tmp_path, capsys
 ):
     """Several arrays, two wheels of -40 to 80, T of 0.2 s, no speed, and a picture by render()."""
-    endpoint, out, drive = free_endpoint(), tmp_path / "r.json", tmp_path / "drive.mcap"
-    policy = tmp_path / "rover.onnx"
-    write_rover(policy, task="somebody/Rover-v0", control_period_s=0.2)
+    policy, env = tmp_path / "rover.onnx", "somebody/Rover-v0"
+    write_rover(policy, task=env, control_period_s=0.2)
     path = {"PYTHONPATH": os.pathsep.join((str(site), os.environ.get("PYTHONPATH", "")))}
-    served = ("simulate", "--env", "somebody/Rover-v0", "--listen", endpoint, "--out", str(out))
-    with BridgeProcess(*served, environment=path) as run:
-        listening = ("record", "--out", str(drive), "--connect", endpoint, "--wait-s", "20")
-        with BridgeProcess(*listening) as record:
-            wait_until(drive.exists, "the recording")
-            with start_edge(endpoint, policy):
-                assert run.wait() == 0, run.errors
-            assert record.wait() == 0, record.errors
-    report = read(out)
+    drive = record_drive(tmp_path, env, policy, environment=path)
+    report = read(tmp_path / "report.json")
     (row,) = report["per_episode"]
-    assert (report["scenario"], report["success_rate"]) == ("somebody/Rover-v0", 1.0)
+    assert (report["scenario"], report["success_rate"]) == (env, 1.0)
     assert (row["steps"], row["time_s"]) == (20, 4.0)
     assert row["actions"][9] == pytest.approx([9.0, -9.0])  # ten times the ranges of step 9
     shown = tmp_path / "drive.rrd"

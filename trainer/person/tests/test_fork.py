@@ -1,6 +1,5 @@
 """A person drives on in a recorded drive: `trainer drive --from`, and what learns from it."""
 
-import contextlib
 import json
 import sys
 from pathlib import Path
@@ -11,11 +10,8 @@ import pytest
 
 from bridge import bisect
 from bridge.__main__ import main as bridge
-from bridge.environments import describe, make_environment
-from bridge.fork import ForkedDrive, RecordedEpisode, read_episode
-from bridge.messages import Origin
-from bridge.record import RecordingWriter
-from edge_runtime.policy import load_policy
+from bridge.fork import RecordedEpisode, read_episode
+from bridge.tests.harness import record_in_process
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import write_policy
 from trainer.__main__ import main as trainer
@@ -34,17 +30,9 @@ def recorded(tmp_path, monkeypatch, one_thread) -> RecordedEpisode:
     """A left turn with a constant pedal, as ``bridge record`` keeps it, where the test is."""
     monkeypatch.chdir(tmp_path)
     write_policy("policy.onnx", "constant", 0.2)
-    origin = Origin(
-        session="s", environment="left_turn", condition="variant", seed=3, standing=False,
-        clock="lockstep", loop="policy", latency="50ms",
-    )  # fmt: skip
-    environment = make_environment("left_turn", "variant")
-    begun = RecordedEpisode(Path(), "v", 0, origin, 0, describe(environment), began_ns=0)
-    with contextlib.closing(RecordingWriter(Path("drive.mcap"))) as out:
-        policy = load_policy("policy.onnx", None, allow_unsigned=True)
-        ForkedDrive(begun, environment, 0, policy, out=out).run()
-        out.finish(dropped=0)
-    return read_episode(Path("drive.mcap"), None, None)
+    drive = Path("drive.mcap")
+    record_in_process(drive, "left_turn", Path("policy.onnx"), 3, "50ms", "variant")
+    return read_episode(drive, None, None)
 
 
 def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
