@@ -17,8 +17,8 @@ import numpy as np
 import onnx
 import pytest
 
-from bridge.bisect import first_change
 from bridge.environments import describe, make_environment
+from bridge.fork import first_change
 from bridge.policy_file import make_policy as make_any_policy
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.tests.harness import (

@@ -18,8 +18,8 @@ from edge_runtime.tests.policies import STEERING, TASK, T
 from edge_runtime.wire import Health, encode
 
 
-def checking():
-    check = inbound.CommandCheck("here", TASK)
+def checking(task=TASK):
+    check = inbound.CommandCheck("here", task)
     check.begin(0)
     check.sent(5)
     return check
@@ -121,10 +121,7 @@ def test_a_plan_is_played_period_by_period_and_no_longer_than_it_says(plan, now_
 
 
 def test_a_plan_may_last_a_second_whatever_the_period():
-    task = msgspec.structs.replace(TASK, control_period_s=0.3)
-    check = inbound.CommandCheck("here", task)
-    check.begin(0)
-    check.sent(5)
+    check = checking(msgspec.structs.replace(TASK, control_period_s=0.3))
     taken = [check.read(encode(make_command(5, plan=[[0.1]] * n))) is not None for n in (3, 4)]
     assert (taken, dict(check.rejected)) == ([True, False], {"plan_too_long": 1})
 

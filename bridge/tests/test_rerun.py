@@ -56,6 +56,8 @@ def test_episodes_stand_end_to_end():
     steps = [timeline.place("a", *place)[1] for place in places]
     assert steps == [0, 7, 8, 5]
     assert timeline.place("a", 1, 2) == ("episode_1", 10)
+    # A second session is not drawn over the first.
+    assert timeline.place("b", 0, 0) == ("episode_0_of_session_2", 11)
 
 
 def test_a_scene_without_an_origin_stands_where_its_state_does():
@@ -67,12 +69,6 @@ def test_a_scene_without_an_origin_stands_where_its_state_does():
     times = [one.args[:1] + tuple(one.kwargs.values()) for one in recording.set_time.call_args_list]
     here = [("sim_time", 9 * period_s), ("step", 9), ("episode_0", 9 * period_s)]
     assert times == here * 2
-
-
-def test_a_second_session_is_not_drawn_over_the_first():
-    timeline = Timeline()
-    timeline.place("a", 0, 7)
-    assert timeline.place("b", 0, 0) == ("episode_0_of_session_2", 8)
 
 
 def test_a_scene_is_read_without_what_is_not_drawn():
@@ -221,19 +217,26 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
     assert list(tmp_path.glob(".drive*")) == []
 
 
-def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
-    log = WireLog(rr.RecordingStream("test"))
-    events = []
-    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+@pytest.fixture
+def log():
+    return WireLog(rr.RecordingStream("test"))
+
+
+@pytest.fixture
+def events(monkeypatch):
+    told: list[str] = []
+    monkeypatch.setattr(WireLog, "_event", lambda _, text, *__: told.append(text))
+    return told
+
+
+def test_a_late_viewer_does_not_call_it_silence(log, events):
     log.write_state(make_state(50), 10**18)
     assert events == []
     log.write_state(make_state(53), 10**18 + 3 * 10**8)
     assert events == ["no command: the simulator brakes by itself"]
 
 
-def test_a_ride_is_shown_and_no_silence(kept, monkeypatch):
-    log, events = WireLog(rr.RecordingStream("test")), []
-    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+def test_a_ride_is_shown_and_no_silence(log, events):
     log.write_state(make_state(7), 10**18)
     log.write_command(harness.make_command(7, plan=[[0.1]] * 5), 10**18)
     for step, ridden in ((8, 0), (9, 1), (10, 2)):
@@ -270,8 +273,7 @@ def make_scene(**fields):
     return messages.Scene(episode=0, step=9, sim_time_s=0.9, **fields)
 
 
-def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
-    log = WireLog(rr.RecordingStream("test"))
+def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(log, kept):
     ms = 10**6
     for step in (3, 4):
         sent_ns = 10**18 + step * 100 * ms
@@ -291,9 +293,7 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
     assert kept["latency/downlink"] == pytest.approx([60.0 - 26.0])
 
 
-def test_rejections_are_counted_by_side_and_reason(kept, monkeypatch):
-    log, events = WireLog(rr.RecordingStream("test")), []
-    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+def test_rejections_are_counted_by_side_and_reason(log, kept, events):
     for count in (0, 2, 5):
         log.write_scene(make_scene(rejected={"stale": count}), 10**18)
         log.write_health(msgspec.structs.replace(HEALTH, rejected={"stale": count}), 10**18)
@@ -311,8 +311,7 @@ def test_rejections_are_counted_by_side_and_reason(kept, monkeypatch):
     ("link", "envelope"),
     [({"x": 1.0}, {"y": 1.0}), ({"y": 1.0}, {"y": 1.0}), ({"y": 1.0, "load": 1.0}, {"y": 0.0})],
 )
-def test_the_link_of_a_stranger_is_not_drawn(kept, link, envelope):
-    log = WireLog(rr.RecordingStream("test"))
+def test_the_link_of_a_stranger_is_not_drawn(log, kept, link, envelope):
     log.write_health(msgspec.structs.replace(HEALTH, link=link, envelope=envelope), 10**18)
     assert not [path for path in kept if path.startswith("link/")]
 

@@ -219,24 +219,17 @@ def register():
 """
 
 
-@pytest.fixture
-def site(tmp_path):
-    """A folder as pip leaves it: the module, and the entry point in the package's metadata."""
+def test_somebodys_robot_of_another_kind_is_served_recorded_replayed_and_shown(tmp_path, capsys):
+    """Several arrays, two wheels of -40 to 80, T of 0.2 s, no speed, and a picture by render()."""
+    # A folder as pip leaves it: the module, and the entry point in the package's metadata.
     (tmp_path / "somebodys_envs.py").write_text(MODULE)
     about = tmp_path / "somebodys_envs-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: somebodys-envs\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[gymnasium.envs]\nsomebody=somebodys_envs:register\n")
-    return tmp_path
-
-
-def test_somebodys_robot_of_another_kind_is_served_recorded_replayed_and_shown(
-    site, tmp_path, capsys
-):
-    """Several arrays, two wheels of -40 to 80, T of 0.2 s, no speed, and a picture by render()."""
     policy, env = tmp_path / "rover.onnx", "somebody/Rover-v0"
     write_rover(policy, task=env, control_period_s=0.2)
-    path = {"PYTHONPATH": os.pathsep.join((str(site), os.environ.get("PYTHONPATH", "")))}
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))}
     drive = record_drive(tmp_path, env, policy, environment=path)
     report = read(tmp_path / "report.json")
     (row,) = report["per_episode"]
@@ -298,23 +291,17 @@ def run(environment, clock, standing=False):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("action_names", ["a", "b"], "action_names has 2 entries, not 1"),
-        ("brake_action", np.zeros(3), "brake_action has 3 entries, not 1"),
-        ("car", {"throttle_mps2": 3.0}, "its car is not valid: .*brake_mps2"),
+        ("action_names", ["a", "b"], ": action_names has 2 entries, not 1"),
+        ("brake_action", np.zeros(3), ": brake_action has 3 entries, not 1"),
+        ("car", {"throttle_mps2": 3.0}, ": its car is not valid: .*brake_mps2"),
+        # Names that a policy cannot use
+        *(("observation_name", entry, f" observes {entry!r}: ") for entry in ("action", "0", "")),
     ],
 )
 def test_what_an_environment_says_wrongly_of_itself_is_one_line(monkeypatch, name, value, words):
     made = make_environment(TOY)
     monkeypatch.setattr(made.unwrapped, name, value, raising=False)
-    with pytest.raises(UserError, match=f"^environment 'left_turn': {words}"):
-        describe(made)
-
-
-@pytest.mark.parametrize("entry", ["action", "0", ""])
-def test_a_name_that_a_policy_cannot_use_is_refused(monkeypatch, entry):
-    made = make_environment(TOY)
-    monkeypatch.setattr(made.unwrapped, "observation_name", entry)
-    with pytest.raises(UserError, match=f"^environment 'left_turn' observes {entry!r}: "):
+    with pytest.raises(UserError, match=f"^environment 'left_turn'{words}"):
         describe(made)
 
 

@@ -127,13 +127,11 @@ class KeyboardHands:
         self._tapped.clear()
         since_s = PERIOD_S if self._read_s is None else min(now_s - self._read_s, PERIOD_S)
         self._read_s = now_s
-        keys, rest = self._controls.keys, self._controls.rest
-        driving = held & keys.keys()
+        rest, driving = self._controls.rest, held & self._controls.keys.keys()
         if not driving and "space" not in held:
             self._pressed = 0.0
             return Reading(rest)
-        pressing = sum((np.array(keys[key]) for key in driving), np.zeros(np.size(rest)))
-        target = np.clip(pressing, np.subtract(-1.0, rest), np.subtract(1.0, rest))
+        target = np.subtract(self._controls.mix(dict.fromkeys(driving, 1.0)), rest)
         # The other direction begins at once, from rest.
         pressed = np.where(target * self._pressed < 0.0, 0.0, self._pressed)
         step = self._controls.rate_per_s * since_s
@@ -216,9 +214,8 @@ class Window:
                 pygame.joystick.init()
                 pygame.font.init()
                 width, height = pygame.display.get_desktop_sizes()[0]
-                size = _fitted(
-                    min(SCREEN_SHARE * width, SIZE[0]), min(SCREEN_SHARE * height, SIZE[1])
-                )
+                room = min(SCREEN_SHARE * width, SIZE[0]), min(SCREEN_SHARE * height, SIZE[1])
+                size = _fitted(SIZE, room)
                 self._window = pygame.display.set_mode(size, pygame.RESIZABLE)
         except pygame.error as error:
             pygame.quit()
@@ -264,7 +261,7 @@ class Window:
             colour = "text" if row < len(self.help) else "dim"
             self._text(line, (MARGIN, 588 + 21 * row), colour)
         room = self._window.get_size()
-        size = _fitted(*room)
+        size = _fitted(SIZE, room)
         drawn = self._screen
         if size != SIZE:
             drawn = pygame.transform.smoothscale(drawn, size)
@@ -279,12 +276,11 @@ class Window:
     def _scene(self, view: View) -> None:
         """The road from above, or what the environment draws."""
         if view.scene is not None:
-            self._blit(draw_scene(view.scene, ego=COLOURS[view.control]), (0, 0))
+            shown = draw_scene(view.scene, ego=COLOURS[view.control])
+            self._screen.blit(_surface(shown), (0, 0))
         elif view.picture is not None:
-            height, width = view.picture.shape[:2]
-            scale = min(SCENE_SIZE[0] / width, SCENE_SIZE[1] / height)
-            surface = pygame.image.frombuffer(view.picture.tobytes(), (width, height), "RGB")
-            size = int(scale * width), int(scale * height)
+            surface = _surface(view.picture)
+            size = _fitted(surface.get_size(), SCENE_SIZE)
             self._screen.blit(pygame.transform.smoothscale(surface, size), (0, 0))
 
     def _frames(self, view: View) -> None:
@@ -296,7 +292,7 @@ class Window:
             large = np.repeat(np.repeat(frame, FRAME_SCALE, axis=0), FRAME_SCALE, axis=1)
             left = MARGIN + place * (large.shape[1] + MARGIN)
             self._text(f"the policy sees, {when}", (left, top - 20), "dim")
-            self._blit(np.repeat(large[:, :, None], 3, axis=2), (left, top))
+            self._screen.blit(_surface(np.repeat(large[:, :, None], 3, axis=2)), (left, top))
 
     def _state(self, view: View) -> None:
         """The right column: who is in control, and how the drive is going."""
@@ -395,17 +391,17 @@ class Window:
         x, y = place
         self._screen.blit(drawn, (x - drawn.get_width() if right else x, y))
 
-    def _blit(self, picture: NDArray[np.uint8], place: tuple[int, int]) -> None:
-        """Put a picture uint8 [height, width, 3] on the screen."""
-        height, width = picture.shape[:2]
-        surface: Any = pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
-        self._screen.blit(surface, place)
+
+def _surface(picture: NDArray[np.uint8]) -> Any:
+    """A picture uint8 [height, width, 3] as pygame has it."""
+    height, width = picture.shape[:2]
+    return pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
 
 
-def _fitted(width: float, height: float) -> tuple[int, int]:
-    """The largest size of the picture's shape that fits."""
-    scale = min(width / SIZE[0], height / SIZE[1])
-    return max(int(SIZE[0] * scale), 1), max(int(SIZE[1] * scale), 1)
+def _fitted(shape: tuple[int, int], room: tuple[float, float]) -> tuple[int, int]:
+    """The largest size of that shape that fits into the room; both are width and height."""
+    scale = min(room[0] / shape[0], room[1] / shape[1])
+    return max(int(shape[0] * scale), 1), max(int(shape[1] * scale), 1)
 
 
 @contextmanager

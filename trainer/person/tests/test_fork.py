@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bridge import bisect
+from bridge import fork
 from bridge.__main__ import main as bridge
 from bridge.fork import RecordedEpisode, read_episode
 from bridge.tests.harness import record_in_process
@@ -88,7 +88,7 @@ def test_a_planted_snapshot_of_a_run_is_found_by_bisection(recorded, capsys, mon
         assert words[:3] == [sys.executable, "-m", "trainer"]
         return SimpleNamespace(returncode=exit_status(trainer, words[3:]), stderr="")
 
-    monkeypatch.setattr(bisect.subprocess, "run", in_this_process)
+    monkeypatch.setattr(fork.subprocess, "run", in_this_process)
     words = ["bisect", "drive.mcap", "--at", "1s", "--runs", "run", "--out", "found.json"]
     assert exit_status(bridge, words) == 0
     found = json.loads(Path("found.json").read_text())
