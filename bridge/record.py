@@ -199,8 +199,9 @@ class RecordingWriter:
         self.messages = 0
         self._copies = ViewerCopies(self._add_copy)
         self._file, self._mcap = new_recording_at(path)
-        self._channels: dict[tuple[str, int], int] = {}
-        self._schema_ids: dict[str, int] = {}
+        # Each is registered once; with its schema, as a picture may have the name of a message.
+        self._channel = functools.cache(self._mcap.register_channel)
+        self._schema = functools.cache(self._mcap.register_schema)
         self._counts: Counter[str] = Counter()
 
     def write(self, heard: Heard, with_view: bool = True) -> None:
@@ -232,17 +233,13 @@ class RecordingWriter:
         close_torn(self._file)
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
-        if schema.name not in self._schema_ids:
-            schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
-            self._schema_ids[schema.name] = schema_id
-        self._add(topic, "protobuf", now_ns, data, self._schema_ids[schema.name])
+        schema_id = self._schema(schema.name, "protobuf", schema.descriptors)
+        self._add(topic, "protobuf", now_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
-        kind = topic, schema_id  # A picture may have the name of a message.
-        if kind not in self._channels:
-            self._channels[kind] = self._mcap.register_channel(topic, encoding, schema_id)
+        channel_id = self._channel(topic, encoding, schema_id)
         self._counts[topic] += 1
-        self._mcap.add_message(self._channels[kind], now_ns, data, now_ns, self._counts[topic])
+        self._mcap.add_message(channel_id, now_ns, data, now_ns, self._counts[topic])
 
 
 def _vehicle_id(heard: Heard) -> str:
@@ -471,19 +468,14 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
     """Copy every message into a new recording, held in memory."""
     stream = io.BytesIO()
     writer = start_mcap(stream)
-    schemas: dict[int, int] = {}
-    channels: dict[int, int] = {}
+    channel_of = functools.cache(writer.register_channel)
+    schema_of = functools.cache(writer.register_schema)
     messages = 0
     for channel, schema, message in recording.messages():
-        if schema is not None and schema.id not in schemas:
-            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        if channel.id not in channels:
-            kind = (channel.message_encoding, schemas.get(channel.schema_id, 0))
-            channels[channel.id] = writer.register_channel(channel.topic, *kind)
-        writer.add_message(
-            channels[channel.id], message.log_time, message.data, message.publish_time,
-            message.sequence,
-        )  # fmt: skip
+        schema_id = 0 if schema is None else schema_of(schema.name, schema.encoding, schema.data)
+        channel_id = channel_of(channel.topic, channel.message_encoding, schema_id)
+        stamps = message.publish_time, message.sequence
+        writer.add_message(channel_id, message.log_time, message.data, *stamps)
         messages += 1
     if recording.metadata:
         writer.add_metadata(METADATA, recording.metadata)

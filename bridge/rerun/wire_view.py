@@ -6,6 +6,7 @@ Or, live, in Foxglove: the copies that `bridge record` makes for viewers, as a W
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -121,14 +122,16 @@ def _drawn(sink: str) -> Iterator[Callable[[Heard], None]]:
 @contextlib.contextmanager
 def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
     """What shows a message in Foxglove; UserError where nothing can be served at the port."""
-    context, channels = foxglove.Context(), dict[str, Any]()
+    context = foxglove.Context()
+
+    @functools.cache
+    def channel(topic: str, schema: Schema) -> Any:
+        told = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.descriptors)
+        kind: Any = {"message_encoding": "protobuf", "schema": told, "context": context}
+        return foxglove.Channel(topic, **kind)
 
     def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
-        if topic not in channels:
-            told = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.descriptors)
-            kind: Any = {"message_encoding": "protobuf", "schema": told, "context": context}
-            channels[topic] = foxglove.Channel(topic, **kind)
-        channels[topic].log(data, log_time=now_ns)
+        channel(topic, schema).log(data, log_time=now_ns)
 
     try:
         server = foxglove.start_server(name="phil", host=LOOPBACK, port=port, context=context)
