@@ -17,7 +17,6 @@ from edge_runtime.manifest import Entry, Task, check_task
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_STATE_BYTES
 
-WIRE_TOPICS = ("state", "command", "feedback", "health", "scene")
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
 

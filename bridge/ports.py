@@ -24,7 +24,7 @@ import zenoh
 
 from bridge.environments import picture_of, scene_of
 from bridge.inbound import EdgeCounts
-from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Scene, encode_scene
+from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
 from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
@@ -251,7 +251,7 @@ def open_listener(
                 f"phil/{vehicle_id}/{topic}",
                 zenoh.handlers.Callback(listener.hear, indirect=False),
             )
-            for topic in WIRE_TOPICS
+            for topic in DECODERS
         ]
         for topic in TOKEN_TOPICS:
             token, watch = f"phil/{vehicle_id}/{topic}", listener.watch

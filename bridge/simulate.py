@@ -33,7 +33,7 @@ from edge_runtime.cli import (
     sigterm_as_interrupt,
 )
 from edge_runtime.files import write_json_out
-from edge_runtime.manifest import Manifest, Task
+from edge_runtime.manifest import Task
 from edge_runtime.run import rearm_command
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT
@@ -103,11 +103,10 @@ def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
             bar.show("waiting for an edge runtime")
             port.hear("command", clock.receive)
             port.wait_for_edge(wait_s, endpoint)
-            manifest = port.edge_manifest()
             if isinstance(clock, VehicleClock):
                 port.hear("feedback", clock.receive_feedback)
                 clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-            return _drive(asked, environment, port, clock, bar, task, manifest)
+            return _drive(asked, environment, port, clock, bar, task)
 
 
 def _drive(
@@ -117,11 +116,10 @@ def _drive(
     clock: Clock,
     bar: ProgressBar,
     task: Task,
-    manifest: Manifest | None,
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
-    network = str(asked.latency)
+    network, manifest = str(asked.latency), port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
     rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)

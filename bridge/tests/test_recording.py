@@ -26,7 +26,7 @@ from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
 from bridge import recording as records
-from bridge.messages import WIRE_TOPICS, Heard, Scene, encode_scene
+from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import RawImage, RecordingWriter, _listen, describe
 from bridge.recording import Recording, Stored
@@ -120,7 +120,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
             payload = bytearray(good[number % len(good)])
             for _ in range(number // 1000):
                 payload[random.integers(len(payload))] = random.integers(256)
-            topic = WIRE_TOPICS[(number // len(good)) % len(WIRE_TOPICS)]
+            topic = list(DECODERS)[(number // len(good)) % len(DECODERS)]
             writer.write(heard(topic, bytes(payload), arrived_ns=number))
     raw = [stored for stored in Recording(tmp_path / "a.mcap").messages() if stored.schema is None]
     assert len(raw) == 3000

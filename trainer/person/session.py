@@ -279,7 +279,11 @@ class Sitting:
         self._write_last_step()
         told = DISCARDED if self._discard else outcome
         self.cost["failures"] += failed(told)
-        self._tell_coach(told)
+        period_s = self.env.control_period_s
+        driven_s = self._human_steps * period_s
+        since_s = (self._number - self._taken_over_at) * period_s
+        episode = Episode(self.episode, told, driven_s, self._interventions, since_s)
+        self.coach.episodes.append(episode)
         if self._discard:
             self.discarded += 1
             return DISCARDED
@@ -321,15 +325,6 @@ class Sitting:
             "control": self._applied.control,
             "speed_mps": float(self._info["speed_mps"]),
         }
-
-    def _tell_coach(self, outcome: str) -> None:
-        """Tell how the episode ended."""
-        period_s = self.env.control_period_s
-        driven_s, since_s = (
-            steps * period_s for steps in (self._human_steps, self._number - self._taken_over_at)
-        )
-        episode = Episode(self.episode, outcome, driven_s, self._interventions, since_s)
-        self.coach.episodes.append(episode)
 
     def quit(self) -> bool:
         """Ask for the end of the sitting; False where it is over already."""

@@ -27,6 +27,11 @@ pytestmark = pytest.mark.usefixtures("opened")
 
 TWO_HEARTBEATS = "new Promise((done) => setTimeout(done, 200))"
 YOU = "document.querySelector('.bar.human output').textContent"
+COLOURS_IN = (
+    "new Set(new Uint32Array({0}.getContext('2d')"
+    ".getImageData(0, 0, {0}.width, {0}.height).data.buffer)).size"
+)
+"""How many colours a canvas shows."""
 LEVEL = "document.getElementById('pad').className === 'level'"
 
 
@@ -212,11 +217,7 @@ async def test_what_is_shown_is_drawn(browser, cockpit):
         ".getImageData(0, 0, 80, 45).data].filter((_, i) => i % 4 === 0)"
     )
     assert await browser.evaluate(pixel) == view.frames[1].ravel().tolist()
-    colours = (
-        "new Set(new Uint32Array(scene.getContext('2d')"
-        ".getImageData(0, 0, scene.width, scene.height).data.buffer)).size"
-    )
-    assert await browser.evaluate(colours) > 10
+    assert await browser.evaluate(COLOURS_IN.format("scene")) > 10
 
 
 async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpit):
@@ -231,11 +232,7 @@ async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpi
     newest, older = (await browser.inner_text("#episodes")).splitlines()[1:]
     assert newest.split() == ["7", "goal", "2.3", "1"]
     assert older.split() == ["6", "collision", "0.0", "0"]
-    colours = (
-        "new Set(new Uint32Array(curve.getContext('2d')"
-        ".getImageData(0, 0, curve.width, curve.height).data.buffer)).size"
-    )
-    assert await browser.evaluate(colours) > 5
+    assert await browser.evaluate(COLOURS_IN.format("curve")) > 5
     cockpit.show(first_view())
     await until(browser, "document.getElementById('coach').hidden")
     assert await browser.is_hidden("#advice")
