@@ -67,8 +67,10 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
     if not _NAME.fullmatch(name):
         raise UserError(f"{name!r} names no environment; {hint()}")
     try:
-        environment_id = _id_of(name)
-        load_plugin(environment_id)
+        words = importlib.metadata.entry_points(group=SCENARIO_GROUP, name=name)
+        # To load a scenario's word imports the module that registers it.
+        environment_id = next((str(one.load()) for one in words), name)
+        _load_plugin(environment_id)
         options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
         modes = _metadata(environment_id).get("render_modes") or ()
         if RENDERED in modes:
@@ -117,13 +119,6 @@ def _make_quietly(environment_id: str, **options: Any) -> Environment:
         gymnasium.logger.min_level = level
 
 
-def _id_of(name: str) -> str:
-    """The gymnasium id that a name stands for; the module that registers it is imported."""
-    for one in importlib.metadata.entry_points(group=SCENARIO_GROUP, name=name):
-        return str(one.load())
-    return name
-
-
 def _metadata(environment_id: str) -> dict[str, Any]:
     """What the environment's class says of itself, before one is made."""
     module, _, plain_id = environment_id.rpartition(":")
@@ -139,7 +134,7 @@ def _metadata(environment_id: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}  # A wrapper's is a property of each object.
 
 
-def load_plugin(environment_id: str) -> None:
+def _load_plugin(environment_id: str) -> None:
     """Let an installed package register the id, as Gymnasium did by itself before 1.0.
 
     Such a package declares an entry point of the group ``gymnasium.envs``: its name is the

@@ -107,9 +107,14 @@ class Scene(SeenScene, frozen=True, kw_only=True):
 
 STAMPS = tuple(n for n in Scene.__struct_fields__ if n not in SeenScene.__struct_fields__)
 """What of a scene the simulator adds to the environment's own ``scene()``."""
-_ENCODER = msgspec.msgpack.Encoder(
-    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-)
+
+
+def plain(value: Any) -> Any:
+    """What msgspec asks for where it cannot encode: NumPy's arrays and numbers as Python's."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=plain)
 _DECODER = msgspec.msgpack.Decoder(Scene)
 
 

@@ -76,7 +76,7 @@ def _run(arguments: argparse.Namespace) -> int:
         try:
             data = make_policy(model, task, arguments.algorithm, training, envelope)
             policy = open_policy(data, UNSIGNED)
-            low, high = drive(policy, environment, REAL_OBSERVATIONS)
+            low, high = _drive(policy, environment)
         except UserError as error:
             raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
     finally:
@@ -168,23 +168,21 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
             names[:] = [swap.get(name, name) for name in names]
 
 
-def drive(
-    policy: Policy, environment: Environment, steps: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """The least and largest actions, float [n], in that many steps of the environment.
+def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.ndarray]:
+    """The least and largest actions, float [n], in REAL_OBSERVATIONS steps of the environment.
 
     Every other episode is driven by random actions: a policy that stands sees little.
     Raises UserError for an action that the environment cannot take.
     """
     actions: list[np.ndarray] = []
     space: Any = environment.action_space
-    space.seed(seed)
+    space.seed(0)
     actuators = Actuators(environment, policy.manifest.action)
     episode, over = 0, True
     seen: Any = None
-    while len(actions) < steps:
+    while len(actions) < REAL_OBSERVATIONS:
         if over:
-            seen, _ = environment.reset(seed=seed + episode)
+            seen, _ = environment.reset(seed=episode)
             episode += 1
         packed = pack(policy.layout, environment, seen)
         try:

@@ -261,8 +261,8 @@ class RecordedDrive:
             self.policy_ids.append(command.policy_id)
         self.plan_periods = max(self.plan_periods, len(command.plan or ()))
         sent_s = self._sent_s(command, heard_s)
-        key = (command.session, command.episode, command.step)
-        exchange = self.exchanges.setdefault(key, _first_exchange(command, sent_s, self.period_s))
+        first = _first_exchange(command, sent_s, self.period_s)
+        exchange = self.exchanges.setdefault(key_of(command), first)
         exchange.last_s = sent_s
         note(exchange.answers, command)
 
@@ -288,9 +288,9 @@ def note(answers: list[Answer], decision: Command | Order) -> None:
         answers.append(answer)
 
 
-def key_of(state: State) -> Key:
+def key_of(message: State | Command) -> Key:
     """Return what a state and its command have in common."""
-    return state.session, state.episode, state.step
+    return message.session, message.episode, message.step
 
 
 def _first_exchange(command: Command, sent_s: float, period_s: float) -> Exchange:

@@ -14,8 +14,9 @@ from bridge.tests.harness import make_command, make_feedback
 from bridge.tests.toy import ToyEnv
 from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.manifest import Action
+from edge_runtime.tests.harness import HEALTH
 from edge_runtime.tests.policies import STEERING, TASK, T
-from edge_runtime.wire import Health, encode
+from edge_runtime.wire import encode
 
 
 def checking(task=TASK):
@@ -295,11 +296,8 @@ def test_a_steered_car_brakes_when_its_vehicle_does():
 
 
 def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
-    return Health(
-        vehicle_id="v", vehicle=vehicle, mode="drive", reason="", needs_rearm=needs_rearm,
-        accepted=1, superseded=0, rejected=rejected, deadline_misses=0, safe_stops=0, policy_id="p",
-        inference_ms={}, uptime_s=uptime_s, sent_ns=sent_ns,
-    )  # fmt: skip
+    what = {"vehicle": vehicle, "needs_rearm": needs_rearm, "rejected": rejected}
+    return msgspec.structs.replace(HEALTH, sent_ns=sent_ns, uptime_s=uptime_s, **what)
 
 
 @pytest.mark.parametrize(

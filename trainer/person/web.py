@@ -24,12 +24,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
-import numpy as np
 import segno
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 from PIL import Image
 
+from bridge.messages import plain
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.controls import controls_of, keyboard_of
@@ -64,9 +64,7 @@ HEADERS_S = 5.0  # A connection must show the token within this time
 BACKLOG = 16
 """Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 INPUT = msgspec.json.Decoder(Input)
-_ENCODER = msgspec.json.Encoder(
-    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-)
+_ENCODER = msgspec.json.Encoder(enc_hook=plain)
 
 
 @LOGGER.addFilter
