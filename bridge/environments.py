@@ -248,12 +248,9 @@ def known_stops(environment: Environment) -> list[float | None] | None:
 
 
 def _period_s(own: Any, name: str, period_s: float | None) -> float:
-    found = getattr(own, "control_period_s", None)
-    frames_per_s = own.metadata.get("render_fps")
-    if found is None and frames_per_s:
-        found = 1.0 / frames_per_s
+    found, frames_per_s = getattr(own, "control_period_s", None), own.metadata.get("render_fps")
     if found is None:
-        found = period_s
+        found = 1.0 / frames_per_s if frames_per_s else period_s
     if found is None:
         raise UserError(f"environment {name!r} does not say how long a step is; give it --period")
     return float(found)

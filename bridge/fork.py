@@ -35,7 +35,7 @@ from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
 from bridge.inbound import CommandCheck
-from bridge.messages import DECODERS, STAMPS, Heard, Origin, Scene, encode_scene
+from bridge.messages import DECODERS, ENCODER, STAMPS, Heard, Origin, Scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.progress import ProgressBar
@@ -52,8 +52,6 @@ from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
-
-NOWHERE = Scene(episode=0, step=0, sim_time_s=0.0)
 
 
 def _told(payload: bytes) -> bytes:
@@ -141,7 +139,7 @@ class RecordedEpisode:
                 if state.observation.get(name) != data:
                     return f"the observation {name!r}"
         known, scene = self.scenes.get(step), scene_of(environment)
-        if known is None or scene is None or _told(encode_scene(scene, NOWHERE)) == known:
+        if known is None or scene is None or ENCODER.encode(scene) == known:
             return ""
         return "the scene"
 

@@ -114,18 +114,18 @@ def plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=plain)
+ENCODER = msgspec.msgpack.Encoder(enc_hook=plain)  # Of an environment's own ``scene()``, too
 _DECODER = msgspec.msgpack.Decoder(Scene)
 
 
 def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
     """Encode an environment's ``scene()`` with the STAMPS of another as a MessagePack map."""
-    return _ENCODER.encode({**scene, **{name: getattr(stamps, name) for name in STAMPS}})
+    return ENCODER.encode({**scene, **{name: getattr(stamps, name) for name in STAMPS}})
 
 
 def read_scene(scene: Mapping[str, Any]) -> SeenScene:
     """An environment's ``scene()`` as what is drawn; what is not drawn is left out."""
-    return msgspec.msgpack.decode(_ENCODER.encode(scene), type=SeenScene)
+    return msgspec.msgpack.decode(ENCODER.encode(scene), type=SeenScene)
 
 
 def period_of(state: wire.State) -> float:
