@@ -293,7 +293,7 @@ class VehicleClock(RealTimeClock):
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
         self._action_names = [row.name for row in task.action]
-        self.feedback_check = FeedbackCheck(check.session, task)
+        self.feedback_check = FeedbackCheck(check, task)
         super().__init__(publish, check, spec, task)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -353,14 +353,8 @@ class VehicleClock(RealTimeClock):
     def finish(self, state: State) -> None:
         """Publish the final state at once; the vehicle is to stop."""
         with self._arrived:
-            self.feedback_check.sent(state.episode, state.step)
             self.tracking.end()
         super().finish(state)
-
-    def _send_state(self, state: State) -> float:
-        with self._arrived:
-            self.feedback_check.sent(state.episode, state.step)
-        return super()._send_state(state)
 
     def _admitted(self, command: Command) -> None:
         self.tracking.command(command)

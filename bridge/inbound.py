@@ -43,8 +43,7 @@ class CommandCheck:
         self.rejected: Counter[str] = Counter()
         self.policy_ids: list[str] = []
         self._actions, self._period_s = task.action, task.control_period_s
-        self._episode = 0
-        self._newest_step = -1
+        self.newest = (0, -1)  # Episode and step of the newest state that was sent
         self._ended = (-1, -1)
         self._stamps: deque[int] = deque(maxlen=64)  # Of commands: a copy is no second one.
         self.heard: dict[str, int] = {}
@@ -52,19 +51,19 @@ class CommandCheck:
 
     def begin(self, episode: int) -> None:
         """Note that an episode begins: whatever answers an earlier one is stale from now on."""
-        self._episode, self._newest_step = episode, -1
+        self.newest = (episode, -1)
 
     def sent(self, step: int) -> None:
         """Note that a state has been sent, so that its answer can be told from an invention."""
-        self._newest_step = step
+        self.newest = (self.newest[0], step)
 
     def end(self, final_step: int, answered_step: int) -> None:
         """Note that the episode has ended, and up to which step its states were answered.
 
         The answers to those after it are still on their way, and come too late without a fault.
         """
-        self._newest_step = final_step
-        self._ended = (self._episode, answered_step)
+        self.sent(final_step)
+        self._ended = (self.newest[0], answered_step)
 
     def read(self, payload: bytes, now_ns: int = 0) -> Command | None:
         """Return the command if it answers a state of this episode; None otherwise.
@@ -108,9 +107,9 @@ class CommandCheck:
                 return fault
         if len(plan) * self._period_s > MAX_RIDE_S + ROUNDING_S:
             return "plan_too_long"  # It would keep the vehicle going for longer than any may
-        if (command.episode, command.step) > (self._episode, self._newest_step):
+        if (command.episode, command.step) > self.newest:
             return "unknown_step"  # It answers a state never sent
-        if command.episode < self._episode and not self._overtaken(command):
+        if command.episode < self.newest[0] and not self._overtaken(command):
             return Reason.STALE.value
         return ""
 
@@ -141,28 +140,23 @@ NOT_COMMANDED = ""
 
 
 class FeedbackCheck:
-    """Reads feedback for one simulator session and keeps the counts of the whole run.
+    """Reads feedback for the session of ``commands`` and keeps the counts of the whole run.
 
     Another simulator's session is no fault before the vehicle has heard of this one, but is not
     believed either. Its stamps say which feedback is the newest; after 2 T without any, order
     begins anew: another board, with another clock, may have taken over.
     """
 
-    def __init__(self, session: str, task: Task) -> None:
+    def __init__(self, commands: CommandCheck, task: Task) -> None:
         self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
         """The last that could be read, of whatever session: it tells that a vehicle is there."""
         self.heard_s = 0.0
-        self._session = session
+        self._commands = commands
         self._actions, self._silence_s = task.action, SILENCE_PERIODS * task.control_period_s
-        self._sent = (-1, -1)
         self._met = False
         self._newest: Feedback | None = None
         self._newest_s = self._received_s = 0.0
-
-    def sent(self, episode: int, step: int) -> None:
-        """Note that a state has been sent."""
-        self._sent = (episode, step)
 
     def read(
         self, payload: bytes, now_s: float, received_s: float | None = None
@@ -177,14 +171,14 @@ class FeedbackCheck:
             self.rejected[feedback.reason.value] += 1
             return None
         self.heard, self.heard_s = feedback, now_s
-        own = feedback.session in (self._session, NOT_COMMANDED)
+        own = feedback.session in (self._commands.session, NOT_COMMANDED)
         if not own and not self._met:
             return None
         fault = self._fault(feedback, now_s) if own else Reason.FOREIGN_SESSION.value
         if fault:
             self.rejected[fault] += 1
             return None
-        self._met = self._met or feedback.session == self._session
+        self._met = self._met or feedback.session == self._commands.session
         self._newest, self._newest_s = feedback, now_s
         self._received_s = now_s if received_s is None else received_s
         return feedback
@@ -220,7 +214,7 @@ class FeedbackCheck:
         """Why a well-formed feedback of this session is not believed; empty if it is."""
         if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
             return fault
-        if (feedback.episode, feedback.step) > self._sent:
+        if (feedback.episode, feedback.step) > self._commands.newest:
             return "unknown_step"  # It answers a state never sent
         newest = self._newest
         if newest is None:

@@ -246,7 +246,6 @@ class WireLog:
         """From the sending of a state to that of its command, by the stamps of both."""
         self._split: Place | None = None
         """The state whose round trip was drawn in its parts last."""
-        self._edge_counts: dict[str, int] = {}
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode: tuple[str, int] | None = None
         self._health: Health | None = None
@@ -319,11 +318,11 @@ class WireLog:
         needed = {"load", "up_ms", "down_ms", "error_ms", *health.envelope}
         if not (needed <= health.link.keys() and all(health.envelope.values())):
             health = msgspec.structs.replace(health, link={})  # None, or a stranger's
+        before = self._health.rejected if self._health else {}
         for reason, count in health.rejected.items():
-            new = count - self._edge_counts.get(reason, 0)
+            new = count - before.get(reason, 0)
             if new > 0:
                 self._event(f"edge rejected {new} states: {reason}", rr.TextLogLevel.WARN)
-        self._edge_counts = dict(health.rejected)
         self._rejections("edge", health.rejected)
         for name, limit in health.envelope.items() if health.link else ():
             self._scalar(f"link/{name}", health.link[name] / limit)

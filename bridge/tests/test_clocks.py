@@ -299,7 +299,7 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
         rig.report(-1, speed_mps=1.0, session="", episode=-1)
         wait_until(lambda: rig.check.heard is not None, "the feedback")
         threading.Timer(0.1, rig.report, [0], {"speed_mps": 0.0, "session": ""}).start()
-        rig.check.sent(0, 5)
+        rig.clock.check.sent(5)
         rig.clock.wait_for_standstill()
         assert rig.clock.moving_starts == 0
         rig.report(1, speed_mps=0.5)

@@ -27,9 +27,7 @@ def checking(task=TASK):
 
 
 def checking_feedback():
-    check = inbound.FeedbackCheck("here", TASK)
-    check.sent(0, 5)
-    return check
+    return inbound.FeedbackCheck(checking(), TASK)
 
 
 BOTH = [
@@ -209,7 +207,7 @@ STOPPED = CommandHold(0.0, T).decide(0.0, edge_silence_s=0.3)
 
 
 def decide(feedback, after_s=0.05, heard=HEARD, received_s=1.0):
-    check = inbound.FeedbackCheck("here", TASK)
+    check = checking_feedback()
     check._newest, check._received_s, check._newest_s = feedback, received_s, 1.0
     return check.decide(heard, 0, now_s=1.0 + after_s)
 
