@@ -33,7 +33,6 @@ from bridge.rerun import (
     draw,
     flush,
     open_sink,
-    read_sink,
 )
 
 # isort: split
@@ -137,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def check_word(word: str) -> str:
     """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
-    return check_sink(read_sink(word))
+    return check_sink(word)
 
 
 class StepEntry(NamedTuple):

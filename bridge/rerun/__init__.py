@@ -91,15 +91,11 @@ def _file(path: str) -> str:
     return path
 
 
-def read_sink(word: str) -> str:
-    """The word itself: spawn, serve, or a path that ends in .rrd; UserError for any other."""
-    if word not in (SPAWN, SERVE) and not word.endswith(SUFFIX):
-        raise UserError(f"{word!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    return word
-
-
 def check_sink(sink: str | None) -> str:
-    """The sink (None: a window); UserError at once where nothing could be shown there."""
+    """The sink: spawn (None is that, too), serve, or a path that ends in .rrd.
+
+    UserError for any other, and at once where nothing could be shown there.
+    """
     sink = sink or SPAWN
     if sink.endswith(SUFFIX):
         check_writable(sink)
@@ -109,6 +105,8 @@ def check_sink(sink: str | None) -> str:
                 check_port_is_free(f"tcp/{LOOPBACK}:{port}")
             except UserError:
                 raise UserError(f"port {port} is in use; end the other rerun first") from None
+    elif sink != SPAWN:
+        raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
     elif sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
