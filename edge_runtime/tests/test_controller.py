@@ -261,6 +261,9 @@ def test_an_answer_to_a_state_older_than_two_periods_stops():
     controller = make()
     begin(controller, 0, 0.0, 0.9)
     assert said(controller.finish(GOOD, QUICK_NS, 0.901)) == TOO_LONG
+    in_time = make()
+    begin(in_time, 0, 0.0, 0.2)
+    assert said(in_time.finish(GOOD, QUICK_NS, in_time.safety.answer_s)) == "drive"
 
 
 def test_a_safe_stop_is_the_manifests_or_holds_the_last_value():
