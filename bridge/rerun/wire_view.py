@@ -271,8 +271,6 @@ class WireLog:
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
         self._timeline.period_s = period_of(state) or self._timeline.period_s
-        if not self._session:
-            self._timeline.adopt(state.session)
         self._session = state.session
         self._stand_at(place := (state.session, state.episode, state.step))
         _keep(self._sent_ns, place, state.sent_ns)
@@ -465,13 +463,6 @@ class Timeline:
         self._sessions: dict[str, int] = {}  # In the order of their first messages, from 1
         self._end_step = 0
         self.period_s = 0.0  # The control period, as soon as a message tells it
-
-    def adopt(self, session: str) -> None:
-        """Take what had no session so far for this one's, as a first scene without ``origin``."""
-        self._starts = {
-            (each or session, number): at for (each, number), at in self._starts.items()
-        }
-        self._sessions = {each or session: nth for each, nth in self._sessions.items()}
 
     def place(self, session: str, episode: int, step: int) -> tuple[str, int]:
         """The episode's own timeline, and the step with the episodes end to end."""

@@ -60,17 +60,6 @@ def test_episodes_stand_end_to_end():
     assert timeline.place("b", 0, 0) == ("episode_0_of_session_2", 11)
 
 
-def test_a_scene_without_an_origin_stands_where_its_state_does():
-    recording = MagicMock()
-    log, period_s = WireLog(recording), 0.1
-    log._timeline.period_s = period_s
-    log.write_scene(make_scene(), 10**18)  # The simulator sends it first.
-    log.write_state(make_state(9, session="here"), 10**18)
-    times = [one.args[:1] + tuple(one.kwargs.values()) for one in recording.set_time.call_args_list]
-    here = [("sim_time", 9 * period_s), ("step", 9), ("episode_0", 9 * period_s)]
-    assert times == here * 2
-
-
 def test_a_scene_is_read_without_what_is_not_drawn():
     scene = {
         "roads": [[[0.0, 0.0], [9.0, 0.0]]], "goal": [9.0, 0.0], "stop_line": [1.0, 2.0],
