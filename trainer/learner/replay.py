@@ -77,113 +77,6 @@ class Layout(NamedTuple):
 FRAMES_LAYOUT = Layout((2, 45, 80), np.dtype(np.uint8), stacked=True)
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
-Lost = list[int]
-"""Slots of transitions that are forgotten because a new picture took the place of theirs."""
-
-
-class RingIndex:
-    """Running numbers of pictures and transitions, the rings they are kept in, and the pictures.
-
-    ``capacity`` is in transitions. An observation that is not stacked counts as a picture.
-    """
-
-    def __init__(self, capacity: int, layout: Layout = FRAMES_LAYOUT) -> None:
-        self.capacity, self.stacked = capacity, layout.stacked
-        self.frame_slots = int(capacity * FRAMES_PER_TRANSITION) + 3
-        shape = layout.shape[1:] if layout.stacked else layout.shape
-        self.pictures = np.empty((self.frame_slots, *shape), layout.dtype)
-        self.frame_ids = np.zeros((capacity, 2 + layout.stacked), np.int64)
-        """The running numbers of each transition's three (or two) pictures, oldest first."""
-        self.added = self.frames_added = 0
-        self.oldest = 0  # Running number of the oldest transition that is not forgotten
-        self._current: tuple[int, ...] | None = None
-
-    def __len__(self) -> int:
-        return self.added - self.oldest
-
-    @property
-    def used(self) -> int:
-        """Slots that hold or held a transition."""
-        return min(self.added, self.capacity)
-
-    @property
-    def alive(self) -> NDArray[np.int64]:
-        """Slots of the transitions that are not forgotten, oldest first."""
-        return np.arange(self.oldest, self.added, dtype=np.int64) % self.capacity
-
-    def start_episode(self, frames: NDArray[Any]) -> Lost:
-        """Take the first observation of an episode; a picture seen twice once only."""
-        lost: Lost = []
-        if not self.stacked:
-            self._current = (self._add_picture(frames, lost),)
-            return lost
-        older = newer = self._add_picture(frames[0], lost)
-        if not np.array_equal(frames[0], frames[1]):
-            newer = self._add_picture(frames[1], lost)
-        self._current = (older, newer)
-        return lost
-
-    def add(self, frames: NDArray[Any]) -> tuple[int, Lost]:
-        """Number a transition that led to an observation; its slot.
-
-        Raises RuntimeError: no episode has begun.
-        """
-        if self._current is None:
-            raise RuntimeError("start_episode comes before add")
-        lost: Lost = []
-        newest = self._add_picture(frames[1] if self.stacked else frames, lost)
-        slot = self.added % self.capacity
-        self.frame_ids[slot] = *self._current, newest
-        self.added += 1
-        self.oldest = max(self.oldest, self.added - self.capacity)
-        self._current = (*self._current[1:], newest)
-        return slot, lost
-
-    def frames(self, slots: Indices, first: int) -> NDArray[Any]:
-        """What each transition began with (``first`` is 0) or led to (1), [n, 2, 45, 80]."""
-        pictures = slice(first, first + 2) if self.stacked else first
-        return self.pictures[self.frame_ids[slots, pictures] % self.frame_slots]
-
-    def follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
-        """Whether each transition begins with the picture that another ended with, [n].
-
-        Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
-        """
-        return self.frame_ids[slots, -1] == self.frame_ids[following, -2]
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on."""
-        return {
-            "added": self.added,
-            "frames_added": self.frames_added,
-            "oldest": self.oldest,
-            "frame_ids": self.frame_ids[: self.used],
-            # Bytes: a checkpoint knows no structured array.
-            "pictures": self.pictures[: self.frames_added].view(np.uint8),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
-        self.added = state["added"]
-        self.frames_added = state["frames_added"]
-        self.oldest = state["oldest"]
-        self.frame_ids[: self.used] = state["frame_ids"]
-        kept = self.pictures[: self.frames_added].view(np.uint8)
-        kept[:] = state["pictures"]
-        self._current = None
-
-    def _add_picture(self, picture: NDArray[Any], lost: Lost) -> int:
-        """Store a picture; its running number. Forget the transitions that lose theirs by it."""
-        number = self.frames_added
-        self.frames_added += 1
-        self.pictures[number % self.frame_slots] = picture
-        gone = number - self.frame_slots
-        while len(self) and self.frame_ids[self.oldest % self.capacity, 0] <= gone:
-            lost.append(self.oldest % self.capacity)
-            self.oldest += 1
-        return number
-
-
 COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
@@ -217,6 +110,9 @@ class Batch:
 class ReplayBuffer:
     """A ring of transitions, drawn in proportion to priority ** alpha.
 
+    Pictures and transitions have running numbers, and a ring of slots each. A transition is
+    forgotten with the oldest of its pictures. An observation that is not stacked is a picture.
+
     Args:
         capacity: transitions kept (table A6: 1e5).
         action_size: length of an action.
@@ -248,7 +144,14 @@ class ReplayBuffer:
     ) -> None:
         self.capacity, self.alpha, self.human_share = capacity, alpha, human_share
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
-        self._ring = RingIndex(capacity, layout)
+        self.added = self._frames_added = 0  # Since the run began
+        self._oldest = 0  # Running number of the oldest transition that is not forgotten
+        self._stacked, self._frame_slots = layout.stacked, int(capacity * FRAMES_PER_TRANSITION) + 3
+        shape = layout.shape[1:] if layout.stacked else layout.shape
+        self._pictures = np.empty((self._frame_slots, *shape), layout.dtype)
+        self._frame_ids = np.zeros((capacity, 2 + layout.stacked), np.int64)
+        """The running numbers of each transition's three (or two) pictures, oldest first."""
+        self._current: tuple[int, ...] | None = None
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
@@ -262,27 +165,38 @@ class ReplayBuffer:
             self._foreseen = ReplayBuffer(capacity, action_size, alpha=0.0, layout=layout)
 
     def __len__(self) -> int:
-        return len(self._ring)
+        return self.added - self._oldest
 
     @property
-    def added(self) -> int:
-        """Transitions stored since the run began."""
-        return self._ring.added
+    def alive(self) -> Indices:
+        """Slots of the transitions that are not forgotten, oldest first."""
+        return np.arange(self._oldest, self.added, dtype=np.int64) % self.capacity
+
+    @property
+    def _used(self) -> int:
+        """Slots that hold or held a transition."""
+        return min(self.added, self.capacity)
 
     @property
     def human_count(self) -> int:
         """How many of the kept transitions are the human's."""
-        return int(self._human[self._ring.alive].sum())
+        return int(self._human[self.alive].sum())
 
     def mean_priorities(self) -> tuple[float, float]:
         """Mean priority of the policy's and of the human's transitions (nan where none)."""
-        alive = self._ring.alive
+        alive = self.alive
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
     def start_episode(self, frames: NDArray[Any]) -> None:
-        """Take the first observation of an episode."""
-        self._forget(self._ring.start_episode(frames))
+        """Take the first observation of an episode; a picture seen twice once only."""
+        if not self._stacked:
+            self._current = (self._add_picture(frames),)
+            return
+        older = newer = self._add_picture(frames[0])
+        if not np.array_equal(frames[0], frames[1]):
+            newer = self._add_picture(frames[1])
+        self._current = (older, newer)
 
     def add(
         self,
@@ -306,13 +220,21 @@ class ReplayBuffer:
             overruled: the policy's action in its place, if so.
             penalised: whether that action is penalised.
             foreseen: the observation before, and what the policy's action would have led to.
+
+        Raises RuntimeError: no episode has begun.
         """
-        others = self._priorities[: self._ring.used]
+        if self._current is None:
+            raise RuntimeError("start_episode comes before add")
+        others = self._priorities[: self._used]
         if len(self._trees) > 1:  # It enters one of two buffers, each with priorities of its own
-            others = others[self._human[: self._ring.used] == human]
+            others = others[self._human[: self._used] == human]
         priority = float(others.max(initial=0.0)) or 1.0
-        slot, lost = self._ring.add(next_frames)
-        self._forget(lost)
+        newest = self._add_picture(next_frames[1] if self._stacked else next_frames)
+        slot = self.added % self.capacity
+        self._frame_ids[slot] = *self._current, newest
+        self._current = (*self._current[1:], newest)
+        self.added += 1
+        self._oldest = max(self._oldest, self.added - self.capacity)
         self._actions[slot] = action
         self._rewards[slot] = reward
         self._terminals[slot] = terminal
@@ -357,19 +279,32 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
-        columns = {name: getattr(self, f"_{name}")[: self._ring.used] for name in COLUMNS}
+        columns = {name: getattr(self, f"_{name}")[: self._used] for name in COLUMNS}
         ahead = {} if self._foreseen is None else self._foreseen.state_dict()
         named = {f"{AHEAD}{name}": value for name, value in ahead.items()}
-        return {**self._ring.state_dict(), **columns, **named}
+        return {
+            "added": self.added,
+            "frames_added": self._frames_added,
+            "oldest": self._oldest,
+            "frame_ids": self._frame_ids[: self._used],
+            # Bytes: a checkpoint knows no structured array.
+            "pictures": self._pictures[: self._frames_added].view(np.uint8),
+            **columns,
+            **named,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
-        self._ring.load_state_dict(state)
+        self.added, self._oldest = state["added"], state["oldest"]
+        self._frames_added = state["frames_added"]
+        self._frame_ids[: self._used] = state["frame_ids"]
+        self._pictures[: self._frames_added].view(np.uint8)[:] = state["pictures"]
+        self._current = None
         for name in COLUMNS:
-            getattr(self, f"_{name}")[: self._ring.used] = state[name]
+            getattr(self, f"_{name}")[: self._used] = state[name]
         # What was here before must not be drawn any more.
         self._trees = [SumTree(self.capacity) for _ in self._trees]
-        alive = self._ring.alive
+        alive = self.alive
         if len(alive):
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
         if self._foreseen is not None:
@@ -380,10 +315,10 @@ class ReplayBuffer:
         rewards, lasts, terminals, spans = self._returns(indices)
         return Batch(
             indices=indices,
-            frames=self._ring.frames(indices, 0),
+            frames=self._frames(indices, 0),
             actions=self._actions[indices],
             rewards=rewards,
-            next_frames=self._ring.frames(lasts, 1),
+            next_frames=self._frames(lasts, 1),
             terminals=terminals,
             human=self._human[indices],
             probabilities=self._probabilities(indices),
@@ -411,7 +346,7 @@ class ReplayBuffer:
         going = np.ones(len(indices), np.bool_)
         for step in range(1, self.steps):
             following = (lasts + 1) % self.capacity
-            going &= (terminals == 0.0) & self._ring.follows(lasts, following)
+            going &= (terminals == 0.0) & self._follows(lasts, following)
             if not going.any():
                 break
             discount = np.float32(self.gamma**step)
@@ -446,11 +381,32 @@ class ReplayBuffer:
         for tree, own in zip(self._trees, (~human, human), strict=True):
             tree[indices] = weights * own
 
-    def _forget(self, lost: Lost) -> None:
+    def _frames(self, slots: Indices, first: int) -> NDArray[Any]:
+        """What each transition began with (``first`` is 0) or led to (1), [n, 2, 45, 80]."""
+        pictures = slice(first, first + 2) if self._stacked else first
+        return self._pictures[self._frame_ids[slots, pictures] % self._frame_slots]
+
+    def _follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
+        """Whether each transition begins with the picture that another ended with, [n].
+
+        Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
+        """
+        return self._frame_ids[slots, -1] == self._frame_ids[following, -2]
+
+    def _add_picture(self, picture: NDArray[Any]) -> int:
+        """Store a picture; its running number. Forget the transitions that lose theirs by it."""
+        number = self._frames_added
+        self._frames_added += 1
+        self._pictures[number % self._frame_slots] = picture
+        gone, lost = number - self._frame_slots, []
+        while len(self) and self._frame_ids[self._oldest % self.capacity, 0] <= gone:
+            lost.append(self._oldest % self.capacity)
+            self._oldest += 1
         if lost:
             # Weights of 0, not 0 ** alpha, which is 1 where alpha is 0.
             self._priorities[lost] = 0.0
             self._set_weights(np.array(lost), np.zeros(len(lost)))
+        return number
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -176,9 +176,9 @@ def test_probabilities_follow_equation_20():
 
 def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
     buffer, _ = filled(*[1] * 60, capacity=40, alpha=0.0)
-    buffer.update_priorities(buffer._ring.alive[:3], np.array([0.5, 2.0, 9.0]))
+    buffer.update_priorities(buffer.alive[:3], np.array([0.5, 2.0, 9.0]))
     batch = sample(buffer, 1000)
-    assert set(batch.indices) == set(buffer._ring.alive)
+    assert set(batch.indices) == set(buffer.alive)
     np.testing.assert_allclose(batch.probabilities, 1 / len(buffer))
 
 
@@ -206,8 +206,7 @@ def test_a_restored_buffer_draws_the_same(steps, separate):
 
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
-    parts = [*vars(buffer).values(), *vars(buffer._ring).values()]
-    size = sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
+    size = sum(part.nbytes for part in vars(buffer).values() if isinstance(part, np.ndarray))
     assert size + buffer._trees[0]._nodes.nbytes < 400e6
 
 
