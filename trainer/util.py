@@ -29,6 +29,7 @@ import numpy as np
 from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
+CPU_INFO = Path("/proc/cpuinfo")
 LOCK_FILE = ".lock"  # In a directory that is claimed, for as long as it is
 WRITTEN = ("results/paper", "results/guidance")
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
@@ -247,11 +248,17 @@ def _git(directory: Path, *arguments: str) -> str | None:
     return done.stdout.strip()
 
 
+def cpu_info() -> list[str]:
+    """The lines that Linux has about each core; none elsewhere."""
+    try:
+        return CPU_INFO.read_text(errors="replace").splitlines()
+    except OSError:
+        return []
+
+
 def processor_model() -> str:
     """The processor's name; on Linux ``platform`` knows no more than its instruction set."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-    except OSError:
-        lines = []
-    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(models, "") or platform.processor() or platform.machine()
+    for line in cpu_info():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

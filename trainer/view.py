@@ -134,11 +134,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check_word(word: str) -> str:
-    """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
-    return check_sink(word)
-
-
 class StepEntry(NamedTuple):
     """The numbers of one control period."""
 

@@ -96,23 +96,16 @@ def importance_weights(probabilities: Tensor, beta: float | Tensor, normalise: b
     return weights / weights.max() if normalise else weights
 
 
-def split_mean(values: Tensor, human: Tensor) -> Tensor:
-    """The mean over the policy's samples plus the mean over the human's (eq. 11, 12, 22, 23).
-
-    A part without samples adds nothing.
-    """
-    return _masked_mean(values, ~human) + _masked_mean(values, human)
-
-
 def critic_loss(
     values: Tensor, targets: Tensor, human: Tensor, weights: Tensor, split: bool
 ) -> Tensor:
     """Eq. 22, with the importance weights of eq. 16: squared TD errors.
 
-    ``split`` is the paper's form, a mean over each kind of sample; otherwise one mean over all.
+    ``split`` is the paper's form, the mean over the policy's samples plus the mean over the human's
+    (eq. 11 and 12); otherwise one mean over all.
     """
     losses = weights * (targets - values).square()
-    return split_mean(losses, human) if split else losses.mean()
+    return _masked_mean(losses, ~human) + _masked_mean(losses, human) if split else losses.mean()
 
 
 def overruled_loss(values: Tensor, penalised: Tensor, penalty: float, weights: Tensor) -> Tensor:
@@ -155,5 +148,6 @@ def preference_loss(actions: Tensor, preferred: Tensor, overruled: Tensor, beta:
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """The mean over some samples; 0 where there is none."""
     # No branch on the count: on a GPU it would wait for the answer.
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)

@@ -16,7 +16,6 @@ all that is asked of it; the rest is small, and always in single precision.
 import re
 from functools import cache
 from itertools import chain, pairwise, repeat
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from trainer.learner.kernel import FEATURES, FILTERS, FRAME, SIDE, trunk_features
+from trainer.util import cpu_info
 
-CPU_INFO = Path("/proc/cpuinfo")
 _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|amx_bf16|bf16)\b")
 """As Linux names them on x86-64 and on aarch64."""
 
@@ -37,10 +36,7 @@ def multiplies_bfloat16(device_type: str) -> bool:
     """Whether ``device_type`` (``cpu``, ``cuda``) has instructions for it."""
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    try:
-        return _INSTRUCTIONS.search(CPU_INFO.read_text(errors="replace")) is not None
-    except OSError:
-        return False
+    return any(map(_INSTRUCTIONS.search, cpu_info()))
 
 
 HIDDEN = (256, 128, 64)

@@ -22,10 +22,10 @@ from trainer.learner.replay import Batch
 class Losses(NamedTuple):
     """What one update reports; ``priorities`` are the batch's new ones (eq. 21)."""
 
-    critic: float
-    policy: float
-    cloning: float
-    mean_value: float
+    critic_loss: float
+    policy_loss: float
+    cloning_loss: float
+    value: float  # Mean Q_1 of the batch
     priorities: NDArray[np.float64]
 
 
@@ -81,14 +81,6 @@ class TD3Learner:
         # Numbers lose by it what a picture does not have.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
-
-    def act(self, frames: NDArray[Any]) -> NDArray[np.float32]:
-        """pi(s) for one observation: float32 [action size]."""
-        return self.actor.act(frames[None])[0]
-
-    def act_together(self, frames: NDArray[Any], averaged: bool = False) -> NDArray[np.float32]:
-        """The same for observations [n, ...], or the target actor's: float32 [n, action size]."""
-        return (self.target_actor if averaged else self.actor).act(frames)
 
     @torch.no_grad()
     def doubt(self, frames: NDArray[Any], action: NDArray[np.float32]) -> float:

@@ -227,9 +227,9 @@ def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space)
     assert batch.frames.tobytes() == again.frames.tobytes() == rows[batch.indices].tobytes()
     assert batch.next_frames.tobytes() == rows[batch.indices + batch.spans].tobytes()
     learner = TD3Learner(LearnerConfig(batch_size=16), PHIL, 0, 2, space=space)
-    before = learner.act(rows[0])
+    before = learner.actor.act(rows[:1])
     assert np.isfinite(learner.update(batch)[:4]).all()
-    assert not np.array_equal(before, learner.act(rows[0]))
+    assert not np.array_equal(before, learner.actor.act(rows[:1]))
     assert [part.shape[0] for part in tensors(rows)] == [41] * len(tensors(rows))
 
 

@@ -97,7 +97,7 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
     threads: list[threading.Thread] = []
     learner = learning.learner
     learner.update = noting(threads, learner.update)
-    learner.act = noting(threads, lambda seen: np.zeros(1, np.float32))
+    learner.actor.act = noting(threads, learner.actor.act)
     learning.act(PICTURE)
     learning.begin(0.0)
     learning.finish()
@@ -115,8 +115,8 @@ def test_validation_acts_in_the_learners_thread(tmp_path):
     run.validation.envs = [ScriptedEnv(3, "goal") for _ in range(2)]
     learner, validations = run.learning.learner, []
     threads: list[threading.Thread] = []
-    learner.act = noting(threads, learner.act)
-    learner.act_together = noting(threads, lambda seen, _: np.zeros((len(seen), 1), np.float32))
+    for actor in (learner.actor, learner.target_actor):
+        actor.act = noting(threads, actor.act)
     run.train(lambda metrics: validations.append(metrics.validation_distance_m))
     assert validations == [3.0]
     assert len(threads) == 3 + 3  # two episodes of three steps, side by side

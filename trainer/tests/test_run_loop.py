@@ -120,7 +120,7 @@ def scripted_run(run_dir, config, length=1, outcome="goal", human_steps=(), reas
         return Losses(0.0, 0.0, 0.0, 0.0, priorities)
 
     replay.add, replay.update_priorities = spy_add, spy_write
-    learner.act = lambda observation: np.array([POLICY], np.float32)
+    learner.actor.act = lambda seen: np.full((len(seen), 1), POLICY, np.float32)
     learner.update = update
     return run
 
@@ -284,7 +284,7 @@ def bad_update(run):
 
 
 def bad_action(run):
-    run.learning.learner.act = lambda *_: np.array([np.nan], np.float32)
+    run.learning.learner.actor.act = lambda _: np.array([[np.nan]], np.float32)
 
 
 def bad_weights(run):

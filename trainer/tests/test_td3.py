@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from trainer import util
 from trainer.learner import networks
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import FEATURES, Actor, Critic, Picture
@@ -90,8 +91,8 @@ def test_an_update_sees_shifted_pictures():
         TD3Learner(replace(SMALL, picture_shift=most), PHIL, seed=0).update(make_batch())
         for most in (0, 3)
     )
-    assert plain.critic != shifted.critic
-    assert plain.policy != shifted.policy
+    assert plain.critic_loss != shifted.critic_loss
+    assert plain.policy_loss != shifted.policy_loss
 
 
 def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is_not():
@@ -122,7 +123,7 @@ def processor(tmp_path, monkeypatch):
         info = tmp_path / "cpuinfo"
         if text is not None:
             info.write_text(text)
-        monkeypatch.setattr(networks, "CPU_INFO", info)
+        monkeypatch.setattr(util, "CPU_INFO", info)
         networks.multiplies_bfloat16.cache_clear()
 
     yield pretend
@@ -166,5 +167,5 @@ def test_every_picture_of_an_update_is_embedded_in_its_precision(
     wanted = Counter((network.picture, autocast) for network in [*used, targets.first])
     assert Counter(reduced) == wanted
     reduced.clear()
-    learner.act(batch.frames[0])
+    learner.actor.act(batch.frames[:1])
     assert reduced == [(learner.actor.picture, False)]

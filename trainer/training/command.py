@@ -2,7 +2,6 @@
 
 import argparse
 import difflib
-import importlib
 import inspect
 import math
 import os
@@ -24,6 +23,7 @@ import torch
 from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
+from bridge.rerun import check_sink, read_sink
 from edge_runtime.cli import INTERRUPTED, examples, quit_on_signals
 from edge_runtime.util import UserError, counted, read_toml
 from trainer import options
@@ -222,10 +222,7 @@ def _new_directory(config: RunConfig) -> Path:
 def _train(
     person: argparse.Namespace, config: RunConfig, run_dir: Path, rerun: str | None, end_s: float
 ) -> Run:
-    view: Any = None
-    if rerun is not None:
-        view = importlib.import_module("trainer.view")
-        sink = view.check_word(rerun)
+    sink = None if rerun is None else check_sink(read_sink(rerun))
     with ExitStack() as stack:
         training: TrainingRun
         if person.human in HUMANS:
@@ -239,7 +236,11 @@ def _train(
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
         bar = stack.enter_context(ProgressBar("training", *extent))
-        watch = stack.enter_context(view.watched(training, sink)) if view else None
+        watch = None
+        if sink:
+            from trainer.view import watched  # rerun takes a second to load
+
+            watch = stack.enter_context(watched(training, sink))
         # The last: behind the first signal is what a viewer makes of them.
         stack.enter_context(quit_on_signals(partial(_quit, training)))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)

@@ -23,8 +23,7 @@ from trainer.learner.replay import FRAMES_LAYOUT, Batch, Layout, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.util import Purpose, random_stream
 
-LOSSES = ("critic_loss", "policy_loss", "cloning_loss", "value")
-"""The means of an episode, in the order of ``Losses``."""
+LOSSES = Losses._fields[:4]  # What is averaged over an episode
 
 
 class LearningThread:
@@ -87,7 +86,7 @@ class LearningThread:
 
     def act(self, observation: Observation) -> Action:
         """The actor's action, float32 [action size]; not while updating."""
-        return self.in_thread(self.learner.act, observation)
+        return self.act_together(observation[None], averaged=False)[0]
 
     def doubt(self, observation: Observation, action: Action) -> float:
         """How much the critics differ about an action; not while updating."""
@@ -95,7 +94,9 @@ class LearningThread:
 
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-        return self.in_thread(self.learner.act_together, observations, averaged)
+        learner = self.learner
+        actor = learner.target_actor if averaged else learner.actor
+        return self.in_thread(actor.act, observations)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""

@@ -25,6 +25,7 @@ from torch.autograd.function import once_differentiable
 
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
+from trainer.util import cpu_info
 
 _LOGGER = logging.getLogger(__name__)
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared")
@@ -105,11 +106,7 @@ def _compiler() -> list[str]:
 def _processor() -> str:
     """Names the instruction set: a cache on a shared home may meet several machines."""
     wanted = ("model name", "flags", "features", "cpu part")
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-    except OSError:
-        lines = []
-    known = dict.fromkeys(line for line in lines if line.lower().startswith(wanted))
+    known = dict.fromkeys(line for line in cpu_info() if line.lower().startswith(wanted))
     return "\n".join([platform.machine(), platform.processor(), *known])
 
 
