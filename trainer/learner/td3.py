@@ -1,6 +1,6 @@
 """The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time.
 
-``reference.py`` is the same written plainly; this one computes nothing twice.
+``tests/test_reference.py`` has the same written plainly; this one computes nothing twice.
 """
 
 import copy
