@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from edge_runtime.tests.harness import exit_status
@@ -49,7 +50,7 @@ WRONG = [
         "expert --condition rain", "expert --out /dev/null/r.json",
     )),
     *(f"export {{tmp}} --out {{tmp}}/{words}" for words in (
-        "p.onnx", "p.onnx --key {tmp}/no.key", "p.txt",
+        "p.onnx", "p.onnx --key {tmp}/no.key", "p.onnx --key {tmp}/file", "p.txt",
     )),
     *(f"picture expert --out {words}" for words in (
         "{tmp}/p.png --time -1", "/dev/null/p.png",
@@ -62,6 +63,8 @@ WRONG = [
 
 
 TOLD = [
+    *((f"evaluate constant:{action}", "expected an action from -1 to 1")
+      for action in ("''", "fast", "nan", "1.5", "-2", "inf")),
     ("train --out x --set printed_reward", "--set printed_reward: expected NAME=VALUE"),
     ("train --out x --set printed_reward=maybe", "expected true or false, got 'maybe'"),
     ("train --out x --set batch_size=1.5", "expected a whole number, got '1.5'"),
@@ -77,7 +80,7 @@ TOLD = [
     ("experiment report status", "stand alone"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
     ("experiment report --results nowhere", "no results"),
-]
+]  # fmt: skip
 """What would be right is said, too."""
 
 
@@ -155,10 +158,18 @@ def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
+ONES = {"picture.trunk.conv1.weight": torch.ones(3), "head.output.bias": torch.ones(1)}
+
+
 @pytest.mark.parametrize("name", ["checkpoint.pt", "best_actor.pt", "human_model.pt"])
-def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
-    save_torch(tmp_path / name, {"something": 1, "scenario": 3})
-    refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
+@pytest.mark.parametrize(
+    "state", [[1, 2], torch.ones(3), {"actor": ONES}, {"something": 1, "scenario": 3}]
+)
+def test_a_foreign_torch_file_is_said_in_one_line(name, state, capsys, tmp_path):
+    save_torch(tmp_path / name, state)
+    said = refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
+    assert f"{name} is not a" in said
+    assert "of this project" in said
 
 
 @pytest.fixture

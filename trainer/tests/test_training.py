@@ -27,7 +27,7 @@ from trainer.evaluation import evaluate
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
-from trainer.pictures import moving_average, write_learning_curve
+from trainer.pictures import write_learning_curve
 from trainer.policy_file import export
 from trainer.tests.test_td3 import same_weights
 from trainer.training import metrics as metrics_module
@@ -301,10 +301,6 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.pt")
     with pytest.raises(UserError, match="no regular file"):
         load_torch(tmp_path / "pipe.pt")
-
-
-def test_moving_average_by_hand():
-    np.testing.assert_allclose(moving_average(np.array([1.0, 3.0, 5.0, 7.0]), 2), [1, 2, 4, 6])
 
 
 def test_episode_seeds_never_meet_small_test_seeds():
