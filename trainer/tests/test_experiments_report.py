@@ -1,6 +1,4 @@
-import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -273,13 +271,3 @@ def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
     assert status == 0
     assert "the same command goes on" in out
     assert not (store.runs / "quick/results/left_turn.jsonl").exists()
-
-
-PAPER = Path(__file__).parents[2] / "results" / "paper"
-
-
-@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
-def test_each_record_lies_in_its_scenarios_file_once(scenario):
-    records = list(map(json.loads, (PAPER / f"{scenario}.jsonl").read_text().splitlines()))
-    assert {record["unit"]["scenario"] for record in records} == {scenario}
-    assert len({record["id"] for record in records}) == len(records)

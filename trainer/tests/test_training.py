@@ -51,6 +51,15 @@ def train(config: RunConfig, directory: Path, resume: bool = False) -> TrainingR
     return run
 
 
+def train_in_parts(config: RunConfig, directory: Path) -> TrainingRun:
+    """As a run that is asked to end in its second episode, and goes on."""
+    directory.mkdir()
+    first = TrainingRun(config, directory)
+    first.train(lambda _: setattr(first, "quitting", True))
+    assert first.episode == 2
+    return train(config, directory, resume=True)
+
+
 def same_actors(one, other):
     return all(torch.equal(weights, other[name]) for name, weights in one.items())
 
@@ -88,12 +97,7 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
 
 
 def test_the_same_seed_in_two_parts_gives_the_same_weights_and_metrics(trained, tmp_path):
-    parts = tmp_path / "parts"
-    parts.mkdir()
-    first = TrainingRun(TINY, parts)
-    first.train(lambda _: setattr(first, "quitting", True))
-    assert first.episode == 2
-    rest = train(TINY, parts, resume=True)
+    rest = train_in_parts(TINY, tmp_path / "parts")
     assert same_weights(trained.learning.learner, rest.learning.learner)
     assert rows_of(rest) == rows_of(trained)
 
@@ -104,7 +108,7 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
 ):
     monkeypatch.setattr(Asking, "MEMORY", 60)
     human: dict[str, Any] = {"late_to_s": 0.8, "missed_share": 0.3, "human_shift": -0.2}
-    learner, parts = replace(SMALL, warmup_steps=warmup_steps), tmp_path / "parts"
+    learner = replace(SMALL, warmup_steps=warmup_steps)
     config = replace(TINY, algorithm=row, learner=learner, **human)
     whole, reasons = TrainingRun(config, tmp_path / "whole"), set[Any]()
     whole.on_step = lambda seen: reasons.add(seen.intervention and seen.intervention.reason)
@@ -118,10 +122,7 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     whole.train()
     assert (foreseen != {0}) == (row == "ppl_td3")
     assert (ASKED in reasons) == (row == "phil_gated")
-    parts.mkdir()
-    first = TrainingRun(config, parts)
-    first.train(lambda _: setattr(first, "quitting", True))
-    rest = train(config, parts, resume=True)
+    rest = train_in_parts(config, tmp_path / "parts")
     assert same_weights(whole.learning.learner, rest.learning.learner)
     assert rows_of(whole) == rows_of(rest)
 
