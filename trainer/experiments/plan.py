@@ -110,26 +110,28 @@ PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
 BUFFERS = ("rd2_phil", "rd2_td3")
 WEIGHTS = ("phil_advantage_0.1", "phil_advantage_100")
 LEFT, JAM = ("left_turn",), ("congestion",)
-LINES: tuple[tuple[int, str, tuple[str, ...]], ...] = (
-    (0, NORMAL, TESTED_ONLY),
-    (1, NORMAL, FOUR),
-    (2, BIASED, GUIDED),
-    (3, PRINTED, FOUR),
-    (4, ONE_FRAME, FOUR),
-    (5, RANDOM, GUIDED),
-    (6, NORMAL, PARTS),
-    (7, NORMAL, (*PRIORITIES, *BUFFERS)),
-    (8, NORMAL, WEIGHTS),
-)
-"""Everything that is computed: priority (what comes first), setting, algorithms."""
 DEFAULT_SEEDS, MANY = 5, 1000
+Lines = tuple[tuple[str, tuple[str, ...], tuple[str, ...], int], ...]
+"""Setting or human, algorithms, tasks, and how many seeds at most; 0: tested only."""
+LINES: Lines = (
+    (NORMAL, TESTED_ONLY, SCENARIOS, 0),
+    (NORMAL, FOUR, SCENARIOS, MANY),
+    (BIASED, GUIDED, SCENARIOS, MANY),
+    (PRINTED, FOUR, SCENARIOS, MANY),
+    (ONE_FRAME, FOUR, SCENARIOS, MANY),
+    (RANDOM, GUIDED, SCENARIOS, MANY),
+    (NORMAL, PARTS, SCENARIOS, MANY),
+    (NORMAL, (*PRIORITIES, *BUFFERS), SCENARIOS, MANY),
+    (NORMAL, WEIGHTS, SCENARIOS, MANY),
+)
+"""All of the paper's, in the order of work."""
 GUIDANCE = "guidance"  # The fair table of human guidance, which is not the paper's
 ROWS = (
     *FOUR, "cloning_only", "rlif_td3", "pvp_td3", "pvp4real_td3", "rlpd_td3", "ppl_td3",
     "phil_gated",
 )  # fmt: skip
 HELPED = tuple(name for name in ROWS if ALGORITHMS[name].guided)
-GUIDANCE_LINES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], int], ...] = (
+GUIDANCE_LINES: Lines = (
     (GOOD, (EXPERT,), (*SCENARIOS, *FOREIGN), 0),
     (MODEL, (HUMAN_MODEL,), SCENARIOS, 0),
     (GOOD, ROWS, SCENARIOS, MANY),
@@ -137,7 +139,6 @@ GUIDANCE_LINES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], int], ...] = 
     *((name, HELPED, LEFT, 3) for name in IMPERFECT),
     (GOOD, ROWS, tuple(FOREIGN), 3),
 )
-"""Human, rows, tasks and how many seeds at most, in the order of work; 0: tested only."""
 
 
 class Experiment(NamedTuple):
@@ -263,32 +264,23 @@ class Unit(NamedTuple):
 def units_of(names: Collection[str], seeds: int, scenario: str | None = None) -> list[Unit]:
     """The units of some experiments, or of ``all`` of the paper's, each once, in the order of work.
 
-    Seed by seed within a priority, so that work that stops early leaves balanced results.
+    Seed by seed within a line, so that work that stops early leaves balanced results.
     """
-    if GUIDANCE in names:
-        return [
-            Unit(where, row, human, seed)
-            for human, rows, tasks, most in GUIDANCE_LINES
-            for seed in (range(1, min(seeds, most) + 1) if most else [0])
-            for where, row in product(tasks, rows)
-            if scenario in (None, where)
-        ]
-    chosen = EXPERIMENTS.values() if "all" in names else [EXPERIMENTS[name] for name in names]
+    lines = GUIDANCE_LINES if GUIDANCE in names else LINES
+    units = [
+        Unit(where, algorithm, setting, seed)
+        for setting, algorithms, tasks, most in lines
+        for seed in (range(1, min(seeds, most) + 1) if most else [0])
+        for where, algorithm in product(tasks, algorithms)
+        if scenario in (None, where)
+    ]
+    if {"all", GUIDANCE} & set(names):
+        return units
+    chosen = (EXPERIMENTS[name] for name in names)
     wanted = {
-        line
-        for one in chosen
-        for line in product(one.scenarios, one.algorithms, one.settings)
-        if scenario in (None, line[0])
+        line for one in chosen for line in product(one.scenarios, one.algorithms, one.settings)
     }
-    units = {}
-    for priority, setting, algorithms in LINES:
-        for (place, algorithm), (turn, where) in product(
-            enumerate(algorithms), enumerate(SCENARIOS)
-        ):
-            if (where, algorithm, setting) in wanted:
-                for seed in [0] if algorithm in TESTED_ONLY else range(1, seeds + 1):
-                    units[priority, seed, turn, place] = Unit(where, algorithm, setting, seed)
-    return [units[order] for order in sorted(units)]
+    return [unit for unit in units if unit[:3] in wanted]
 
 
 def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:

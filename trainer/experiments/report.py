@@ -42,7 +42,7 @@ PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
 """Tables I and II of the paper: surviving distance, m, by scene."""
 PAPER_S = dict(zip(plan.FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
 """The paper's table of time efficiency: seconds for 10,000 steps."""
-EVERY_LINE = [Line(name, setting) for _, setting, names in plan.LINES for name in names]
+EVERY_LINE = [Line(name, setting) for setting, names, *_ in plan.LINES for name in names]
 """Every line that is computed, in the order of work."""
 Judged = tuple[Claim, Comparison, Comparison | None]
 """A claim with what was measured, and with the same of the policy alone."""
@@ -123,7 +123,7 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         ("setting", "meaning", "algorithms"),
         (
             (name, plan.SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
-            for _, name, algorithms in plan.LINES
+            for name, algorithms, *_ in plan.LINES
             if HUMAN_MODEL not in algorithms
         ),
     )

@@ -202,7 +202,7 @@ class TestPlan:
         write_human(store)
         units = {setting: GUIDED._replace(setting=setting) for setting in planned.SETTINGS}
         of = {name: planned.run_config(units[name], planned.PLAN, store.humans) for name in units}
-        papers = {setting for _, setting, _ in planned.LINES}
+        papers = {setting for setting, *_ in planned.LINES}
         assert (papers | set(planned.HUMANS), len(papers & set(planned.HUMANS))) == (set(of), 0)
         assert of["one_frame"].learner.frames == 1
         assert of["printed"].learner == PRINTED_LEARNER
