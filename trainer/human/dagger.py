@@ -72,13 +72,12 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
     end_s = options.deadline_s(arguments.max_minutes)
     env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
+    size, space = env.action_space.shape[0], env.observation_space
+    model = HumanModel(config, arguments.seed, size, space)
     if arguments.recordings is None:
-        training = HumanTraining(env, config, arguments.seed)
-        model, episodes = training.model, training.episodes()
+        episodes = imitate(model, env, arguments.seed)
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
-        size, space = env.action_space.shape[0], env.observation_space
-        model = HumanModel(config, arguments.seed, size, space)
         taken_over = demonstrate(model, recordings, env.scenario)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert: in place of an episode, those that follow one.
@@ -118,46 +117,30 @@ class HumanEpisode(NamedTuple):
     outcome: str = ""  # Empty where nobody drove: the model learned from recordings
 
 
-class HumanTraining:
+def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
     """Online, incremental imitation of the scripted expert, which takes over while it drives."""
-
-    def __init__(self, env: Any, config: HumanModelConfig, seed: int) -> None:
-        self.env, self.config, self.seed = env, config, seed
-        # Each with a memory of its own: a person who takes over looks at the scene afresh.
-        self.expert, self.adviser = expert_of(env), expert_of(env)
-        self.guide = HumanGuide(self.expert, expert_of(env))
-        self.model = HumanModel(config, seed, env.action_space.shape[0], env.observation_space)
-
-    def episodes(self) -> Iterator[HumanEpisode]:
-        """Drive and learn, episode by episode."""
-        for episode in range(self.config.episodes):
-            interventions, outcome = self._drive(episode)
-            loss = self.model.learn(self.config.updates_per_episode)
-            yield HumanEpisode(loss, self.model.demonstrations, interventions, outcome)
-
-    def _drive(self, episode: int) -> tuple[int, str]:
-        """One episode; the number of take-overs, and the outcome."""
-        c = self.config
+    config = model.config
+    # Each with a memory of its own: a person who takes over looks at the scene afresh.
+    expert, adviser = expert_of(env), expert_of(env)
+    guide = HumanGuide(expert, expert_of(env))
+    for episode in range(config.episodes):
         # One episode in so many; with 0 none is.
-        demonstrated = c.demonstrate_every and episode % c.demonstrate_every == (
-            c.demonstrate_every - 1
-        )
-        seed = episode_seed(self.seed, Purpose.HUMAN_EPISODES, episode)
-        observation, info = self.env.reset(seed=seed)
-        self.guide.reset()
-        self.adviser.reset()
+        every = config.demonstrate_every
+        demonstrated = every and episode % every == every - 1
+        observation, info = env.reset(seed=episode_seed(seed, Purpose.HUMAN_EPISODES, episode))
+        guide.reset()
+        adviser.reset()
         interventions, ended = 0, False
         while not ended:
-            action = self.model.act(observation)
-            intervention = None if demonstrated else self.guide.watch(observation, action)
+            action = model.act(observation)
+            intervention = None if demonstrated else guide.watch(observation, action)
             if demonstrated or intervention is not None:
-                action = (
-                    self.expert.act(observation) if intervention is None else intervention.action
-                )
-                self.model.add(observation, action)
-            elif c.label_every_step:
-                self.model.add(observation, self.adviser.act(observation))
+                action = expert.act(observation) if intervention is None else intervention.action
+                model.add(observation, action)
+            elif config.label_every_step:
+                model.add(observation, adviser.act(observation))
             interventions += intervention is not None and intervention.first
-            observation, _, terminated, truncated, info = self.env.step(action)
+            observation, _, terminated, truncated, info = env.step(action)
             ended = terminated or truncated
-        return interventions, info["outcome"]
+        loss = model.learn(config.updates_per_episode)
+        yield HumanEpisode(loss, model.demonstrations, interventions, info["outcome"])

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from edge_runtime.util import UserError
 from trainer.drivers import constant_driver, load_driver
 from trainer.environments import make_environment
-from trainer.human.dagger import HumanTraining
+from trainer.human.dagger import imitate
 from trainer.human.guide import ASKED, Asking, HumanGuide, Inattentive
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
@@ -58,11 +59,9 @@ def test_refining_takes_its_updates_under_a_falling_learning_rate():
 @pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])
 def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     config = HumanModelConfig(episodes=2, updates_per_episode=2, batch_size=8)
-    models = []
-    for _ in range(2):
-        training = HumanTraining(kind(), config, seed=5)
-        episodes = list(training.episodes())
-        models.append(training.model)
+    models = [HumanModel(config, seed=5) for _ in range(2)]
+    for model in models:
+        episodes = list(imitate(model, kind(), seed=5))
     assert episodes[0].interventions
     assert episodes[-1].demonstrations == models[0].demonstrations > episodes[0].demonstrations
     frames = np.full((2, 45, 80), 70, np.uint8)
@@ -76,27 +75,21 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
 
 def test_someone_takes_over_from_a_model_that_never_looks_and_every_step_is_labelled(monkeypatch):
     config = replace(LABELLED, episodes=2, demonstrate_every=0)
-    training = HumanTraining(LeftTurnEnv(), config, seed=5)
-    monkeypatch.setattr(training.model, "act", lambda observation: FULL)
-    episodes = list(training.episodes())
+    model = HumanModel(config, seed=5)
+    monkeypatch.setattr(model, "act", lambda observation: FULL)
+    episodes = list(imitate(model, LeftTurnEnv(), seed=5))
     assert episodes[-1].demonstrations > 20
     assert sum(each.interventions for each in episodes) > 0
 
 
 def test_episodes_are_demonstrated_or_watched_in_turn(monkeypatch):
     config = replace(LABELLED, episodes=4, demonstrate_every=2)
-    training = HumanTraining(LeftTurnEnv(), config, seed=5)
-    looks: list[int] = []
-    watch = training.guide.watch
-
-    def counted(*seen):
-        looks[-1] += 1
-        return watch(*seen)
-
-    monkeypatch.setattr(training.guide, "watch", counted)
-    monkeypatch.setattr(training.guide, "reset", lambda: looks.append(0))
-    list(training.episodes())
-    assert [count > 0 for count in looks] == [True, False] * 2
+    looks, watched = Mock(return_value=None), []  # nobody takes over
+    monkeypatch.setattr(HumanGuide, "watch", looks)
+    for _ in imitate(HumanModel(config, seed=5), LeftTurnEnv(), seed=5):
+        watched.append(looks.called)
+        looks.reset_mock()
+    assert watched == [True, False] * 2
 
 
 def test_what_does_not_fit_together_is_refused(tmp_path):
