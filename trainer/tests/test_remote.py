@@ -23,10 +23,11 @@ def frames(step):
     return np.stack([np.full((45, 80), max(n, 0), np.uint8) for n in (step - 1, step)])
 
 
-def number(observation):
+def number(seen):
     """The tick of an observation whose two pictures follow each other."""
-    assert observation[1, 0, 0] - observation[0, 0, 0] in (0, 1)
-    return int(observation[1, 0, 0])
+    pictures = seen["observation"] if seen.dtype.names else seen
+    assert pictures[1, 0, 0] - pictures[0, 0, 0] in (0, 1)
+    return int(pictures[1, 0, 0])
 
 
 def answer(observation):
@@ -41,35 +42,43 @@ class Car:
     action_space = SimpleNamespace(shape=(1,))
 
 
-class Kept:
-    """Stands for ``LearningThread``: keeps what would be learned, as the replay's chain would."""
+class Driven:
+    """A policy behind a network, driven over numbered observations; the reward of tick n is n.
 
-    def __init__(self):
-        self.rows: list[tuple] = []
-        self.current: Any = None
+    Keeps what the policy was ``asked``, what was ``carried`` out, and what would be learned: what
+    was ``stored``, and as ``rows``: observation, action, reward, next observation, ends.
+    """
+
+    def __init__(self, spec, aware=False, seed=0):
+        self.spec, self.env = parse_spec(spec), make_environment("left_turn") if aware else Car()
+        self.aware: Any = DelayAware(self.env, self.spec) if aware else None
+        self.asked, self.carried, self.stored, self.rows = [], [], [], list[Any]()
+        self.delayed = DelayedPolicy(self, self.env, self.spec, self.aware)
+        self.delayed.start(frames(0), seed)
 
     def start_episode(self, observation):
-        self.current = observation
+        self.stored.append(observation)
 
     def add(self, action, reward, observation, *ends, overruled=None, foreseen=()):
         self.foreseen = [number(each) for each in foreseen]
-        seen = number(self.current), float(action[0]), reward, number(observation)
+        seen = number(self.stored[-1]), float(action[0]), reward, number(observation)
         self.rows.append((*seen, *ends))
-        self.current = np.stack([self.current[1], observation[1]])
+        self.stored.append(observation)
 
+    def act(self, seen):
+        self.asked.append(seen)
+        return answer(seen)
 
-def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
-    """Drive over numbered observations; the reward of tick n is n."""
-    kept: Any = Kept()
-    delayed = DelayedPolicy(kept, Car(), parse_spec(spec))
-    delayed.start(frames(0), seed)
-    actions = []
-    for tick in range(ticks):
-        actions.append(float(delayed.act(frames(tick), answer)[0]))
-        end = terminated and tick == ticks - 1
-        action = np.array([0.9 if tick in human else actions[-1]], np.float32)
-        delayed.store(action, float(tick), frames(tick + 1), end, tick in human)
-    return kept.rows, actions
+    def drive(self, ticks, terminated=False, human=(), **guidance):
+        for tick in range(ticks):
+            action = self.delayed.act(frames(tick), self.act)
+            action = np.array([0.9], np.float32) if tick in human else action
+            end = terminated and tick == ticks - 1
+            done = action, float(tick), frames(tick + 1), end, tick in human
+            more = {name: of(tick) for name, of in guidance.items()}
+            self.delayed.store(*done, **more)
+            self.carried.append(float(action[0]))
+        return self
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
@@ -91,33 +100,31 @@ def test_a_delayed_driver_is_another_and_the_same_each_time():
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it():
-    rows, actions = drive_delayed("100ms", 8, terminated=True)
+    driven = Driven("100ms").drive(8, terminated=True)
     # Round trip 2 ticks: hands off in ticks 0 and 1; tick n obeys the answer to n - 2.
-    assert actions == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    assert driven.carried == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
     wanted = [(n, pytest.approx(n / 100), n + 2.0, n + 1, n == 5, False) for n in range(6)]
-    assert rows == wanted
+    assert driven.rows == wanted
 
 
 def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer():
-    rows, _ = drive_delayed("100ms", 8, human=(4,))
+    rows = Driven("100ms").drive(8, human=(4,)).rows
     assert [row for row in rows if row[5]] == [(2, pytest.approx(0.9), 4.0, 3, False, True)]
 
 
 def test_what_is_foreseen_is_seen_as_late_as_all_else():
-    kept: Any = Kept()
-    delayed = DelayedPolicy(kept, Car(), parse_spec("100ms"))
-    delayed.start(frames(0), 0)
-    for tick in range(6):
-        delayed.act(frames(tick), answer)
-        ahead = [frames(each) for each in range(tick, tick + 4)]
-        done = np.zeros(1, np.float32), 0.0, frames(tick + 1), False, True
-        delayed.store(*done, overruled=np.ones(1, np.float32), foreseen=ahead)
-    assert kept.foreseen == [3, 4, 5, 6]
+    driven = Driven("100ms").drive(
+        6,
+        overruled=lambda tick: np.ones(1, np.float32),
+        foreseen=lambda tick: [frames(each) for each in range(tick, tick + 4)],
+    )
+    assert driven.foreseen == [3, 4, 5, 6]
 
 
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
 def test_every_tick_is_stored_with_what_was_carried_out(spec):
-    rows, actions = drive_delayed(spec, 60, seed=1)
+    driven = Driven(spec, seed=1).drive(60)
+    rows, actions = driven.rows, driven.carried
     late = ticks_late(parse_spec(spec), Car.control_period_s)
     assert [row[0] for row in rows] == list(range(60 - late))
     assert all(row[3] == row[0] + 1 for row in rows)
@@ -147,43 +154,14 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
     assert end._link.hold.newest_step == 7 - ticks
 
 
-class Told:
-    """Keeps what a policy that knows the delay is told, and what is stored of it."""
-
-    def __init__(self, spec):
-        self.env, self.spec = make_environment("left_turn"), parse_spec(spec)
-        self.aware = DelayAware(self.env, self.spec)
-        self.asked, self.stored, self.carried = [], [], []
-        self.delayed = DelayedPolicy(self, self.env, self.spec, self.aware)
-        self.delayed.start(frames(0), 0)
-
-    def start_episode(self, observation):
-        self.stored.append(observation)
-
-    def add(self, action, reward, observation, *ends):
-        self.stored.append(observation)
-
-    def act(self, seen):
-        self.asked.append(seen)
-        return answer(seen["observation"])
-
-    def drive(self, ticks, human=()):
-        for tick in range(ticks):
-            action = self.delayed.act(frames(tick), self.act)
-            action = np.array([0.9], np.float32) if tick in human else action
-            self.delayed.store(action, 0.0, frames(tick + 1), False, tick in human)
-            self.carried.append(float(action[0]))
-
-
 def told(observations):
     """Tick and actions under way of observations, in hundredths."""
-    ticks = [number(seen["observation"]) for seen in observations]
-    return ticks, [np.round(100 * seen[UNDER_WAY]).astype(int).tolist() for seen in observations]
+    under_way = [np.round(100 * seen[UNDER_WAY]).astype(int).tolist() for seen in observations]
+    return [*map(number, observations)], under_way
 
 
 def test_a_policy_that_knows_the_delay_sees_what_is_on_its_way_in_order():
-    driven = Told("100ms")
-    driven.drive(7)
+    driven = Driven("100ms", aware=True).drive(7)
     assert driven.aware.ticks == 2
     under_way = [[0, 0], [0, 0], [0, 1], [1, 2], [2, 3], [3, 4]]
     assert told(driven.asked) == (list(range(6)), under_way)
@@ -191,18 +169,16 @@ def test_a_policy_that_knows_the_delay_sees_what_is_on_its_way_in_order():
 
 
 def test_what_a_human_did_instead_is_stored_as_what_was_on_its_way():
-    driven = Told("100ms")
-    driven.drive(7, human=(4,))
+    driven = Driven("100ms", aware=True).drive(7, human=(4,))
     assert told(driven.asked)[1][4] == [2, 3]  # It plans on: nobody tells it of the human.
     assert told(driven.stored)[1][3:] == [[1, 90], [90, 3], [3, 4]]
 
 
 @pytest.mark.parametrize("spec", ["up.delay=100ms,jitter=40ms", "60ms+-10ms", "0ms+-30ms"])
 def test_a_command_waits_until_all_are_as_old(spec):
-    driven, today = Told(spec), parse_spec(spec)
-    driven.drive(60)
+    driven = Driven(spec, aware=True).drive(60)
     late = driven.aware.ticks
-    assert late >= ticks_late(today, driven.env.control_period_s)
+    assert late >= ticks_late(driven.spec, driven.env.control_period_s)
     on_time = [np.isclose(done, n / 100) for n, done in enumerate(driven.carried[late:])]
     assert np.mean(on_time) > 0.9  # Two deviations of the jitter are waited for.
 
