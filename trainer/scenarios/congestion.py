@@ -7,8 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env.road.lane import StraightLane
-from highway_env.road.road import Road, RoadNetwork
+from highway_env.road.road import Road
 from numpy.typing import NDArray
 
 from trainer.scenarios import traffic
@@ -103,18 +102,6 @@ EGO_LANE = 1  # The middle one, y = 0; lane 0 is to its left
 REACH_M = 200.0  # How far the road goes on before start and goal
 
 
-def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
-    """Three lanes in the direction of x."""
-    network = RoadNetwork()
-    for lane in range(LANES):
-        y = (lane - EGO_LANE) * lane_width_m
-        ends = (-REACH_M, y), (goal_m + REACH_M, y)
-        # No speed limit: the cars' own desired speeds are what limits them.
-        road = StraightLane(*ends, lane_width_m, speed_limit=None)
-        network.add_lane("start", "end", road)
-    return network
-
-
 def spawn_traffic(
     road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[TrafficVehicle]:
@@ -183,7 +170,10 @@ class CongestionEnv(DrivingEnv):
     def _build(self) -> None:
         c = self.config
         self.road_width_m = LANES * c.lane_width_m
-        self.network = straight_road(c.lane_width_m, c.goal_m)
+        middles_m = [(lane - EGO_LANE) * c.lane_width_m for lane in range(LANES)]
+        self.network = traffic.straight_lanes(
+            ("start", "end"), -REACH_M, c.goal_m + REACH_M, middles_m, c.lane_width_m
+        )
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
         self.rasteriser = Rasteriser(
             -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]

@@ -6,8 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from highway_env.road.lane import StraightLane
-from highway_env.road.road import LaneIndex, RoadNetwork
+from highway_env.road.road import LaneIndex
 from highway_env.utils import wrap_to_pi
 
 from trainer.scenarios import traffic
@@ -27,6 +26,11 @@ LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
 NEAR_LANE: LaneIndex = ("west", "east", 0)
 """The lane of the main road that the ego car must cross; the other one it joins."""
+HEADING_GAIN = 1.5
+OFFSET_GAIN_RAD_PER_M = 0.5
+INTEGRAL_GAIN_RAD_PER_MS = 0.1
+INTEGRAL_LIMIT_MS = 1.0
+"""Of the control that keeps the car on its path."""
 
 
 class Pose(NamedTuple):
@@ -78,50 +82,6 @@ class LeftTurnPath:
     def curvature(self, s_m: float) -> float:
         """Signed curvature at ``s_m``, 1/m; negative is a left turn (headings are clockwise)."""
         return -1.0 / self.radius_m if 0.0 < s_m - self.straight_m <= self.arc_m else 0.0
-
-
-class PathTracker:
-    """PI control of the front wheels along a planned path (section VI, auxiliary functions).
-
-    The proportional part acts on heading error and lateral offset, the integral part on the
-    offset; the path's curvature is fed forward, so that the feedback only has to take up what the
-    kinematic model leaves over.
-    """
-
-    HEADING_GAIN = 1.5
-    OFFSET_GAIN_RAD_PER_M = 0.5
-    INTEGRAL_GAIN_RAD_PER_MS = 0.1
-    INTEGRAL_LIMIT_MS = 1.0
-
-    def __init__(self, path: LeftTurnPath) -> None:
-        self.path = path
-        self.integral_ms = 0.0
-
-    def steering(self, ego: EgoVehicle, s_m: float, offset_m: float, dt_s: float) -> float:
-        """The front-wheel angle in rad for the car at arc length ``s_m``, ``offset_m`` right."""
-        limit = self.INTEGRAL_LIMIT_MS
-        self.integral_ms = min(max(self.integral_ms + offset_m * dt_s, -limit), limit)
-        curvature = self.path.curvature(s_m)
-        # In a bend the car's centre moves at the slip angle to its heading.
-        slip_rad = math.asin(0.5 * ego.LENGTH * curvature)
-        course_rad = self.path.pose(s_m).heading
-        course_error = wrap_to_pi(course_rad - slip_rad - ego.heading)
-        angle = (
-            math.atan(2.0 * math.tan(slip_rad))
-            + self.HEADING_GAIN * course_error
-            - self.OFFSET_GAIN_RAD_PER_M * offset_m
-            - self.INTEGRAL_GAIN_RAD_PER_MS * self.integral_ms
-        )
-        return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
-
-
-def near_lane(lane_width_m: float) -> RoadNetwork:
-    """The one lane in which there is traffic, as highway-env has it; y = 0 is its left edge."""
-    network, y = RoadNetwork(), 0.5 * lane_width_m
-    # No speed limit: the cars' own desired speeds are what limits them.
-    lane = StraightLane((-LANE_REACH_M, y), (LANE_REACH_M, y), lane_width_m, speed_limit=None)
-    network.add_lane(*NEAR_LANE[:2], lane)
-    return network
 
 
 @dataclass(frozen=True)
@@ -206,12 +166,15 @@ class LeftTurnEnv(DrivingEnv):
             Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m),
         ]
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
-        self.network = near_lane(c.lane_width_m)
-        self._offset_m = 0.0
+        # The one lane in which there is traffic; y = 0 is its left edge.
+        self.network = traffic.straight_lanes(
+            NEAR_LANE[:2], -LANE_REACH_M, LANE_REACH_M, [half], c.lane_width_m
+        )
+        self._offset_m = self._integral_ms = 0.0
 
     @property
     def car(self) -> dict[str, float]:
-        """Its steering is where the path tracker ends: no action of the left turn steers."""
+        """Its steering is where the path's control ends: no action of the left turn steers."""
         c = self.config
         return {
             "throttle_mps2": c.throttle_mps2,
@@ -226,12 +189,30 @@ class LeftTurnEnv(DrivingEnv):
         c = self.config
         pedal = min(max(float(action[0]), -1.0), 1.0)
         acceleration_mps2 = pedal * (c.throttle_mps2 if pedal > 0 else c.brake_mps2)
-        steering_rad = self.tracker.steering(
-            self.ego, self.distance_m, self._offset_m, c.control_period_s
-        )
-        self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
+        self._move(acceleration_mps2, self._steering_rad(), c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
+
+    def _steering_rad(self) -> float:
+        """PI control of the front wheels along the planned path (section VI, auxiliary functions).
+
+        The proportional part acts on heading error and lateral offset, the integral part on the
+        offset; the path's curvature is fed forward, so that the feedback only has to take up what
+        the kinematic model leaves over.
+        """
+        ego, limit, dt_s = self.ego, INTEGRAL_LIMIT_MS, self.config.control_period_s
+        self._integral_ms = min(max(self._integral_ms + self._offset_m * dt_s, -limit), limit)
+        # In a bend the car's centre moves at the slip angle to its heading.
+        slip_rad = math.asin(0.5 * ego.LENGTH * self.path.curvature(self.distance_m))
+        course_rad = self.path.pose(self.distance_m).heading
+        course_error = wrap_to_pi(course_rad - slip_rad - ego.heading)
+        angle = (
+            math.atan(2.0 * math.tan(slip_rad))
+            + HEADING_GAIN * course_error
+            - OFFSET_GAIN_RAD_PER_M * self._offset_m
+            - INTEGRAL_GAIN_RAD_PER_MS * self._integral_ms
+        )
+        return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
 
     def pedal_for_speed(self, speed_mps: float) -> float:
         """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.
@@ -265,7 +246,7 @@ class LeftTurnEnv(DrivingEnv):
         start = self.path.pose(0.0)
         speed_mps = float(self.np_random.uniform(*self.config.ego_speed_mps))
         self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
-        self.tracker, self._offset_m = PathTracker(self.path), 0.0
+        self._offset_m = self._integral_ms = 0.0
 
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random

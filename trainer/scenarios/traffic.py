@@ -10,7 +10,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from highway_env.road.road import LaneIndex, Road
+from highway_env.road.lane import StraightLane
+from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.utils import not_zero
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -166,6 +167,18 @@ class TrafficVehicle(IDMVehicle):
         """The car's rectangle on the ground."""
         x, y = self.position.tolist()
         return Rectangle(x, y, float(self.heading), self.LENGTH, self.WIDTH)
+
+
+def straight_lanes(
+    ends: tuple[str, str], start_m: float, end_m: float, middles_m: list[float], width_m: float
+) -> RoadNetwork:
+    """Lanes along x, side by side, as highway-env has them; ``middles_m`` are their y."""
+    network = RoadNetwork()
+    for y in middles_m:
+        # No speed limit: the cars' own desired speeds are what limits them.
+        lane = StraightLane((start_m, y), (end_m, y), width_m, speed_limit=None)
+        network.add_lane(*ends, lane)
+    return network
 
 
 def queue(
