@@ -70,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_time_limit(
         how,
-        "begin nothing after this time, and stop what runs at its next checkpoint, five "
-        "episodes apart; the same command goes on from there",
+        "begin nothing after this time, and stop what runs after its next episode; the same "
+        "command goes on from there",
     )
     where = parser.add_argument_group("where it is kept")
     for option, default, text in (

@@ -17,7 +17,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -43,7 +43,7 @@ from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics,
 from trainer.training.run import TrainingRun
 
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
-"""How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since
+"""How work on a unit ends: with its record; with a checkpoint, for lack of time; at once, since
 another process has it; with an error."""
 WRITING_PATIENCE_S = 60.0
 """How long one waits for a file of records, into which another process writes a megabyte."""
@@ -187,7 +187,7 @@ class Task:
     unit: Unit
     store: Store
     stop_at_s: float = math.inf
-    """Seconds of the epoch after which work stops at its next checkpoint."""
+    """Seconds of the epoch after which work stops with the next episode."""
 
 
 def compute(task: Task) -> str:
@@ -255,15 +255,11 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     return record
 
 
-class _OutOfTimeError(Exception):
-    """Ends training at a checkpoint."""
-
-
 def _train(task: Task, run_dir: Path) -> bool:
     """Train to the budget's end; whether it was reached.
 
-    Time is looked at only where a checkpoint was just written, and not through the deadline of
-    ``TrainingRun.train``: that one validates once more when it stops, as no unbroken run does.
+    It quits when time is out, and has no deadline in ``TrainingRun.train``: that one validates once
+    more when it stops, as no unbroken run does.
     """
     config = plan.run_config(task.unit, task.store.plan, task.store.humans)
     rows = read_metrics(run_dir)
@@ -274,14 +270,11 @@ def _train(task: Task, run_dir: Path) -> bool:
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
-        at_checkpoint = run.episode % config.checkpoint_every == 0
-        if at_checkpoint and not run.over and time.time() > task.stop_at_s:
-            raise _OutOfTimeError
+        if time.time() > task.stop_at_s:
+            run.quit()
 
-    with suppress(_OutOfTimeError):
-        run.train(after)
-        return True
-    return False
+    run.train(after)
+    return run.over
 
 
 def _columns(rows: Sequence[dict[str, str]], names: dict[str, str]) -> dict[str, list[Any]]:
