@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.util import read_bytes
 from trainer.environments import COMMAND_NOISE, CONDITIONS, expert_of, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
@@ -339,9 +339,6 @@ def obstacle(unit: Unit, humans: Path) -> str | None:
 
 def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
     """What decides a unit's training, as plain values."""
-    reason = obstacle(unit, humans)
-    if reason:
-        raise UserError(f"{unit}: {reason}; see `python -m trainer human --help`")
     values: dict[str, Any] = {"unit": unit._asdict(), "human": None}
     scene = unit.environment, "nominal", unit.scripted_human
     if unit.needs_human:

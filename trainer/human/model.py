@@ -134,13 +134,8 @@ class HumanModel(Driver):
 
 
 def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
-    """The network of a HUMAN_DIR and what is known of it.
-
-    Raises UserError: no human model there.
-    """
+    """The network of a HUMAN_DIR and what is known of it; UserError: no human model there."""
     path = directory / MODEL_FILE
-    if not path.is_file():
-        raise UserError(f"no human model in {directory} (expected {MODEL_FILE})")
     state = load_torch(path)
     try:
         space = make_environment(state["scenario"]).observation_space

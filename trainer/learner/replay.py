@@ -220,11 +220,8 @@ class ReplayBuffer:
             overruled: the policy's action in its place, if so.
             penalised: whether that action is penalised.
             foreseen: the observation before, and what the policy's action would have led to.
-
-        Raises RuntimeError: no episode has begun.
         """
-        if self._current is None:
-            raise RuntimeError("start_episode comes before add")
+        assert self._current is not None  # An episode has begun.
         others = self._priorities[: self._used]
         if len(self._trees) > 1:  # It enters one of two buffers, each with priorities of its own
             others = others[self._human[: self._used] == human]
