@@ -209,14 +209,14 @@ def test_the_expert_seeks_the_middle_of_the_gap():
     ],
 )
 def test_who_turns_or_is_aside_is_taken_over(side, offset_m, heading_rad, action, reason):
-    expert = CongestionHuman(environment(side * offset_m, side * heading_rad, ALONE))
-    assert CongestionHuman(expert.env).wants_control(side * action) == reason
+    trigger = CongestionHuman(environment(side * offset_m, side * heading_rad, ALONE))
+    assert trigger.wants_control(side * action) == reason
 
 
 def test_who_will_touch_a_car_with_its_side_is_taken_over():
     for offset_m, action, reason in ((0.75, RIGHT, "collision"), (-0.75, STRAIGHT, None)):
-        expert = CongestionHuman(environment(offset_m, 0.1))
-        assert CongestionHuman(expert.env).wants_control(action) == reason
+        trigger = CongestionHuman(environment(offset_m, 0.1))
+        assert trigger.wants_control(action) == reason
 
 
 @pytest.mark.parametrize("offset_m", [0.2, 0.45, 0.7])

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from trainer.learner.config import ALGORITHMS, PHIL, LearnerConfig
+from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.learner.td3 import Losses
 from trainer.tests.test_run_loop import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
@@ -18,14 +18,14 @@ LOSSES = Losses(1.0, 2.0, 3.0, 4.0, np.full(SMALL.batch_size, 2.0))
 PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
 
 
-@pytest.fixture
-def learning():
+@pytest.fixture(params=["phil_td3"])
+def learning(request):
     """One that is filled, with every third step the human's; its learner's update is scripted."""
-    made: Any = LearningThread(SMALL, PHIL, 1, 1)
+    made: Any = LearningThread(SMALL, ALGORITHMS[request.param], 1, 1)
     made.start_episode(PICTURE)
     for step in range(20):
         made.add(np.full(1, step / 20, np.float32), float(step % 5), PICTURE, False, step % 3 == 0)
-    made.learner.update = lambda batch, beta: LOSSES
+    made.learner.update = Mock(return_value=LOSSES)
     yield made
     made.close()
 
@@ -43,7 +43,7 @@ def noting(threads, function):
 def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learning):
     for scale in (1.0, 3.0):
         scaled = Losses(scale, 2.0 * scale, 3.0 * scale, 4.0 * scale, LOSSES.priorities)
-        learning.learner.update = lambda batch, beta, scaled=scaled: scaled
+        learning.learner.update.return_value = scaled
         learning.begin(0.0)
         learning.finish()
     episode, after = learning.end_episode(0.0), learning.end_episode(0.0)
@@ -57,20 +57,17 @@ def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learn
     assert after["learning_s"] == after["waiting_s"] == 0.0
 
 
-def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back():
-    made: Any = LearningThread(SMALL, ALGORITHMS["rlpd_td3"], 1, 1)
-    made.start_episode(PICTURE)
-    for step in range(20):
-        made.add(np.zeros(1, np.float32), 0.0, PICTURE, False, step % 3 == 0)
-    made.learner.update = Mock(return_value=LOSSES)
-    made.replay.update_priorities = Mock()
-    made.begin(0.0)
-    made.finish()
-    made.close()
-    drawn = [call.args[0].indices.tolist() for call in made.learner.update.call_args_list]
+@pytest.mark.parametrize("learning", ["rlpd_td3"], indirect=True)
+def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back(
+    learning,
+):
+    learning.replay.update_priorities = Mock()
+    learning.begin(0.0)
+    learning.finish()
+    drawn = [call.args[0].indices.tolist() for call in learning.learner.update.call_args_list]
     assert len(drawn) == 2
     assert drawn[0] != drawn[1]
-    written = made.replay.update_priorities.call_args_list
+    written = learning.replay.update_priorities.call_args_list
     assert [call.args[0].tolist() for call in written] == drawn
 
 

@@ -193,9 +193,9 @@ def guided(guide: HumanGuide, action: np.ndarray):
 @pytest.mark.parametrize("pedal", [0.3, 1.0])
 def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
-    expert = LeftTurnHuman(env)
+    guide = HumanGuide(LeftTurnHuman(env), LeftTurnHuman(env))
     for seed in range(15):
-        guide = HumanGuide(expert, LeftTurnHuman(expert.env))
+        guide.reset()
         _, info = drive(env, guided(guide, np.array([pedal], np.float32)), seed)
         assert info["outcome"] == "goal"
 

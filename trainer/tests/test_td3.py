@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from trainer import util
 from trainer.learner import networks
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import FEATURES, Actor, Critic, Picture
@@ -116,14 +115,11 @@ def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is
 
 
 @pytest.fixture
-def processor(tmp_path, monkeypatch):
-    """Pretend to have a processor of these flags; None: there is no list of them."""
+def processor(monkeypatch):
+    """Pretend to have a processor of these flags."""
 
-    def pretend(text):
-        info = tmp_path / "cpuinfo"
-        if text is not None:
-            info.write_text(text)
-        monkeypatch.setattr(util, "CPU_INFO", info)
+    def pretend(*lines):
+        monkeypatch.setattr(networks, "cpu_info", lambda: lines)
         networks.multiplies_bfloat16.cache_clear()
 
     yield pretend
@@ -134,7 +130,7 @@ def processor(tmp_path, monkeypatch):
     ("flags", "multiplies"),
     [("flags : fma avx2 avx512f avx512_bf16 avx512_vnni", True),
      ("Features : fp asimd i8mm bf16", True), ("flags : fma avx2 avx512f", False),
-     ("Features : fp asimd ebf16x", False), ("", False), (None, False)],
+     ("Features : fp asimd ebf16x", False), ("", False)],
 )  # fmt: skip
 def test_the_processors_flags_decide(processor, flags, multiplies):
     processor(flags)

@@ -57,6 +57,13 @@ def test_a_lock_whose_file_was_taken_away_is_no_lock(tmp_path, monkeypatch):
     assert not path.exists()
 
 
+def test_a_processor_that_no_list_describes_has_a_name(monkeypatch, tmp_path):
+    assert util.processor_model()
+    monkeypatch.setattr(util, "CPU_INFO", tmp_path / "none")
+    assert util.cpu_info() == []
+    assert util.processor_model()
+
+
 def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
     (tmp_path / util.LOCK_FILE).mkdir()
     with pytest.raises(UserError, match="cannot lock"), util.claimed(tmp_path):
