@@ -346,7 +346,7 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         values["human"] = hashlib.sha256(model).hexdigest()[:ID_LENGTH]
     if unit.trained:
         config = run_config(unit, plan, humans)
-        values["config"] = decided(config.as_dict(), RunConfig(), NOT_DECIDING)
+        values["config"] = decided(asdict(config), RunConfig(), NOT_DECIDING)
         # The row's hyper-parameters are in the config.
         switches = asdict(ALGORITHMS[unit.algorithm])
         values["switches"] = decided(switches, Algorithm(), ["settings"])

@@ -4,6 +4,7 @@ import math
 import shlex
 import shutil
 import time
+from dataclasses import asdict
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -176,7 +177,7 @@ def test_a_foreign_torch_file_is_said_in_one_line(name, state, capsys, tmp_path)
 def config(tmp_path, capsys):
     """The settings of a run whose checkpoint cannot be read, and what resuming it says."""
     (tmp_path / "checkpoint.pt").write_bytes(b"none that could be read")
-    values = RunConfig(seed=3, episodes=4, evaluate_every_steps=7, human="person").as_dict()
+    values = asdict(RunConfig(seed=3, episodes=4, evaluate_every_steps=7, human="person"))
     values["learner"]["batch_size"] = 8
 
     def refused(values, *given):

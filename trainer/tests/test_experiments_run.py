@@ -3,7 +3,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert not any(record["training"]["human_steps"] + record["training"]["takeovers"])
     assert record["computed"]["processor"]
     # It says what was trained: enough to train it again by hand.
-    config = planned.run_config(UNIT, TINY, straight.humans).as_dict()
+    config = asdict(planned.run_config(UNIT, TINY, straight.humans))
     said = record["config"]
     said = {**config, **said, "learner": {**config["learner"], **said["learner"]}}
     assert said == json.loads(json.dumps(config))

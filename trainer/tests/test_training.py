@@ -81,7 +81,7 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
     directory = trained.run_dir
     config = json.loads((directory / "config.json").read_text())
     assert config.pop("source_revision")
-    assert config == json.loads(json.dumps(TINY.as_dict()))
+    assert config == json.loads(json.dumps(asdict(TINY)))
     rows = read_metrics(directory)
     assert list(rows[0]) == NAMES
     found = [(row["episode"], row["validation_success"] != "nan") for row in rows]
@@ -172,7 +172,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path)
     with pytest.raises(UserError, match="holds no checkpoint to resume from"):
         check_directory(tmp_path, config, resume=True)
     (tmp_path / "config.toml").write_text(config.as_toml())
-    (tmp_path / "config.json").write_text(json.dumps(config.as_dict()))
+    (tmp_path / "config.json").write_text(json.dumps(asdict(config)))
     words = ("train", "--out", str(tmp_path), "--config", str(tmp_path / "config.toml"))
     assert run_cli(main, [*words, "--resume"]) == 0
     assert len(read_metrics(tmp_path)) == 2

@@ -385,7 +385,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved, wanted = _flat(options.read_json(path, "run config")), _flat(config.as_dict())
+    saved, wanted = _flat(options.read_json(path, "run config")), _flat(asdict(config))
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []

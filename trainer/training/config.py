@@ -109,13 +109,9 @@ class RunConfig:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
     def as_toml(self) -> str:
-        """The same as a file for ``--config``."""
-        values = self.as_dict()
+        """A file for ``--config``."""
+        values = asdict(self)
         parts = values, values.pop("learner")
         own, learner = (
             [f"{n} = {json.dumps(v, ensure_ascii=False)}" for n, v in part.items()]

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -114,7 +114,7 @@ class TrainingRun:
         Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
         ``resume`` goes on.
         """
-        about = {**self.config.as_dict(), "source_revision": util.source_revision()}
+        about = {**asdict(self.config), "source_revision": util.source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
         write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
         metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
