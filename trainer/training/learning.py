@@ -86,7 +86,7 @@ class LearningThread:
 
     def act(self, observation: Observation) -> Action:
         """The actor's action, float32 [action size]; not while updating."""
-        return self.act_together(observation[None], averaged=False)[0]
+        return self.in_thread(self.learner.actor.act, observation[None])[0]
 
     def doubt(self, observation: Observation, action: Action) -> float:
         """How much the critics differ about an action; not while updating."""
