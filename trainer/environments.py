@@ -22,7 +22,7 @@ from bridge import environments as bridge
 from bridge.episode import array_of, finite, outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
-from trainer.human.guide import Action, Driver, Expert, Reason
+from trainer.human.guide import Action, Expert, Reason
 from trainer.learner.replay import FRAMES_LAYOUT, Layout
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.environment import Scene
@@ -278,7 +278,7 @@ class Adapted:
         return array
 
 
-class _ScaledExpert(Driver):
+class _ScaledExpert(Expert):
     """An expert whose actions are the environment's own."""
 
     def __init__(self, env: Any, own: Any) -> None:

@@ -5,13 +5,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Driver, Reason
+from trainer.human.guide import Expert, Reason
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
 
 
-class CongestionHuman(Driver):
+class CongestionHuman(Expert):
     """Heading control towards the middle between the neighbours; and judges the policy's action.
 
     A cascade: the offset from the middle asks for a heading, the heading error for a steering
@@ -64,10 +64,6 @@ class CongestionHuman(Driver):
                 right_m = min(right_m, float(car.position[1]) - 0.5 * car.WIDTH)
         limit = self.MIDDLE_LIMIT_M
         return min(max(0.5 * (left_m + right_m), -limit), limit)
-
-    def may_return(self) -> bool:
-        """Whether control can be handed back: anywhere."""
-        return True
 
     def wants_control(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""

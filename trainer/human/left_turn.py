@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Driver, Reason
+from trainer.human.guide import Expert, Reason
 from trainer.scenarios.environment import EgoVehicle, Observation
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
@@ -103,7 +103,7 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
     return (min(xs), max(xs)) if xs else (math.inf, -math.inf)
 
 
-class LeftTurnHuman(Driver):
+class LeftTurnHuman(Expert):
     """Waits at the stop line, picks a gap, and then commits; and judges the policy's action.
 
     A driver who changes their mind with the nose in the lane is hit; one who needs a wide gap to
