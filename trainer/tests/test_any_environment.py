@@ -42,7 +42,6 @@ from trainer.view import Shown, Steps
 
 ROVER = f"{__name__}:test/Rover-v0"
 CAMERA = Box(0, 255, (12, 20, 3), np.uint8)
-GENTLE = PHIL
 
 
 class Rover(gymnasium.Env):
@@ -235,7 +234,7 @@ def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space)
 
 def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_path):
     settings = {"batch_size": 8, "warmup_steps": 20, "evaluation_runs": 1}
-    row = f"{__name__}:GENTLE"
+    row = f"{__name__}:PHIL"
     run = train(ROVER, algorithm=row, episodes=4, settings=settings, out=tmp_path / "run")
     assert sum(int(each["human_steps"]) for each in run.metrics) > 0
     alone = evaluate(run, runs=2)
@@ -276,7 +275,7 @@ def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
         assert expert.may_return()
     with pytest.raises(UserError, match=r"offers no expert\(\)"):
         expert_of(make_environment("Pendulum-v1"))
-    assert find_algorithm(f"{__name__}:GENTLE") is PHIL
+    assert find_algorithm(f"{__name__}:PHIL") is PHIL
     for wrong in ("magic", f"{__name__}:Rover", "nowhere:ROW"):
         with pytest.raises(UserError):
             find_algorithm(wrong)
