@@ -235,14 +235,11 @@ def test_the_share_of_watched_episodes_is_met_at_any_time(share, episodes):
     assert watched == math.ceil(episodes * share)
 
 
-def test_the_human_leaves_after_so_many_steps(tmp_path):
-    run = trained(tmp_path, 2, human_steps=(2,), episodes=4, guided_until_step=3)
-    assert [human for *_, human in run.stored] == [False, True] * 2 + [False] * 4
-
-
-def test_the_human_gives_up_after_so_many_episodes_and_may_drive_in_another_way(tmp_path):
-    config = {"episodes": 4, "guided_until_episode": 2, "human_shift": -0.75}
-    run = trained(tmp_path, 2, human_steps=(2,), **config)
+@pytest.mark.parametrize("until", [{"guided_until_step": 3}, {"guided_until_episode": 2}])
+def test_the_human_leaves_after_so_many_steps_or_episodes_and_may_drive_in_another_way(
+    tmp_path, until
+):
+    run = trained(tmp_path, 2, human_steps=(2,), episodes=4, human_shift=-0.75, **until)
     assert [human for *_, human in run.stored] == [False, True] * 2 + [False] * 4
     assert [action for action, *_, human in run.stored if human] == [-1.0, -1.0]  # clipped
 
