@@ -23,7 +23,7 @@ import torch
 from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
-from bridge.rerun import check_sink, read_sink
+from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, examples, quit_on_signals
 from edge_runtime.util import UserError, counted, read_toml
 from trainer import options
@@ -222,7 +222,7 @@ def _new_directory(config: RunConfig) -> Path:
 def _train(
     person: argparse.Namespace, config: RunConfig, run_dir: Path, rerun: str | None, end_s: float
 ) -> Run:
-    sink = None if rerun is None else check_sink(read_sink(rerun))
+    sink = None if rerun is None else check_sink(rerun)
     with ExitStack() as stack:
         training: TrainingRun
         if person.human in HUMANS:
