@@ -162,6 +162,13 @@ def test_a_plan_holds_ten_whole_finite_actions_at_most(plan, reason):
     assert isinstance(found, Rejection) or found.plan == plan
 
 
+def test_a_stop_needs_no_action_and_has_no_plan():
+    fields = {**as_map(make_command(mode="safe_stop", action=[])), "plan": [[0.5]]}
+    found = wire.decode_command(msgspec.msgpack.encode(fields))
+    assert isinstance(found, Command)
+    assert (found.mode, found.action, found.plan) == ("safe_stop", [], msgspec.UNSET)
+
+
 @pytest.mark.parametrize(
     "nested", [b"\x91" * 60_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff"]
 )
