@@ -53,6 +53,7 @@ STORIES: dict = {
     "two leaps between which it went on as ever are two strays": [
         (A, 0, 5, 0.0, None), (A, 100, 0, 0.1, FUTURE), (A, 0, 6, 0.2, None),
         (A, 100, 1, 0.3, FUTURE), (A, 0, 7, 0.4, None), (A, 100, 1, 0.5, FUTURE),
+        (A, 99, 2, 0.6, FUTURE),
     ],
     "after an outage a simulator may be far ahead": [
         (A, 0, 0, 0.0, None), (A, 0, 20_001, 100.0, FUTURE), (A, 0, 20_000, 100.0, None),
