@@ -325,7 +325,7 @@ class VehicleClock(RealTimeClock):
         )
 
     def rejected(self) -> Counter[str]:
-        """The same, and the feedback that was not believed, as ``feedback_REASON``."""
+        """The commands that were not believed, and the feedback as ``feedback_REASON``."""
         counts = dict(self.feedback_check.rejected)
         feedback = {f"feedback_{name}": count for name, count in counts.items()}
         return super().rejected() + Counter(feedback)

@@ -62,31 +62,40 @@ def run(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
-    judge, hangs = threading.Thread(target=_judge, args=(bench,), daemon=True), False
+    verdicts, told = bench.verdicts, 0
+    judge = threading.Thread(target=_judge, args=(bench,), daemon=True)
     judge.start()
     try:
         while judge.is_alive() and bench.calls_for_s <= HANG_S:
             judge.join(LOOKS_EVERY_S)
-        if hangs := judge.is_alive():
+            told = _tell(verdicts, told)
+        if judge.is_alive():
             bench.is_over = True
-            bench.tell(f"{bench.called}() has not come back after {HANG_S:g} s")
+            verdicts.append(f"{bench.called}() has not come back after {HANG_S:g} s")
+        _tell(verdicts, told)
     finally:
         bench.is_over = True  # After ^C nothing may be asked of it once it is closed.
-        judge.join(CALL_S if hangs else HANG_S)
+        judge.join(CALL_S if bench.calls_for_s > HANG_S else HANG_S)
         with contextlib.suppress(Exception):  # The last rule closes it, where it came so far.
             if not judge.is_alive():
                 bench.vehicle.close()
         log.close()
-    broken = bench.broken.count(True)
-    untried = f", {len(RULES) - len(bench.broken)} not tried" if hangs else ""
-    print(
-        f"{bench.vehicle.name}: {len(bench.broken) - broken} rules kept, {broken} broken{untried}"
-    )
-    return BROKEN if broken else 0
+    kept, untried = verdicts.count(""), len(RULES) - len(verdicts)
+    rest = f", {untried} not tried" if untried else ""
+    print(f"{bench.vehicle.name}: {kept} rules kept, {len(verdicts) - kept} broken{rest}")
+    return 0 if kept == len(RULES) else BROKEN
+
+
+def _tell(verdicts: list[str], told: int) -> int:
+    """Print the verdicts after the first ``told``; how many are told then."""
+    for rule, words in list(zip(RULES, list(verdicts), strict=False))[told:]:
+        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
+        told += 1
+    return told
 
 
 def _judge(bench: Bench) -> None:
-    """Tell what is wrong by each rule, in their order."""
+    """Say what is wrong by each rule, in their order."""
     for is_kept in RULES.values():
         try:
             words = "" if is_kept(bench) else f"it says {bench.last}"
@@ -95,7 +104,7 @@ def _judge(bench: Bench) -> None:
             words = f"{type(error).__name__}: {error}"
         if bench.is_over:
             return
-        bench.tell(words)
+        bench.verdicts.append(words)
 
 
 class Bench:
@@ -108,19 +117,13 @@ class Bench:
         self.longest_s, self.well_formed = 0.0, True
         self.last: VehicleReport | None = None
         self.called, self._called_s = "", math.inf  # The call under way, and since when
-        self.broken: list[bool] = []  # For each rule that was tried
+        self.verdicts: list[str] = []  # What is wrong by each rule that was tried; empty: nothing
         self.is_over = False
 
     @property
     def calls_for_s(self) -> float:
         """How long the call under way has taken; -inf where there is none."""
         return time.monotonic() - self._called_s
-
-    def tell(self, words: str) -> None:
-        """Print what is wrong by the next rule; empty where it is kept."""
-        rule = list(RULES)[len(self.broken)]
-        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
-        self.broken.append(bool(words))
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
         """Call the driver as the runtime does: with the time, and with a command's speed."""

@@ -259,6 +259,6 @@ def cpu_info() -> list[str]:
 def processor_model() -> str:
     """The processor's name; on Linux ``platform`` knows no more than its instruction set."""
     for line in cpu_info():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
+        if line.startswith("model name") and (name := line.partition(":")[2].strip()):
+            return name
     return platform.processor() or platform.machine()

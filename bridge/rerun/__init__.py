@@ -96,7 +96,7 @@ def check_sink(sink: str | None) -> str:
 
     UserError for any other, and at once where nothing could be shown there.
     """
-    sink = sink or SPAWN
+    sink = SPAWN if sink is None else sink
     if sink.endswith(SUFFIX):
         check_writable(sink)
     elif sink == SERVE:

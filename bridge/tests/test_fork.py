@@ -79,15 +79,20 @@ def is_recorded_to_the_bit(
     return found
 
 
+def undisturbed(tmp_path: Path, *drive, **options) -> tuple[Path, dict]:
+    """A recording, and its report: where the machine stood still, the edge runtime has stopped."""
+    for attempt in range(8):
+        (folder := tmp_path / str(attempt)).mkdir()
+        path = record_drive(folder, *drive, **options)
+        if not (driven := read(folder / "report.json"))["wall_clock_stalls"]:
+            return path, driven
+    raise AssertionError("the machine stood still in each of 8 drives")
+
+
 @pytest.mark.parametrize(("env", "latency"), [("left_turn", "none"), ("congestion", NETWORK)])
 def test_without_a_change_the_fork_is_the_recorded_drive_to_the_bit(tmp_path, env, latency):
     policy = SHIPPED / f"{env}.onnx"
-    for attempt in range(8):  # Where the machine stood still, the edge runtime has stopped.
-        (folder := tmp_path / str(attempt)).mkdir()
-        path = record_drive(folder, env, policy, *TWO, "--seed", "3", "--latency", latency)
-        driven = read(folder / "report.json")
-        if not driven["wall_clock_stalls"]:
-            break
+    path, driven = undisturbed(tmp_path, env, policy, *TWO, "--seed", "3", "--latency", latency)
     for number, row in enumerate(driven["per_episode"]):
         found = is_recorded_to_the_bit(path, number, policy, row["time_s"])
         assert found["fork"] == row, "rewards and all, as the simulator itself has reported them"
@@ -111,11 +116,18 @@ def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
     assert found["fork"] == asdict(row)
 
 
+def test_a_scene_may_call_something_as_ours_do(tmp_path):
+    policy, path = make_policy(tmp_path, "constant", 0.5), tmp_path / "drive.mcap"
+    row = record_in_process(path, TOY, policy, seed=4, latency="none")
+    found = fork_of(path, "--at", row.time_s / 2, "--policy", policy, "--env", TOY)
+    assert found["fork"] == asdict(row)
+
+
 def test_a_drive_with_plans_is_the_same_to_the_bit(tmp_path):
     settings, loses = tmp_path / "edge.toml", ("--latency", "loss=30%")
     settings.write_text("[ride_through]\nmax_s = 0.3\n")
     config = ("--config", str(settings))
-    path = record_drive(tmp_path, "left_turn", OURS, "--seed", "3", *loses, edge=config)
+    path, _ = undisturbed(tmp_path, "left_turn", OURS, "--seed", "3", *loses, edge=config)
     found = fork_of(path, "--at", "1s", "--policy", OURS)
     assert found["differs_from_s"] is None
     assert found["fork"] == found["recorded"]

@@ -53,6 +53,7 @@ class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             "path": np.array([[0.0, 0.0], [self._goal_m, 0.0]]),
             "goal": [self._goal_m, 0.0],
             "vehicles": [car],
+            "step": -self._steps,  # In a message stands ours.
         }
 
     def _info(self, acceleration_mps2: float, outcome: str | None) -> dict[str, Any]:

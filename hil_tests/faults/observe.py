@@ -122,7 +122,7 @@ def drives_between(
 ) -> list[str]:
     """Wrong where it drove in between, before it was re-armed."""
     drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in list(commands))
-    return ["drove before it was re-armed"] if drove else []
+    return ["was told to drive before it was re-armed"] if drove else []
 
 
 def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:

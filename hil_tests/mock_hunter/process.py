@@ -154,9 +154,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _setting(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
-    with contextlib.suppress(ValueError):
+    try:
         return name, float(value)
-    raise argparse.ArgumentTypeError(f"{text!r} is not valid: use NAME=VALUE")
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not valid: use NAME=VALUE") from None
 
 
 def _fault(text: str) -> tuple[float, str]:

@@ -122,7 +122,9 @@ def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys,
     assert any(rule in line for line in broken) if flaw else not broken, lines
 
 
-@pytest.mark.parametrize(("call", "kept", "not_tried"), [("command", 1, 14), ("close", 15, 0)])
+@pytest.mark.parametrize(
+    ("call", "kept", "not_tried"), [("command", 1, ", 14 not tried"), ("close", 15, "")]
+)
 def test_a_driver_that_hangs_is_named_and_not_waited_for(
     call, kept, not_tried, monkeypatch, capsys
 ):
@@ -133,7 +135,7 @@ def test_a_driver_that_hangs_is_named_and_not_waited_for(
     assert exit_status(main, words) == 1
     *_, broken, last = capsys.readouterr().out.splitlines()
     assert broken.endswith(f"{call}() has not come back after 0.5 s")
-    assert last == f"mock: {kept} rules kept, 1 broken, {not_tried} not tried"
+    assert last == f"mock: {kept} rules kept, 1 broken{not_tried}"
 
 
 def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):

@@ -278,7 +278,7 @@ def units_of(names: Collection[str], seeds: int, scenario: str | None = None) ->
         return units
     chosen = (EXPERIMENTS[name] for name in names)
     wanted = {
-        line for one in chosen for line in product(one.scenarios, one.algorithms, one.settings)
+        what for one in chosen for what in product(one.scenarios, one.algorithms, one.settings)
     }
     return [unit for unit in units if unit[:3] in wanted]
 

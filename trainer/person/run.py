@@ -370,7 +370,7 @@ class BehindTheScenes:
 
     def __init__(self, config: RunConfig) -> None:
         self._config = config
-        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start)
+        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start_validating)
         self._begun: tuple[Check, Future[list[EpisodeResult]]] | None = None
 
     @property
@@ -385,7 +385,7 @@ class BehindTheScenes:
         seeds = list(check.seeds.values())
         try:
             with interrupts_blocked():
-                self._begun = check, self._process.submit(_drive, self._config, weights, seeds)
+                self._begun = check, self._process.submit(_validate, self._config, weights, seeds)
         except BrokenExecutor:
             self._begun = None  # It was killed; `take` has said so.
 
@@ -412,7 +412,8 @@ class BehindTheScenes:
             process.kill()
 
 
-def _start() -> None:
+def _start_validating() -> None:
+    """What the process begins with."""
     threading.Thread(target=die_with_parent, daemon=True).start()
     os.nice(NICENESS)
     torch.set_num_threads(1)
@@ -421,10 +422,10 @@ def _start() -> None:
 _trials = cache(Trials)  # Of the one config
 
 
-def _drive(
+def _validate(
     config: RunConfig, weights: dict[str, NDArray[Any]], seeds: list[int]
 ) -> list[EpisodeResult]:
-    """The process's end."""
+    """What `BehindTheScenes.begin` asks of its process."""
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)

@@ -51,7 +51,7 @@ WRONG = [
         "expert --condition rain", "expert --out /dev/null/r.json",
     )),
     *(f"export {{tmp}} --out {{tmp}}/{words}" for words in (
-        "p.onnx", "p.onnx --key {tmp}/no.key", "p.onnx --key {tmp}/file", "p.txt",
+        "p.onnx", "p.onnx --key {tmp}/no.key", "p.txt",
     )),
     *(f"picture expert --out {words}" for words in (
         "{tmp}/p.png --time -1", "/dev/null/p.png",

@@ -190,7 +190,7 @@ class TestPlan:
         for name in planned.EXPERIMENTS:
             assert set() < set(planned.units_of([name], 2)) <= set(everything)
 
-    def test_work_goes_by_priority_and_then_seed_by_seed(self):
+    def test_work_goes_line_by_line_and_then_seed_by_seed(self):
         units = planned.units_of(["all"], 5)
         assert {unit.algorithm for unit in units[:4]} == {planned.HUMAN_MODEL, planned.CONSTANT}
         first = units[4:44]

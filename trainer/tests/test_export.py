@@ -110,3 +110,11 @@ def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
     policy, frames = load_policy(path, allow_unsigned=True), real_observations("left_turn", 30)[-1]
     past = np.stack([np.zeros_like(frames[0]), frames[1]])
     assert policy.act({"frames": frames}) == policy.act({"frames": past})
+
+
+def test_a_wrong_key_leaves_no_file(exported, tmp_path):
+    key = tmp_path / "wrong.key"
+    key.write_text("not a key")
+    with pytest.raises(UserError, match="not a private key"):
+        write_policy(exported.model, tmp_path / "policy.onnx", key)
+    assert not (tmp_path / "policy.onnx").exists()

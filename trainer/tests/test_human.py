@@ -84,9 +84,12 @@ def test_someone_takes_over_from_a_model_that_never_looks_and_every_step_is_labe
 
 def test_episodes_are_demonstrated_or_watched_in_turn(monkeypatch):
     config = replace(LABELLED, episodes=4, demonstrate_every=2)
-    looks, watched = Mock(return_value=None), []  # nobody takes over
+    looks, begins = Mock(return_value=None), Mock()  # nobody takes over
     monkeypatch.setattr(HumanGuide, "watch", looks)
-    for _ in imitate(HumanModel(config, seed=5), LeftTurnEnv(), seed=5):
+    monkeypatch.setattr(HumanGuide, "reset", begins)
+    watched = []
+    for number, _ in enumerate(imitate(HumanModel(config, seed=5), LeftTurnEnv(), seed=5), 1):
+        assert begins.call_count == 1 + number  # and once where the guide is made
         watched.append(looks.called)
         looks.reset_mock()
     assert watched == [True, False] * 2

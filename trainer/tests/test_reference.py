@@ -18,9 +18,9 @@ from torch.nn.functional import linear, max_pool2d, relu
 
 from trainer.learner import equations
 from trainer.learner.config import ALGORITHMS, OVERRULED_ACTION, PHIL, Algorithm, LearnerConfig
-from trainer.learner.networks import Actor, Critic, Picture
+from trainer.learner.networks import Actor, Critic, CriticPair, Picture
 from trainer.learner.replay import Batch
-from trainer.learner.td3 import NETWORKS, Losses, TD3Learner
+from trainer.learner.td3 import Losses, TD3Learner
 from trainer.tests.test_td3 import SMALL, make_batch, same_weights, weights_of
 
 COLUMNS = (
@@ -48,22 +48,24 @@ def q(critic: Critic, frames: Tensor, actions: Tensor) -> Tensor:
 
 
 class ReferenceLearner:
-    """Actor, two critics, their targets and optimisers, as another learner has them."""
+    """Actor, two critics, their targets and optimisers; arguments as ``TD3Learner``'s."""
 
-    def __init__(self, learner: TD3Learner) -> None:
-        self.config, self.algorithm = learner.config, learner.algorithm
-        self.actor, self.critics, self.target_actor, self.target_critics = (
-            copy.deepcopy(getattr(learner, name)) for name in NETWORKS
-        )
+    def __init__(self, config: LearnerConfig, algorithm: Algorithm, seed: int) -> None:
+        self.config, self.algorithm = config, algorithm
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            self.actor = Actor(1, config.frames)
+            self.critics = CriticPair(1, config.frames, config.action_bound, config.critic_norm)
+        self.target_actor = copy.deepcopy(self.actor)
+        self.target_critics = copy.deepcopy(self.critics)
         self.actor_optimiser, self.critic_optimiser = (
             torch.optim.Adam(module.parameters(), rate)
             for module, rate in (
-                (self.actor, self.config.actor_learning_rate),
-                (self.critics, self.config.critic_learning_rate),
+                (self.actor, config.actor_learning_rate),
+                (self.critics, config.critic_learning_rate),
             )
         )
-        self.noise = torch.Generator()
-        self.noise.set_state(learner.noise.get_state())
+        self.noise = torch.Generator().manual_seed(seed)
         self.updates = 0
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
@@ -149,16 +151,18 @@ class ReferenceLearner:
 
 def both(config: LearnerConfig, algorithm: Algorithm) -> tuple[TD3Learner, ReferenceLearner]:
     """With targets that differ from the online networks, as they do after some updates."""
-    fast, random = TD3Learner(config, algorithm, seed=2), torch.Generator().manual_seed(5)
-    with torch.no_grad():
-        for module in (fast.target_actor, fast.target_critics):
-            for p in module.parameters():
-                p.add_(0.02 * torch.randn(p.shape, generator=random))
-        # Fresh critics hardly feel the action: without this, whose it was would not show.
-        fast.target_actor.head.output.bias.add_(0.5)
-        for critic in fast.target_critics.pair:
-            critic.action.weight += 0.5
-    return fast, ReferenceLearner(fast)
+    fast, plain = TD3Learner(config, algorithm, 2), ReferenceLearner(config, algorithm, 2)
+    for learner in (fast, plain):
+        random = torch.Generator().manual_seed(5)
+        with torch.no_grad():
+            for module in (learner.target_actor, learner.target_critics):
+                for p in module.parameters():
+                    p.add_(0.02 * torch.randn(p.shape, generator=random))
+            # Fresh critics hardly feel the action: without this, whose it was would not show.
+            learner.target_actor.head.output.bias.add_(0.5)
+            for critic in learner.target_critics.pair:
+                critic.action.weight += 0.5
+    return fast, plain
 
 
 def check(config: LearnerConfig, algorithm: Algorithm, humans: int = 4) -> None:
@@ -235,7 +239,7 @@ def test_the_doubt_is_how_far_the_critics_are_apart():
     fast, plain = both(SMALL, ALGORITHMS["phil_gated"])
     batch = make_batch(0)
     seen, actions = torch.from_numpy(batch.frames[:1].copy()), torch.from_numpy(batch.actions[:1])
-    one, other = (float(q(critic, seen, actions)) for critic in plain.critics.pair)
+    one, other = (q(critic, seen, actions).item() for critic in plain.critics.pair)
     assert fast.doubt(batch.frames[0], batch.actions[0]) == pytest.approx(
         abs(one - other), rel=1e-3
     )
