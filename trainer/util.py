@@ -98,7 +98,7 @@ def save_torch(path: Path, state: Any) -> None:
     write_atomic(path, buffer.getbuffer())
 
 
-def load_torch(path: Path) -> Any:
+def load_torch(path: Path) -> dict[str, Any]:
     """Read what ``save_torch`` wrote.
 
     Raises UserError: not such a file. Only tensors and plain values are unpickled.
@@ -107,11 +107,14 @@ def load_torch(path: Path) -> Any:
 
     try:
         with open_regular(path) as stream:
-            return torch.load(stream, map_location="cpu", weights_only=True)
+            state = torch.load(stream, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise TypeError(type(state))
+        return state
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
     except Exception as error:
-        # torch raises its own unpickling errors for foreign files.
+        # torch raises its own unpickling errors for foreign files; ours hold a table of names.
         raise UserError(f"{path} is not a checkpoint of this project") from error
 
 
