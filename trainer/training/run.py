@@ -111,7 +111,7 @@ class TrainingRun:
     ) -> None:
         """Train until the configured end, or ``time.monotonic() > deadline_s``.
 
-        Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
+        Not twice: however it ends, the learner lets go of its thread. A new run with
         ``resume`` goes on.
         """
         about = {**asdict(self.config), "source_revision": util.source_revision()}
