@@ -72,8 +72,11 @@ def test_a_chassis_that_does_not_confirm(rig, change, words, outranks):
 
 @pytest.mark.parametrize(
     ("change", "clears"),
-    [({"faults": 0x0001}, True), ({"state": 2}, True), ({"faults": 0x1000}, False), ({}, False)],
-)
+    [
+        ({"faults": 0x0001}, True), ({"state": 2}, True), ({"state": 3}, False),
+        ({"faults": 0x1000}, False), ({}, False),
+    ],
+)  # fmt: skip
 def test_errors_are_cleared_before_control_is_asked_for_but_a_lost_link_is_not(rig, change, clears):
     rig.status = OK._replace(**change)
     rig.tell(protocol.SYSTEM_STATUS, rig.status)

@@ -44,9 +44,9 @@ STORIES: dict = {
         (A, 12, 10_000, 10.0, None),
     ],
     "a simulator that counts in leaps goes on from where it came to": [
-        (A, 0, 5, 0.0, None), (A, 100, 0, 0.1, FUTURE), (A, 101, 0, 0.2, FUTURE),
-        (A, 101, 11, 0.3, FUTURE), (A, 101, 11, 0.4, FUTURE), (A, 101, 10, 0.45, FUTURE),
-        (A, 101, 11, 0.5, None), (A, 101, 12, 0.5, None),
+        (A, 0, 5, 0.0, None), (A, 100, 0, 0.1, FUTURE), (A, 101, 1, 0.2, FUTURE),
+        (A, 101, 12, 0.3, FUTURE), (A, 101, 12, 0.4, FUTURE), (A, 101, 11, 0.45, FUTURE),
+        (A, 101, 12, 0.5, None), (A, 101, 13, 0.5, None),
         (A, 100, 1, 0.6, STALE), (B, 200, 0, 1.0, None), (A, 201, 13, 2.0, FUTURE),
         (B, 201, 0, 2.0, None), (B, 300, 14, 2.1, FUTURE), (B, 300, 24, 2.2, None),
     ],
