@@ -53,6 +53,7 @@ def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
     rig.step(20, PEDAL)
     assert rig.report.action["pedal"] == 0.0
     rig.core.brake(rig.now_s, latch=False)
+    assert rig.report.commanded_speed_mps == 0.0
     assert rig.step().report.action["pedal"] == -1.0
 
 
