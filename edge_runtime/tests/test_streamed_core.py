@@ -46,6 +46,19 @@ def test_a_new_core_knows_and_sends_nothing(rig):
     assert (rig.sent, core.state) == ([], State.DISABLED)
 
 
+@pytest.mark.parametrize(
+    ("period_s", "holds_s", "silence_s"),
+    [(0.1, 0.24, 0.2), (0.05, 0.13, 0.1), (0.5, 1.12, 1.0), (0.01, 0.042, 0.06)],
+)
+def test_two_periods_of_the_policy_hold_a_command_and_miss_feedback(
+    rig, period_s, holds_s, silence_s
+):
+    rig.core.follow_period(period_s)
+    rig.enabled().core.command(PEDAL, rig.now_s)
+    assert rig.core.late_at_s == pytest.approx(rig.now_s + holds_s)
+    assert rig.core._heard.silence_s == pytest.approx(silence_s)
+
+
 def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
     rig.enabled()
     assert rig.report.action["pedal"] == -1.0

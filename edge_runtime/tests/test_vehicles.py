@@ -11,7 +11,7 @@ import pytest
 import edge_runtime
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import Simulator, make_state, run_command, wait_until
-from edge_runtime.tests.rigs import CAR, PEDAL, HunterRig, Ros2Rig, a_manifest
+from edge_runtime.tests.rigs import CAR, a_manifest
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
@@ -125,16 +125,6 @@ def test_a_robot_follows_the_manifests_car_or_that_of_the_settings():
         assert known != vehicle_limits(name, {}, a_manifest())
         with pytest.raises(UserError, match=rf"'parking'.* set car in \[vehicle.{name}\]"):
             vehicle_limits(name, {}, a_manifest(None))
-
-
-@pytest.mark.parametrize("make", [HunterRig, Ros2Rig])
-@pytest.mark.parametrize(("period_s", "holds_s"), [(0.1, 0.24), (0.05, 0.13), (0.5, 1.12)])
-def test_a_streamed_command_holds_for_two_periods_of_the_policy(make, period_s, holds_s):
-    rig = make()
-    rig.core.follow_period(period_s)
-    rig.enabled().core.command(PEDAL, rig.now_s)
-    assert rig.core.late_at_s == pytest.approx(rig.now_s + holds_s)
-    assert rig.core._heard.silence_s == pytest.approx(2 * period_s)
 
 
 def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, capsys):
