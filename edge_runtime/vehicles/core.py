@@ -54,7 +54,7 @@ class Event(str, Enum):
     CLOSE = "close"
     CONFIRMED = "confirmed"  # CAN control, brake released, no error; or fresh odometry
     NOT_CONFIRMED = "not_confirmed"  # within ENABLE_TIMEOUT_S
-    COMMAND_LATE = "command_late"  # no fresh command for 2 T
+    COMMAND_LATE = "command_late"  # no fresh command for `command_timeout_s`
     REMOTE = "remote_control"
     ESTOP = "emergency_stop"
     STANDBY = "chassis_standby"  # or another mode that is not CAN control

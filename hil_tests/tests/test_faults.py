@@ -2,6 +2,7 @@
 
 import fnmatch
 import threading
+from pathlib import Path
 from unittest.mock import MagicMock, Mock
 
 import msgspec
@@ -162,6 +163,7 @@ def test_the_table_says_what_was_missed():
 def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
     names = [row.name for row in ROWS]
     assert len(set(names)) == len(names)
+    assert f"{len(names)} faults" in (Path(__file__).parents[2] / "README.md").read_text()
     for other in ("meteor", "meteor_*"):
         with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from .*edge_killed"):
             choose_rows([other])
