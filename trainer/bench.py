@@ -147,9 +147,9 @@ def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
     Ours in float32 is beside them where the processor has bfloat16; elsewhere ours is just that.
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
-    precisions = {OURS: config.precision, FLOAT32: "float32"}
-    if not multiplies_bfloat16("cpu") or config.precision == "float32":
-        precisions = {OURS: "float32"}
+    precisions = {OURS: "float32"}
+    if multiplies_bfloat16("cpu"):
+        precisions = {OURS: "bfloat16", FLOAT32: "float32"}
     contenders: dict[str, Work] = {}
     for name, precision in precisions.items():
         learner = TD3Learner(replace(config, precision=precision), PHIL, seed=0)
