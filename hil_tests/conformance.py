@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _tell(verdicts: list[str], told: int) -> int:
     """Print the verdicts after the first ``told``; how many are told then."""
-    for rule, words in list(zip(RULES, list(verdicts), strict=False))[told:]:
+    for rule, words in list(zip(RULES, verdicts, strict=False))[told:]:
         print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
         told += 1
     return told
