@@ -26,7 +26,7 @@ from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig
-from trainer.learner.networks import multiplies_bfloat16
+from trainer.learner.networks import bfloat16_is_faster
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 from trainer.options import add_threads, set_threads
@@ -144,11 +144,11 @@ def whole_update(learner: TD3Learner, replay: ReplayBuffer, batch_size: int) -> 
 def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
     """Milliseconds of a PHIL-TD3 update and of Stable-Baselines3's, where that is installed.
 
-    Ours in float32 is beside them where the processor has bfloat16; elsewhere ours is just that.
+    Ours in float32 is beside them where bfloat16 is faster; elsewhere ours is just that.
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
     precisions = {OURS: "float32"}
-    if multiplies_bfloat16("cpu"):
+    if bfloat16_is_faster("cpu"):
         precisions = {OURS: "bfloat16", FLOAT32: "float32"}
     contenders: dict[str, Work] = {}
     for name, precision in precisions.items():

@@ -38,7 +38,7 @@ from trainer.experiments import plan
 from trainer.experiments.plan import Plan, Unit
 from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
-from trainer.learner.networks import multiplies_bfloat16
+from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 
@@ -246,7 +246,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
         "processor": util.processor_model(),
-        "bfloat16": multiplies_bfloat16("cpu"),
+        "bfloat16": bfloat16_is_faster("cpu"),
         "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
         "source_revision": util.source_revision(),

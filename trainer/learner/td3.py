@@ -154,7 +154,7 @@ class TD3Learner:
     def _precision(self) -> torch.autocast:
         kind = self.device.type
         reduced = self.config.precision == "bfloat16" and self._reduces
-        enabled = reduced and networks.multiplies_bfloat16(kind)
+        enabled = reduced and networks.bfloat16_is_faster(kind)
         return torch.autocast(kind, torch.bfloat16, enabled=enabled)
 
     def _tensor(self, column: NDArray[Any]) -> Tensor:

@@ -57,7 +57,7 @@ def test_an_update_draws_learns_and_sets_the_new_priorities():
 @pytest.mark.parametrize(("has", "precision"), [(True, "bfloat16"), (False, "float32")])
 def test_an_effective_precision_of_float32_is_measured_once(has, precision, monkeypatch):
     monkeypatch.setattr(bench, "TRANSITIONS", 20)
-    monkeypatch.setattr(bench, "multiplies_bfloat16", lambda kind: has)
+    monkeypatch.setattr(bench, "bfloat16_is_faster", lambda kind: has)
     found = bench.measure_learner(TINY, lambda done: None)
     assert found["precision"] == precision
     assert found["updates_per_s"] == 1e3 / found["ms_per_update"]

@@ -120,21 +120,23 @@ def processor(monkeypatch):
 
     def pretend(*lines):
         monkeypatch.setattr(networks, "cpu_info", lambda: lines)
-        networks.multiplies_bfloat16.cache_clear()
+        networks.bfloat16_is_faster.cache_clear()
 
     yield pretend
-    networks.multiplies_bfloat16.cache_clear()
+    networks.bfloat16_is_faster.cache_clear()
 
 
 @pytest.mark.parametrize(
-    ("flags", "multiplies"),
-    [("flags : fma avx2 avx512f avx512_bf16 avx512_vnni", True),
-     ("Features : fp asimd i8mm bf16", True), ("flags : fma avx2 avx512f", False),
-     ("Features : fp asimd ebf16x", False), ("", False)],
+    ("lines", "faster"),
+    [(["flags : fma avx2 avx512f avx512_bf16 avx512_vnni"], True),
+     (["vendor_id : AuthenticAMD", "flags : avx512_bf16"], True),
+     (["vendor_id : GenuineIntel", "flags : avx512_bf16 amx_bf16"], False),
+     (["Features : fp asimd i8mm bf16"], True), (["flags : fma avx2 avx512f"], False),
+     (["Features : fp asimd ebf16x"], False), ([], False)],
 )  # fmt: skip
-def test_the_processors_flags_decide(processor, flags, multiplies):
-    processor(flags)
-    assert networks.multiplies_bfloat16("cpu") == multiplies
+def test_the_processors_flags_and_its_vendor_decide(processor, lines, faster):
+    processor(*lines)
+    assert networks.bfloat16_is_faster("cpu") == faster
 
 
 @pytest.mark.parametrize(
