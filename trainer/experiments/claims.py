@@ -1,7 +1,8 @@
 """The paper's claims: what is compared, over what, in which direction, and what we measured.
 
-A claim is about algorithms, so the numbers compared are one a training seed, paired by seed. It
-holds, or does not, where a 95 % interval lies on one side; else it is undecided.
+A claim is about algorithms, so the numbers compared are one a training seed, paired by seed. A
+comparison holds, or does not, where its 95 % interval lies on one side of the bar; else it is
+undecided.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from trainer.environments import CONDITIONS
 from trainer.experiments.data import (
     ALONE,
     CHANGED,
@@ -26,6 +28,7 @@ from trainer.experiments.data import (
     NOTHING,
     PAPER_SCENES,
     REWARD,
+    SCENES,
     SECONDS,
     SPREAD,
     SUCCESS,
@@ -45,7 +48,17 @@ from trainer.experiments.data import (
     within,
     words,
 )
-from trainer.experiments.plan import FOUR, GUIDED, HUMAN_MODEL, ONE_FRAME, RANDOM, SCENARIOS
+from trainer.experiments.plan import (
+    BIASED,
+    CONSTANT,
+    FOUR,
+    GUIDED,
+    HUMAN_MODEL,
+    ONE_FRAME,
+    PRINTED,
+    RANDOM,
+    SCENARIOS,
+)
 
 UNITS = {
     SUCCESS: (100.0, 1, " points"),
@@ -56,9 +69,9 @@ UNITS = {
     SECONDS: (1.0, 1, " s"),
     LATERAL: (1.0, 3, " m/s²"),
     LONGITUDINAL: (1.0, 3, " m/s²"),
-    KEPT: (100.0, 1, " % kept"),
+    KEPT: (100.0, 1, " % of the distance kept"),
     DROPPED: (100.0, 1, " points lost"),
-    CHANGED: (100.0, 1, " % change"),
+    CHANGED: (100.0, 1, " % of the distance gained"),
 }
 """Quantity -> factor, digits and unit as it is shown."""
 SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
@@ -93,7 +106,8 @@ class Comparison(NamedTuple):
 
     text: str
     holds: Holds
-    margin: float  # How far on the good side it is; nan where nothing is measured
+    margin: float
+    """How far on the good side it is, in half widths of its interval; nan: nothing is measured."""
     complete: bool  # Whether all trainings are there
 
 
@@ -105,6 +119,9 @@ def judge(results: Results, claim: Claim, kind: str) -> Comparison:
     if not measured:
         return Comparison("not measured", "undecided", float("nan"), False)
     worst = min(measured, key=lambda one: one.margin)
+    if len(made) > 1:
+        good = sum(one.holds == "yes" for one in made)
+        worst = worst._replace(text=f"{good} of {len(made)} hold; {worst.text}")
     return worst if all(one.complete for one in made) else worst._replace(holds="undecided")
 
 
@@ -128,13 +145,16 @@ def ahead(results: Results, kind: str, claim: Claim, sign: float = 1.0) -> Itera
             found = results.differences(place, first, second, quantity, kind)
             one, over = mean_estimate(found.values()), f" over {second.name}"
             complete = complete and results.complete(place, second, quantity)
+        bar, (factor, digits, unit) = claim.bar, UNITS[quantity]
         if sign:
-            holds, margin = above(one.times(sign), sign * claim.bar), sign * one.value
+            holds, margin = above(one.times(sign), sign * bar), sign * (one.value - bar)
         else:
             scale = 1.0 if quantity == SUCCESS else abs(own.value)
-            holds, margin = within(one, claim.bar or SAME_LEVEL * scale), -abs(one.value)
-        factor, digits, unit = UNITS[quantity]
-        text = f"{one.times(factor).text(digits)}{unit}: {first.name}{over}, "
+            bar = bar or SAME_LEVEL * scale
+            holds, margin = within(one, bar), bar - abs(one.value)
+        said = f", bar {'' if sign else '±'}{factor * bar:.{digits}f}" if bar else ""
+        text = f"{one.times(factor).text(digits)}{unit}{said}: {first.name}{over}, "
+        margin /= max(one.high - one.low, 1e-9)
         yield Comparison(text + _where(claim, place, quantity), holds, margin, complete)
 
 
@@ -165,10 +185,10 @@ def sooner(
         for first, second in product(claim.ours, [max(others, key=end)] if best else others):
             own, other = (results.of(str(place), line) for line in (first, second))
             one, steps = sooner_by(own, other, kind, quantity, common)
-            text = f"{one.text(1)} times, {steps}: {first.name} before {second.name}, "
-            text += _where(claim, place, quantity)
             times = claim.bar or 1.0
-            yield Comparison(text, above(one, times), one.value - times, complete)
+            text = f"{one.text(1)} times as soon, bar {times:g} ({steps}): {first.name} against "
+            text += f"{second.name}, {_where(claim, place, quantity)}"
+            yield Comparison(text, above(one, times), one.low - times, complete)
 
 
 sooner_to_common, sooner_than_best = partial(sooner, common=True), partial(sooner, best=True)
@@ -179,8 +199,9 @@ def sooner_by(
 ) -> tuple[Estimate, str]:
     """How many times as soon one line gets where another one ends, and both in steps.
 
-    A line that never gets there does so somewhere beyond the budget, so the ratio has bounds, and
-    its interval, a bootstrap over the seeds of both, reaches from the lower ones to the upper ones.
+    A line that is there at the first point of the grid got there at some step before it, and one
+    that never is does so at some step beyond the budget. So the ratio has bounds, and its interval,
+    a bootstrap over the seeds of both, reaches from the lower ones to the upper ones.
     """
     if not own or not other:
         return NOTHING, ""
@@ -188,7 +209,7 @@ def sooner_by(
     curves = [np.stack([r.curve(kind, quantity) for r in each]) for each in (own, other)]
     ends = [np.array([r.end(kind, quantity) for r in each]) for each in (own, other)]
 
-    def reached(rows: Sequence[NDArray[np.int64]]) -> list[float]:
+    def reached(rows: Sequence[NDArray[np.int64]]) -> list[Bounds]:
         means = [end[row].mean() for end, row in zip(ends, rows, strict=True)]
         goal = min(means) if common else means[1]
         return [
@@ -196,29 +217,43 @@ def sooner_by(
             for curve, row in zip(curves, rows, strict=True)
         ]
 
-    budget, random = float(grid[-1]), np.random.default_rng(0)
-    counts = [len(curve) for curve in curves]
+    random, counts = np.random.default_rng(0), [len(curve) for curve in curves]
     drawn = [
         reached([random.integers(count, size=count) for count in counts]) for _ in range(RESAMPLES)
     ]
     first, second = reached([np.arange(count) for count in counts])
-    lowest = bootstrap(
-        [min(its, budget) / ours for ours, its in drawn], min(second, budget) / first, min(counts)
-    )
-    highest = bootstrap([its / min(ours, budget) for ours, its in drawn], 0.0, min(counts))
-    said = [f"{steps:,.0f}" if np.isfinite(steps) else "never" for steps in (first, second)]
-    return lowest._replace(high=highest.high), f"{said[0]} against {said[1]} steps"
+    exact = first.low == first.high and second.low == second.high
+    point = second.low / first.low if exact else float("nan")
+    lowest = bootstrap([its.low / ours.high for ours, its in drawn], point, min(counts))
+    with np.errstate(divide="ignore"):
+        ratios = np.divide(*np.array([(its.high, ours.low) for ours, its in drawn]).T)
+    highest = bootstrap([*ratios], point, min(counts))
+    return lowest._replace(high=highest.high), f"{first.said()} against {second.said()} steps"
 
 
-def first_reached(grid: Numbers, curve: Numbers, least: float) -> float:
+class Bounds(NamedTuple):
+    """Between which steps something happened; twice the same number where that is known."""
+
+    low: float
+    high: float
+
+    def said(self) -> str:
+        """As in "1,234", "within 500" and "over 6,000"."""
+        if self.low == self.high:
+            return f"{self.low:,.0f}"
+        return f"within {self.high:,.0f}" if self.low == 0.0 else f"over {self.low:,.0f}"
+
+
+def first_reached(grid: Numbers, curve: Numbers, least: float) -> Bounds:
     """Steps until a curve first reaches a level, between two points on a straight line."""
     places = np.flatnonzero(curve >= least - 1e-9)
     if not len(places):
-        return float("inf")
+        return Bounds(float(grid[-1]), float("inf"))
     place = int(places[0])
     if place == 0:
-        return float(grid[0])
-    return float(np.interp(least, curve[place - 1 : place + 1], grid[place - 1 : place + 1]))
+        return Bounds(0.0, float(grid[0]))
+    steps = np.interp(least, curve[place - 1 : place + 1], grid[place - 1 : place + 1])
+    return Bounds(float(steps), float(steps))
 
 
 def same_ranking(results: Results, kind: str, claim: Claim) -> Iterator[Comparison]:
@@ -271,8 +306,8 @@ CLAIMS: tuple[Claim, ...] = (
           sooner, [LEFT], [PHIL, IA, HI], [PER], BOTH),
     Claim("fig7", "left turn: HI-TD3 is the slowest of the guided", "slowest",
           sooner_to_common, [LEFT], [PHIL, IA], [HI], BOTH),
-    Claim("fig7", "left turn: PHIL-TD3 reaches the best baseline's reward seven times as soon",
-          "over 700 %", sooner_than_best, [LEFT], [PHIL], BASELINES, [REWARD], 7.0),
+    Claim("fig7", "left turn: PHIL-TD3 reaches the best baseline's reward 8 times as soon",
+          "over 700 % better", sooner_than_best, [LEFT], [PHIL], BASELINES, [REWARD], 8.0),
     Claim("fig7", "congestion: PHIL-TD3 and IA-TD3 have comparable rewards", "comparable",
           level, [JAM], [PHIL], [IA], [REWARD]),
     Claim("fig7", "congestion: their rewards are above those of HI-TD3 and vanilla TD3", "better",
@@ -284,7 +319,7 @@ CLAIMS: tuple[Claim, ...] = (
     Claim("fig7", "congestion: IA-TD3 learns faster than HI-TD3", "faster",
           sooner_to_common, [JAM], [IA], [HI]),
     Claim("fig7", "congestion: PHIL-TD3 reaches the best baseline's distance 2.2 times as soon",
-          "over 120 %", sooner_than_best, [JAM], [PHIL], BASELINES, [DISTANCE], 2.2),
+          "over 120 % better", sooner_than_best, [JAM], [PHIL], BASELINES, [DISTANCE], 2.2),
     Claim("fig8", "one frame instead of two does not change the ranking", "same",
           same_ranking, SCENARIOS, [PHIL, IA, HI, PER]),
     Claim("fig8", "PHIL-TD3 and IA-TD3 lose less by it than HI-TD3 and vanilla TD3", "less",
@@ -343,8 +378,8 @@ CLAIMS: tuple[Claim, ...] = (
           behind, [EVERYWHERE], [IA], quantities=[CHANGED]),
     Claim("fig14", "poor guidance does not degrade HI-TD3", "+3.6 %",
           ahead, [EVERYWHERE], [HI], quantities=[CHANGED], bar=-NEARLY),
-    Claim("fig14", "PHIL-TD3 is more robust to poor guidance than IA-TD3", "more",
-          ahead, [EVERYWHERE], [PHIL], [IA], [CHANGED]),
+    Claim("fig14", "poor guidance degrades IA-TD3 more than PHIL-TD3 and HI-TD3", "most",
+          ahead, [EVERYWHERE], [PHIL, HI], [IA], [CHANGED]),
     Claim("fig15", "left turn: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
           behind, LEFTS, [POOR_PHIL], [POOR_IA, POOR_HI], [LONGITUDINAL]),
     Claim("fig15", "congestion: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
@@ -353,3 +388,37 @@ CLAIMS: tuple[Claim, ...] = (
           level, [LEFT], [PHIL], [IA], [SECONDS]),
 )  # fmt: skip
 """All that the paper says of its results."""
+AS_PRINTED = tuple(
+    claim._replace(
+        source=PRINTED,
+        ours=[Line(line.algorithm, PRINTED) for line in claim.ours],
+        others=[line and Line(line.algorithm, PRINTED) for line in claim.others],
+    )
+    for claim in CLAIMS
+    if claim.source == "fig9" and claim.quantities in ([SUCCESS], [DROPPED])
+)
+"""Its claims of success once more, of the settings as it prints them."""
+NOMINAL, NOISE, VARIANT, DENSE = (
+    [scene for scene in SCENES if scene.condition == condition] for condition in CONDITIONS
+)
+GOALS: tuple[Claim, ...] = (
+    Claim("goals", "vanilla TD3 and HI-TD3 learn to drive", "85 %",
+          ahead, NOMINAL, [PER, HI], quantities=[SUCCESS], bar=0.85),
+    Claim("goals", "they are above the best constant action", "ahead",
+          ahead, SCENES, [PER, HI], [Line(CONSTANT)], [SUCCESS]),
+    Claim("goals", "PHIL-TD3's success in the nominal scenes", "99 %",
+          ahead, NOMINAL, [PHIL], quantities=[SUCCESS], bar=0.99),
+    Claim("goals", "PHIL-TD3's success with command noise", "98 %",
+          ahead, NOISE, [PHIL], quantities=[SUCCESS], bar=0.98),
+    Claim("goals", "PHIL-TD3's success in the variants", "96 %",
+          ahead, VARIANT, [PHIL], quantities=[SUCCESS], bar=0.96),
+    Claim("goals", "PHIL-TD3 is ahead of its human in success", "in four of six scenes",
+          ahead, PAPER_SCENES, [PHIL], [HUMAN], [SUCCESS]),
+    Claim("goals", "PHIL-TD3 is ahead of its human in distance", "in four of six scenes",
+          ahead, PAPER_SCENES, [PHIL], [HUMAN]),
+    Claim("goals", "PHIL-TD3 is ahead of the baselines in the dense scenes", "ahead",
+          ahead, DENSE, [PHIL], BASELINES, [SUCCESS]),
+    Claim("goals", "PHIL-TD3 is ahead of IA-TD3 after biased guidance", "in one scene",
+          ahead, SCENES, [Line("phil_td3", BIASED)], [Line("ia_td3", BIASED)], [SUCCESS]),
+)  # fmt: skip
+"""What this project wants of the learner, beyond what the paper says."""

@@ -46,14 +46,13 @@ class Estimate(NamedTuple):
         return held.times(100.0).text(1)
 
     def text(self, digits: int = 2) -> str:
-        """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
+        """As in "0.97 [0.93, 0.99]"; a dash for nothing, the interval alone where no number is."""
         if not self.size:
             return "–"
-        shown = f"{self.value:.{digits}f}"
+        shown, low, high = (f"{number:.{digits}f}" for number in self[:3])
         if np.isinf([self.low, self.high]).all():
             return shown
-        low, high = (f"{end:.{digits}f}".replace("inf", "∞") for end in (self.low, self.high))
-        return f"{shown} [{low}, {high}]"
+        return f"{shown} [{low}, {high}]".replace("nan ", "").replace("inf", "∞")
 
 
 NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
@@ -174,6 +173,7 @@ class Costs(NamedTuple):
     takeovers: int
     failures: int  # Training episodes that missed the goal, whoever drove
     human_s: float
+    steps: float  # Of the environment
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Result:
     @property
     def costs(self) -> Costs:
         """What the whole training cost."""
-        return self._costs_at(np.inf)
+        return self._costs_at(self.record["training"]["end_step"][-1])
 
     def until(self, level: float) -> Costs | None:
         """What it cost until the policy alone reached ``level`` in validation; None: never."""
@@ -251,7 +251,7 @@ class Result:
         outcomes = np.asarray(columns["outcome"])[so_far]
         human_steps, period_s = int(human.sum()), self.record.get("period_s", 0.1)
         failures = sum(failed(outcome) for outcome in outcomes.tolist())
-        return Costs(human_steps, int(takeovers.sum()), failures, human_steps * period_s)
+        return Costs(human_steps, int(takeovers.sum()), failures, human_steps * period_s, step)
 
     def reached(self, condition: str) -> NDArray[np.bool_]:
         """Which test drives reached the goal, by seed."""
@@ -334,29 +334,16 @@ class Results:
         return mean_estimate(self.numbers(place, line, quantity, kind).values())
 
     def _kept(self, scenario: str, line: Line, kind: str) -> BySeed:
-        """Each seed's part in the ratio of the final distances, one frame over two.
-
-        The mean of these is the ratio of the means, and their spread that ratio's to first order.
-        A mean of the seeds' own ratios would be ruled by a seed that learned next to nothing.
-        """
-        two = self.numbers(scenario, line, DISTANCE, kind)
-        one = self.numbers(scenario, Line(line.algorithm, ONE_FRAME), DISTANCE, kind)
-        seeds = sorted(two.keys() & one.keys())
-        mean = float(np.mean([two[seed] for seed in seeds])) if seeds else 0.0
-        if not mean:
-            return {}
-        ratio = float(np.mean([one[seed] for seed in seeds])) / mean
-        return {seed: ratio + (one[seed] - ratio * two[seed]) / mean for seed in seeds}
+        """Each seed's part in the ratio of the final distances, one frame over two."""
+        lines = Line(line.algorithm, ONE_FRAME), line
+        return _ratio(*(self.numbers(scenario, each, DISTANCE, kind) for each in lines))
 
     def _changed(self, scenes: Sequence[Scene], line: Line) -> BySeed:
-        """Each seed's change of the distance by poor guidance, mean of the scenes."""
-        by_seed: dict[int, list[float]] = {}
-        for scene in scenes:
-            lines = line, Line(line.algorithm, RANDOM)
-            good, poor = (self.numbers(scene, one, DISTANCE) for one in lines)
-            for seed in good.keys() & poor.keys():
-                by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
-        return {seed: float(np.mean(values)) for seed, values in by_seed.items()}
+        """Each seed's part in the change of the distance by poor guidance, mean of the scenes."""
+        lines = Line(line.algorithm, RANDOM), line
+        found = [_ratio(*(self.numbers(one, each, DISTANCE) for each in lines)) for one in scenes]
+        seeds = set[int].intersection(*map(set, found))
+        return {seed: float(np.mean([one[seed] for one in found])) - 1.0 for seed in sorted(seeds)}
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
@@ -386,6 +373,20 @@ class Results:
                 values = (r.drives(place.condition, quantity)[both] for r in (result, rival))
                 found[result.unit.seed] = float(np.subtract(*values).mean())
         return found
+
+
+def _ratio(above: BySeed, below: BySeed) -> BySeed:
+    """Each seed's part in the ratio of two means.
+
+    The mean of these is the ratio of the means, and their spread that ratio's to first order. A
+    mean of the seeds' own ratios would be ruled by a seed that learned next to nothing.
+    """
+    seeds = sorted(above.keys() & below.keys())
+    mean = float(np.mean([below[seed] for seed in seeds])) if seeds else 0.0
+    if not mean:
+        return {}
+    ratio = float(np.mean([above[seed] for seed in seeds])) / mean
+    return {seed: ratio + (above[seed] - ratio * below[seed]) / mean for seed in seeds}
 
 
 def load(store: Store, seeds: int, name: str = "all") -> Results:

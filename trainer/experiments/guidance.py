@@ -18,7 +18,7 @@ from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
 from trainer.experiments import data, plan
 from trainer.experiments.data import Line, Result, Results
-from trainer.experiments.report import COMMAND, LEARNED, WELL, colour, human_seconds
+from trainer.experiments.report import COMMAND, LEARNED, WELL, colour, until
 from trainer.experiments.run import Store
 from trainer.pictures import write_figure
 
@@ -89,7 +89,8 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         "Every row has the same scenes, human, replay buffer and budget of environment steps "
         f"({budgets}). **Every human here is a script or a model of one: no person's cost is "
         "claimed.** Seconds are simulated ones in which the human drove. Numbers are means of the "
-        "seeds with their 95 % interval; behind a level, in brackets, how many seeds reach it.",
+        "seeds with their 95 % interval; what it took to a level is the median of the seeds, the "
+        "least and the most of them, and how many get there.",
         "",
         f"![Success of the policy alone by what the human has given]({plan.GUIDANCE}.png)",
         "",
@@ -140,7 +141,6 @@ def _page(results: Results, store: Store) -> Iterator[str]:
 
 
 def _row(results: Results, task: str, line: Line, found: list[Result]) -> tuple[str, ...]:
-    until = [cost.takeovers for result in found if (cost := result.until(LEARNED))]
     nominal, tested = data.Scene(task, "nominal"), found[0].record["tests"]
     shares = {
         name: results.estimate(data.Scene(task, name), line, data.SUCCESS).as_share()
@@ -151,8 +151,8 @@ def _row(results: Results, task: str, line: Line, found: list[Result]) -> tuple[
         Line(line.algorithm).name,
         data.words(task),
         str(len(found)),
-        *(human_seconds(found, level) for level in (LEARNED, WELL)),
-        data.mean_estimate(until).text(0),
+        *(until(found, level, "human_s") for level in (LEARNED, WELL)),
+        until(found, LEARNED, "takeovers"),
         data.mean_estimate(result.costs.human_s for result in found).text(0),
         data.mean_estimate(result.costs.failures for result in found).text(0),
         *(shares.get(name, "–") for name in CONDITIONS),
@@ -177,7 +177,7 @@ def _cells(results: Results, row: str) -> Iterator[str]:
         share = results.estimate(
             data.Scene(plan.LEFT[0], "nominal"), Line(row, human), data.SUCCESS
         ).as_share()
-        yield f"{share}, {human_seconds(found, LEARNED)}" if found else "–"
+        yield f"{share}, {until(found, LEARNED, 'human_s')}" if found else "–"
 
 
 def draw(results: Results) -> Figure:

@@ -166,6 +166,9 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "time": Experiment("training time", FOUR, scenarios=LEFT),
     "printed": Experiment("the settings as the paper prints them", FOUR, (NORMAL, PRINTED)),
     "floor": Experiment("the best constant action", (CONSTANT,)),
+    "goals": Experiment(
+        "what this project wants of the learner", (*FOUR, *TESTED_ONLY), (NORMAL, BIASED)
+    ),
     "cost": Experiment("what a training cost, and whether it lasts", FOUR),
 }
 """Name on the command line -> what it is."""

@@ -5,19 +5,29 @@ A summary, a part for each experiment; figures 7 to 15, the ablation, the printe
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.lines import Line2D
 
 from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.experiments import data, plan
-from trainer.experiments.claims import CLAIMS, Claim, Comparison, first_reached, judge_both
+from trainer.experiments.claims import (
+    AS_PRINTED,
+    CLAIMS,
+    GOALS,
+    OF_CURVES,
+    Claim,
+    Comparison,
+    judge_both,
+)
 from trainer.experiments.data import Line, Place, Result, Results, Scene, words
 from trainer.experiments.plan import EXPERIMENTS, HUMAN_MODEL, NORMAL, PAPER_TESTS, SCENARIOS
 from trainer.experiments.run import Store
@@ -64,7 +74,7 @@ def write_report(store: Store, seeds: int) -> Path:
 
 
 def _page(results: Results, store: Store) -> Iterator[str]:
-    judged = [(claim, *judge_both(results, claim)) for claim in CLAIMS]
+    judged = [(claim, *judge_both(results, claim)) for claim in (*CLAIMS, *AS_PRINTED, *GOALS)]
     yield from _summary(results, store, judged)
     for name, experiment in EXPERIMENTS.items():
         title = f"{name}: {experiment.title}"
@@ -81,8 +91,16 @@ def _page(results: Results, store: Store) -> Iterator[str]:
             if claim.source == name
         ]
         if rows:
-            head = ("claim", "the paper", "what decides", "holds", "policy alone", "holds")
-            yield from markdown_table(head, rows)
+            head = (
+                "claim",
+                "wanted" if name == "goals" else "the paper",
+                "what decides",
+                "holds",
+                "policy alone",
+                "holds alone",
+            )
+            columns = len(head) if name in OF_CURVES else len(head) - 2
+            yield from markdown_table(head[:columns], [row[:columns] for row in rows])
 
 
 def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:
@@ -95,38 +113,68 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         "writes this page and its figures from `left_turn.jsonl` and `congestion.jsonl`, one line "
         f"a training. {len(results.found)} of {wanted} trainings and tests are there.",
         "",
-        f"Every algorithm has the same budget of environment steps: {steps}. The policy is "
-        f"validated alone every {store.plan.evaluate_every_steps} steps; the best validated actor "
-        f"drives {store.plan.test_runs} test drives in each scene, of which the first "
-        f"{PAPER_TESTS} have the paper's seeds.",
+        "What differs from the paper: the scenes are drawn by highway-env's traffic and not by "
+        "CARLA; the budget is counted in environment steps, the same for every algorithm: "
+        f"{steps}, where the paper trains for 400 episodes; and the learner has the settings of "
+        f"this project, {_ours()}. What the paper's own settings give is [printed](#"
+        f"{_anchor('printed')}).",
         "",
-        "A claim holds or does not where a 95 % interval of the difference, paired by training "
-        "seed, lies on one side; else it is undecided. What decides is the worst of the "
-        "comparisons that it makes. Learning curves are judged twice: as the paper does, on "
-        "training episodes in which the human helps, and by the policy alone on validation drives.",
+        f"The policy is validated alone every {store.plan.evaluate_every_steps} steps; the best "
+        f"validated actor drives {store.plan.test_runs} test drives in each scene, of which the "
+        f"first {PAPER_TESTS} have the paper's seeds.",
+        "",
+        "A comparison holds, or does not, where a 95 % interval of the difference, paired by "
+        "training seed, lies on one side of its bar, which is 0 where none is named; else it is "
+        "undecided. A claim holds where all of its comparisons do, and does not where one does "
+        "not; the clearest of those is shown. The intervals are over training seeds, in these "
+        "scenes with these test drives; the human model is a single one. Learning curves are "
+        "judged twice: as the paper does, on training episodes in which the human helps, where "
+        "whom the human rescues is at the goal; and by the policy alone on validation drives.",
         "",
     )
     if results.stale:
         yield f"{len(results.stale)} records are of other settings than today's and left out."
         yield ""
-    counts: Counter[tuple[str, str]] = Counter(
-        (claim.source, found.holds) for claim, found, _ in judged
-    )
     answers = ("yes", "no", "undecided")
-    rows = [
-        (f"[{name}](#{_anchor(name)})", one.title, *(counts[name, answer] for answer in answers))
-        for name, one in EXPERIMENTS.items()
-    ]
-    totals = (sum(counts[name, answer] for name in EXPERIMENTS) for answer in answers)
-    yield from markdown_table(("", "about", *answers), [*rows, ("all", "", *totals)])
+    rows = []
+    for name, one in EXPERIMENTS.items():
+        its = [(found, alone) for claim, found, alone in judged if claim.source == name]
+        if its:
+            counts = (Counter(one.holds for one in each if one) for each in zip(*its, strict=True))
+            cells = (f"{count[answer]}" if count else "" for count in counts for answer in answers)
+            rows.append((f"[{name}](#{_anchor(name)})", one.title, *cells))
+    head = ("", "about", *answers, *(f"{answer}, alone" for answer in answers))
+    yield from markdown_table(head, rows)
     yield from markdown_table(
-        ("setting", "meaning", "algorithms"),
+        ("setting", "meaning", "algorithms", "computed in bfloat16"),
         (
-            (name, plan.SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
-            for name, algorithms, *_ in plan.LINES
+            (
+                words(setting),
+                plan.SETTINGS[setting].meaning,
+                ", ".join(Line(name).name for name in algorithms),
+                _in_bfloat16(results, [Line(name, setting) for name in algorithms]),
+            )
+            for setting, algorithms, *_ in plan.LINES
             if HUMAN_MODEL not in algorithms
         ),
     )
+
+
+def _in_bfloat16(results: Results, lines: Sequence[Line]) -> str:
+    """How many of the trainings multiplied in bfloat16; the others did in float32."""
+    found = chain(*(results.of(*each) for each in product(SCENARIOS, lines)))
+    reduced = [one.record["computed"].get("bfloat16", False) for one in found]
+    return f"{sum(reduced)} of {len(reduced)}"
+
+
+def _ours() -> str:
+    """The learner's settings that are not the paper's, as the presets have them."""
+    ours, printed = (asdict(plan.PRESETS[name].learner) for name in ("ours", "printed"))
+    return ", ".join(
+        f"`{name}` {value:g} for {printed[name]:g}" if isinstance(value, float) else
+        f"`{name}` {value} for {printed[name]}"
+        for name, value in ours.items() if value != printed[name]
+    )  # fmt: skip
 
 
 def _anchor(name: str) -> str:
@@ -189,18 +237,22 @@ def _distances(results: Results, name: str) -> Iterator[str]:
 def _floor(results: Results) -> Iterator[str]:
     for scenario in SCENARIOS:
         for result in results.of(scenario, Line(plan.CONSTANT)):
-            action, tried = result.record["action"], len(result.record["success_of"])
-            yield f"Best in the {words(scenario)}: {action:g}, of {tried} on validation drives."
+            action, success = result.record["action"], result.record["success_of"]
+            yield (
+                f"Best in the {words(scenario)}: {action:g}, of {len(success)} tried. It brings "
+                f"{success[f'{action:g}']:.0%} of {plan.PLAN.search_runs} validation drives to the "
+                "goal."
+            )
             yield ""
 
 
 def _cost(results: Results) -> Iterator[str]:
     """Steps and human effort of every line, and how much of the best policy is left at the end."""
     yield (
-        f"Means of the seeds. Steps until the policy alone reaches {LEARNED:.0%} of its validation "
-        f"drives, and the seconds that the human drove until it reached {LEARNED:.0%} and "
-        f"{WELL:.0%}, of those seeds that do; late: validations of the last "
-        f"{data.END_STEPS:,} steps."
+        f"Environment steps, and seconds that the human drove, until the policy alone reaches "
+        f"{LEARNED:.0%} or {WELL:.0%} of its validation drives: median of the seeds, the least and "
+        "the most of them, and how many get there. The rest are means. Late: validations of the "
+        f"last {data.END_STEPS:,} steps, against the best one, which chance makes better, too."
     )
     yield ""
     rows = []
@@ -208,32 +260,37 @@ def _cost(results: Results) -> Iterator[str]:
         found = [result for result in results.of(scenario, line) if result.unit.trained]
         if not found:
             continue
-        steps = [first_reached(r.grid, r.curve(data.ALONE, data.SUCCESS), LEARNED) for r in found]
-        there = [step for step in steps if np.isfinite(step)]
         rows.append(
             (
                 line.name,
                 words(scenario),
-                f"{np.mean(there):,.0f}" if there else "–",
-                f"{len(there)} of {len(found)}",
-                *(human_seconds(found, level) for level in (LEARNED, WELL)),
+                str(len(found)),
+                until(found, LEARNED, "steps"),
+                *(until(found, level, "human_s") for level in (LEARNED, WELL)),
                 f"{100 * np.mean([r.unlearned for r in found]):.1f}",
                 f"{100 * max(r.unlearned for r in found):.1f}",
                 *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
+                f"{np.mean([r.record['totals']['updates'] for r in found]):,.0f}",
             )
         )
     head = (
-        "", "scenario", f"steps to {LEARNED:.0%}", "seeds",
+        "", "scenario", "seeds", f"steps to {LEARNED:.0%}",
         *(f"human s to {level:.0%}" for level in (LEARNED, WELL)), "late below best, points",
-        "at most", "human steps", "take-overs", "failures",
+        "at most", "human steps", "take-overs", "failures", "updates",
     )  # fmt: skip
     yield from markdown_table(head, rows)
 
 
-def human_seconds(found: Sequence[Result], level: float) -> str:
-    """How long the human drove until a level, of those that reach it; in brackets how many do."""
-    there = [cost.human_s for result in found if (cost := result.until(level))]
-    return f"{data.mean_estimate(there).text(0)} ({len(there)})" if there else "–"
+def until(found: Sequence[Result], level: float, what: str) -> str:
+    """A cost until the policy alone reached a level: median, least and most of the seeds.
+
+    A seed that never does costs more than any other. In brackets, how many do.
+    """
+    costs = [getattr(one.until(level), what, np.inf) for one in found]
+    there = int(np.isfinite(costs).sum())
+    shown = [f"{cost:,.0f}" for cost in (np.median(costs), min(costs), max(costs))]
+    middle, least, most = (text.replace("inf", "never") for text in shown)
+    return f"{middle} [{least}, {most}] ({there})" if there else "–"
 
 
 LEARNED, WELL = metrics.LEARNED
@@ -259,7 +316,7 @@ TITLES = {
     data.LATERAL: "mean |lateral acceleration|, m/s²",
     data.LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
 }
-HATCHES = {"one_frame": "//", "random": "//", "biased": "xx"}
+MARKERS = {"normal": "o", "one_frame": "D", "random": "^", "biased": "v"}
 SCENE_KEY = "L: left turn, C: congestion, -N: command noise, -V: variant, -D: dense"
 Panel = tuple[Sequence[Place], str, str]
 """Side by side in a panel: the places, their quantity, and the kind of their curves."""
@@ -268,6 +325,13 @@ Panel = tuple[Sequence[Place], str, str]
 def colour(line: Line, place: int = 0) -> str:
     """An algorithm's colour, the same in every figure."""
     return COLOURS.get(line.algorithm, OTHERS[place % len(OTHERS)])
+
+
+def _marked(line: Line, place: int) -> dict[str, Any]:
+    """A point of an algorithm: its colour, and a shape for the setting; hollow but in normal."""
+    own = colour(line, place)
+    filled = own if line.setting == NORMAL else "white"
+    return {"marker": MARKERS[line.setting], "color": own, "mfc": filled, "ms": 5, "ls": "none"}
 
 
 def lines_of(name: str) -> list[Line]:
@@ -289,7 +353,7 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
             if not found or (metric == data.REWARD and line.setting == "printed"):
                 continue  # the printed reward is on another scale
             curves, grid = np.stack([result.curve(kind, metric) for result in found]), found[0].grid
-            mean, spread = curves.mean(axis=0), curves.std(axis=0)
+            mean, spread = curves.mean(axis=0), curves.std(axis=0, ddof=len(curves) > 1)
             look = {"ls": "-" if line.setting == NORMAL else "--", "color": colour(line, place)}
             panel.plot(grid, mean, **look, lw=1.8, label=f"{line.name}, seeds: {len(found)}")
             band = mean - spread, mean + spread
@@ -297,7 +361,7 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
         if metric != data.REWARD:
             best = 1.0 if metric == data.SUCCESS else plan.FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")
-            panel.set_ylim(0.0, 1.05 * best)
+            panel.set_ylim(top=1.05 * best)
         panel.grid(alpha=0.3)
         if (kind, metric) == CURVES[-1] and panel.get_legend_handles_labels()[1]:
             panel.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
@@ -312,40 +376,40 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
 def draw_groups(
     results: Results, lines: Sequence[Line], panels: Sequence[Panel], rows: int
 ) -> Figure:
-    """The lines side by side in each place of each panel: bars are means of the seeds; boxes, of
+    """The lines side by side in each place of each panel: points are means of the seeds; boxes, of
     what is compared of arrivals only, are of the drives of all seeds that arrive.
     """
     figure = Figure(figsize=(15.0, 1.8 + 2.8 * rows), layout="constrained")
     axes, width = figure.subplots(rows, len(panels) // rows), 0.8 / len(lines)
     for axis, (places, quantity, kind) in zip(axes.flat, panels, strict=True):
-        alone = "" if isinstance(places[0], Scene) else f", {kind}"
-        axis.set_title(f"{TITLES[quantity]}{alone}", fontsize=10)
+        first = places[0]
+        where = words(first.scenario) if isinstance(first, Scene) else kind
+        axis.set_title(f"{TITLES[quantity]}, {where}", fontsize=10)
         for (group, place), (side, line) in product(enumerate(places), enumerate(lines)):
             x = group + (side - 0.5 * (len(lines) - 1)) * width
-            look = {"fc": colour(line, side), "hatch": HATCHES.get(line.setting), "alpha": 0.7}
+            look = _marked(line, side)
             if isinstance(place, Scene) and quantity in data.ARRIVED_ONLY:
                 arrived = results.pooled(place, line, data.SUCCESS) > 0.0
                 values = results.pooled(place, line, quantity)[arrived]
                 if len(values):
                     axis.boxplot(
                         [values], positions=[x], widths=0.85 * width, patch_artist=True,
-                        boxprops=look, flierprops={"ms": 2}, medianprops={"color": "black"},
+                        boxprops={"fc": look["mfc"], "ec": look["color"]}, showfliers=False,
+                        medianprops={"color": "black"},
                     )  # fmt: skip
             else:
                 values = np.array([*results.numbers(place, line, quantity, kind).values()])
                 if len(values):
-                    axis.bar(x, values.mean(), width, yerr=values.std(), capsize=2, **look)
+                    spread = values.std(ddof=1) if len(values) > 1 else None
+                    axis.errorbar(x, values.mean(), spread, capsize=2, **look)
         axis.set_xticks(range(len(places)), [words(place) for place in places], fontsize=8)
         axis.set_xlim(-0.6, len(places) - 0.4)
         axis.grid(alpha=0.3)
         axis.set_axisbelow(True)
-    handles = [
-        Patch(fc=colour(line, side), hatch=HATCHES.get(line.setting), label=line.name)
-        for side, line in enumerate(lines)
-    ]
+    handles = [Line2D([], [], label=line.name, **_marked(line, n)) for n, line in enumerate(lines)]
     figure.legend(handles=handles, fontsize=8, ncols=6, loc="outside upper center")
     figure.supxlabel(
-        f"{SCENE_KEY}; bar: mean and standard deviation of the seeds; box: drives that arrive",
+        f"{SCENE_KEY}; point: mean and standard deviation of the seeds; box: drives that arrive",
         fontsize=8,
     )
     return figure

@@ -104,7 +104,7 @@ def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
             "distance_m": (full_m * success).tolist(),
             "reward": (20.0 * success - 10.0).tolist(),
         },
-        "totals": {"steps": BUDGET},
+        "totals": {"steps": BUDGET, "updates": BUDGET},
     }
 
 

@@ -118,7 +118,6 @@ class TestClaims:
             (claims.level, claims.PHIL, [claims.PER], 0.0, "no"),
             (claims.ahead, claims.PHIL, [None], 0.5, "yes"),
             (claims.sooner, claims.PHIL, [claims.PER], 0.0, "yes"),
-            (claims.sooner, claims.PHIL, [claims.PER], 50.0, "no"),
         ],
     )
     def test_who_is_ahead_or_sooner_and_who_is_not(
@@ -153,24 +152,52 @@ class TestClaims:
         assert sooner_by(own, own) == (pytest.approx(1.0), "2,000 against 2,000 steps")
         assert sooner_by(own, other) == (pytest.approx(3.0), said)
         other[0].record["validation"]["success"] = [0.1] * 12
-        assert sooner_by(other, own)[1] == "never against 2,000 steps"
-        assert sooner_by(other, own, common=True)[1] == "500 against 500 steps"
+        ratio, said = sooner_by(other, own)
+        assert (np.isnan(ratio), said) == (True, "over 6,000 against 2,000 steps")
+        both = sooner_by(other, own, common=True)[1]
+        assert both == "within 500 against within 500 steps"
+
+    @pytest.mark.parametrize(
+        ("own", "other", "bar", "holds"),
+        [
+            (0, 2_000, 1.0, "yes"),  # There at 500 or before: 4 times as soon, if not more
+            (0, 2_000, 50.0, "undecided"),
+            (0, 0, 1.0, "undecided"),
+            (7_000, 2_000, 1.0, "no"),  # Never: in less than a third of the time at best
+        ],
+    )
+    def test_what_happens_before_the_first_look_or_after_the_last_has_bounds(
+        self, own, other, bar, holds
+    ):
+        units = [
+            Unit("left_turn", name, NORMAL, s) for name in ("phil_td3", "per_td3") for s in (1, 2)
+        ]
+        results = results_of(units, 2)
+        for line, when in ((claims.PHIL, own), (claims.PER, other)):
+            for result in results.of("left_turn", line):
+                columns = result.record["validation"]
+                columns["at_step"] = list(range(500, 6_001, 500))
+                columns["success"] = [0.2 + 0.8 * (step >= when) for step in columns["at_step"]]
+        assert finding(results, claims.sooner, claims.PHIL, [claims.PER], bar).holds == holds
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
         grid = 500.0 * np.arange(1, len(values) + 1, dtype=np.float64)
         curve = np.array(values, np.float64)
-        steps = claims.first_reached(grid, curve, least)
-        if np.isinf(steps):
-            assert curve.max() < least
+        low, high = claims.first_reached(grid, curve, least)
+        if np.isinf(high):
+            assert (low, curve.max() < least) == (grid[-1], True)
+        elif low == 0.0:
+            assert (high, curve[0] >= least - 1e-9) == (500.0, True)
         else:
-            assert np.interp(steps, grid, curve) == pytest.approx(least, abs=1e-6) or steps == 500.0
-            assert (curve[grid < steps] <= least).all()
-            assert steps <= claims.first_reached(grid, curve, min(least + 0.1, 1.0))
+            assert low == high
+            assert np.interp(low, grid, curve) == pytest.approx(least, abs=1e-6)
+            assert (curve[grid < low] <= least).all()
+            assert high <= claims.first_reached(grid, curve, min(least + 0.1, 1.0)).high
 
     def test_every_claim_is_judged_and_nothing_is_said_of_nothing(self, everything):
         results = results_of([], SEEDS)
-        for claim in claims.CLAIMS:
+        for claim in (*claims.CLAIMS, *claims.AS_PRINTED, *claims.GOALS):
             assert claim.source in EXPERIMENTS
             for found in filter(None, claims.judge_both(everything, claim)):
                 assert found.holds in ("yes", "no", "undecided")
@@ -201,11 +228,22 @@ def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
     )  # fmt: skip
     (row,) = [line for line in _cost(results) if line.startswith("| PHIL-TD3 |")]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    # The policy alone is at 80 % after 1,000 steps and above 98 after 1,500: the human has given
-    # both of the first two episodes by then, all that there is.
-    seconds = ["123 (1)", "123 (1)"]
+    # The policy alone is above 98 % in the validation after 1,500 steps: the human has given both
+    # of the first two episodes by then, all that there is.
+    until = ["1,500 [1,500, 1,500] (1)", *["123 [123, 123] (1)"] * 2]
     costs = ["10.0", "10.0", "1,234", "56", "7"]
-    assert cells[1:] == ["left turn", "1,250", "1 of 1", *seconds, *costs]
+    assert cells[1:-1] == ["left turn", "1", *until, *costs]
+
+
+def test_a_seed_that_never_learned_costs_more_than_any_other():
+    units = [Unit("left_turn", "phil_td3", NORMAL, seed) for seed in (1, 2, 3)]
+    results = results_of(units, 3)
+    for unit in units:
+        columns = results.found[unit].record["validation"]
+        columns["success"] = [float(unit.seed < 3 and n >= unit.seed) for n in range(12)]
+    found = results.of("left_turn", claims.PHIL)
+    assert report.until(found, 0.9, "steps") == "1,520 [1,020, never] (2)"
+    assert report.until(found[2:], 0.9, "steps") == "–"
 
 
 def test_the_report_is_made_of_the_records_alone(store, monkeypatch):
