@@ -44,26 +44,31 @@ class Setting:
     """Fields of the run's config that it changes."""
     preset: str = "ours"  # Where its settings start from
     learner: Mapping[str, Any] = field(default_factory=dict)  # Hyper-parameters that it changes
-    human: str = ""  # Who guides: the scripted ``expert``; empty: a human model
+    human: str = ""
+    """Who guides: the task's ``expert``, ``module:Class`` of another script; empty: a model."""
 
 
 NORMAL, ONE_FRAME, RANDOM, BIASED, PRINTED = "normal", "one_frame", "random", "biased", "printed"
 POOR_SHARE = 1.0 / 3.0  # Share of the human's actions that poor guidance replaces (section VII-E)
 GOOD, MODEL = "good", "model"
-IMPERFECT: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "third_random": ("a third of the actions is random", {"poor_guidance_share": POOR_SHARE}),
-    "late": ("0.3 to 0.8 s late", {"late_from_s": 0.3, "late_to_s": 0.8}),
-    "seldom": ("overlooks two of three reasons", {"missed_share": 2.0 / 3.0}),
-    "gives_up": ("leaves after 20 episodes", {"guided_until_episode": 20}),
-    "slower": ("drives slower than is best", {"human_shift": -0.4}),
+IMPERFECT: Mapping[str, Setting] = {
+    "third_random": Setting(
+        "a third of the actions is random", {"poor_guidance_share": POOR_SHARE}, human=EXPERT
+    ),
+    "late": Setting("0.3 to 0.8 s late", {"late_from_s": 0.3, "late_to_s": 0.8}, human=EXPERT),
+    "seldom": Setting("overlooks two of three reasons", {"missed_share": 2.0 / 3.0}, human=EXPERT),
+    "gives_up": Setting("leaves after 20 episodes", {"guided_until_episode": 20}, human=EXPERT),
+    "slower": Setting("drives slower than is best", human="trainer.human.left_turn:SlowHuman"),
 }
-"""The good human's one fault, and the run's settings that make it."""
+"""Humans with one fault each, in the left turn."""
 HUMANS: Mapping[str, Setting] = {
     GOOD: Setting("the scripted expert", human=EXPERT),
     MODEL: Setting("the paper's model of it: one frame, 50 episodes"),
-    **{name: Setting(*fault, human=EXPERT) for name, fault in IMPERFECT.items()},
+    **IMPERFECT,
 }
 """Who guides in the table of human guidance, the same for all rows."""
+TUNED: Mapping[str, Mapping[str, Any]] = {}
+"""Row of the table of human guidance -> the hyper-parameters that its tuning chose there."""
 SETTINGS: Mapping[str, Setting] = {
     **HUMANS,
     NORMAL: Setting("two frames, good guidance"),
@@ -133,11 +138,12 @@ ROWS = (
 HELPED = tuple(name for name in ROWS if ALGORITHMS[name].guided)
 GUIDANCE_LINES: Lines = (
     (GOOD, (EXPERT,), (*SCENARIOS, *FOREIGN), 0),
-    (MODEL, (HUMAN_MODEL,), SCENARIOS, 0),
+    (MODEL, (HUMAN_MODEL,), LEFT, 0),
+    ("slower", (EXPERT,), LEFT, 0),
     (GOOD, ROWS, SCENARIOS, MANY),
-    (MODEL, HELPED, SCENARIOS, MANY),
-    *((name, HELPED, LEFT, 3) for name in IMPERFECT),
+    (MODEL, HELPED, LEFT, MANY),
     (GOOD, ROWS, tuple(FOREIGN), 3),
+    *((name, HELPED, LEFT, MANY) for name in IMPERFECT),
 )
 
 
@@ -255,7 +261,10 @@ class Unit(NamedTuple):
 
     @property
     def scripted_human(self) -> str:
-        """The environment's expert, by which a driver is made."""
+        """The script of the human, or of whom the human model was made, by which one is made."""
+        human = SETTINGS[self.setting].human
+        if ":" in human:
+            return human
         return FOREIGN.get(self.scenario, (self.scenario, EXPERT))[1]
 
     @property
@@ -304,7 +313,12 @@ def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
         threads=1,
         learner=replace(
             start.learner,
-            **{**ALGORITHMS[unit.algorithm].settings, **plan.learner, **setting.learner},
+            **{
+                **ALGORITHMS[unit.algorithm].settings,
+                **(TUNED.get(unit.algorithm, {}) if unit.setting in HUMANS else {}),
+                **plan.learner,
+                **setting.learner,
+            },
         ),
         **setting.run,
     )
@@ -315,7 +329,7 @@ NOT_DECIDING = ("device", "threads", "checkpoint_every", "human", "snapshots")
 """Fields of a run's config that do not decide its result; the human model's contents do."""
 
 LATER = (
-    "guided_until_episode", "late_from_s", "late_to_s", "missed_share", "human_shift",
+    "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
     "delay_known",
     "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
     "foresight", "preference_beta",

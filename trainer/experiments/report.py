@@ -249,10 +249,11 @@ def _floor(results: Results) -> Iterator[str]:
 def _cost(results: Results) -> Iterator[str]:
     """Steps and human effort of every line, and how much of the best policy is left at the end."""
     yield (
-        f"Environment steps, and seconds that the human drove, until the policy alone reaches "
+        "Environment steps, and seconds that the human drove, until the policy alone reaches "
         f"{LEARNED:.0%} or {WELL:.0%} of its validation drives: median of the seeds, the least and "
-        "the most of them, and how many get there. The rest are means. Late: validations of the "
-        f"last {data.END_STEPS:,} steps, against the best one, which chance makes better, too."
+        "the most of them (∞: never), and how many get there. The rest are means. Late: "
+        f"validations of the last {data.END_STEPS:,} steps, against the best one, which chance "
+        "makes better, too."
     )
     yield ""
     rows = []
@@ -288,9 +289,15 @@ def until(found: Sequence[Result], level: float, what: str) -> str:
     """
     costs = [getattr(one.until(level), what, np.inf) for one in found]
     there = int(np.isfinite(costs).sum())
-    shown = [f"{cost:,.0f}" for cost in (np.median(costs), min(costs), max(costs))]
-    middle, least, most = (text.replace("inf", "never") for text in shown)
-    return f"{middle} [{least}, {most}] ({there})" if there else "–"
+    return f"{spread(costs)} ({there})" if there else "–"
+
+
+def spread(numbers: Sequence[float]) -> str:
+    """Median, least and most, as in "12 [8, ∞]"; of five, 15 of 16 times the true median lies
+    between the least and the most.
+    """
+    middle, least, most = np.median(numbers), min(numbers), max(numbers)
+    return f"{middle:,.0f} [{least:,.0f}, {most:,.0f}]".replace("inf", "∞")
 
 
 LEARNED, WELL = metrics.LEARNED
@@ -300,7 +307,7 @@ MORE = {"fig9": _tests, "time": _times, "floor": _floor, "cost": _cost}
 
 
 COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", HUMAN_MODEL: "C1"}
-OTHERS = ("C4", "C5", "C6", "C8", "C9", "black")
+OTHERS = ("C4", "C5", "C6", "C8", "C9", "black", "C1")
 """For algorithms without a colour of their own, by their place in the figure."""
 CURVES = (
     (data.TRAINING, data.REWARD),

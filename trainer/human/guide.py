@@ -77,8 +77,8 @@ class Guide(Protocol):
 class Asking(Trigger):
     """The robot asks for help where its critics differ most, and the human need not watch.
 
-    That is where their doubt is among the ``share`` of the highest of late. Until it knows what is
-    high the human watches, as in AIM's first drives (2506.09176).
+    That is where their doubt is among the ``share`` of the highest of late: a budget of help, as
+    in ThriftyDAgger (2109.08273). Until it knows what is high the human watches.
     """
 
     MEMORY = 500  # Control periods
@@ -103,39 +103,29 @@ class Asking(Trigger):
         return ASKED if self.doubts[-1] > np.quantile(self.doubts, 1.0 - self.share) else None
 
 
-class Inattentive(Trigger):
-    """A human that comes late, or not at all: what is overlooked is not looked at for a while.
+class Attention:
+    """A human's who comes late, or not at all: what is overlooked is not looked at for a while.
 
-    ``trigger`` is when it should take over; ``late_steps`` the least and the longest delay, in
-    control periods, of which each is drawn anew; ``missed_share`` how often it notices nothing.
+    ``late_steps`` are the least and the longest delay, in control periods, of which each is drawn
+    anew; ``missed_share`` is how often it notices nothing. A late human takes over from what the
+    policy does by then, and that is what has the penalty.
     """
 
     BLIND_STEPS = 15
 
     def __init__(
-        self,
-        trigger: Trigger,
-        late_steps: tuple[float, float],
-        missed_share: float,
-        random: np.random.Generator,
+        self, late_steps: tuple[float, float], missed_share: float, random: np.random.Generator
     ) -> None:
-        self.trigger, self.random = trigger, random
-        self.late_steps, self.missed_share = late_steps, missed_share
+        self.random, self.late_steps, self.missed_share = random, late_steps, missed_share
         self._reason: Reason | None = None
         self._steps_left = 0
 
-    def may_return(self) -> bool:
-        """Whether the human would give control back here."""
-        return self.trigger.may_return()
-
     def reset(self) -> None:
         """Forget the last episode."""
-        self.trigger.reset()
         self._steps_left = 0
 
-    def wants_control(self, action: Action) -> Reason | None:
-        """The reason, so much later; once begun a take-over is not given up."""
-        reason = self.trigger.wants_control(action)
+    def notices(self, reason: Reason | None) -> Reason | None:
+        """The reason to take over, so much later; once begun a take-over is not given up."""
         if self._steps_left == 0:
             if reason is None:
                 return None
@@ -151,17 +141,27 @@ class HumanGuide:
     """Turns trigger and driver into interventions.
 
     The human stays in control for ``hold_steps`` from the last reason for it. A second and a half:
-    a person first brings the car out of what made them take over.
+    a person first brings the car out of what made them take over. Where the robot asks, it is a
+    third of that: nothing is wrong yet. At the wheel every human is attentive.
     """
 
-    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = 15) -> None:
+    def __init__(
+        self,
+        driver: Driver,
+        trigger: Trigger,
+        hold_steps: int = 15,
+        attention: Attention | None = None,
+    ) -> None:
         self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
+        self.attention = attention
         self.reset()
 
     def reset(self) -> None:
         """Start an episode with the policy in control."""
         self.driver.reset()
         self.trigger.reset()
+        if self.attention:
+            self.attention.reset()
         self._steps_left = 0
         self._reason: Reason | None = None
 
@@ -169,8 +169,11 @@ class HumanGuide:
         """What the human does about ``policy_action``: None lets it pass. Once a step."""
         trigger = self.trigger.wants_control(policy_action)
         before = self._reason
+        if before is None and self.attention:
+            trigger = self.attention.notices(trigger)
         if trigger is not None:
-            self._steps_left = self.hold_steps
+            hold_steps = self.hold_steps // 3 if trigger == ASKED else self.hold_steps
+            self._steps_left = max(self._steps_left, hold_steps)
         if self._steps_left == 0 and (before is None or self.trigger.may_return()):
             self._reason = None
             return None

@@ -58,6 +58,7 @@ UNIFORM = {"alpha": 0.0}
 UNIT_VALUES = {"saturation_weight": 3e-3}
 """Values lie between -1 and 1, a tenth of what our rewards make, and so does the price that the
 actor weighs against them."""
+UNEXPLORED = {"exploration_initial": 0.0, "exploration_final": 0.0}
 PVP = Algorithm(
     penalty=False, behaviour_cloning=False, advantage_weight=0.0, rewarded=False,
     proxy_values=True, human_share=0.5,
@@ -81,8 +82,9 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
     "phil_without_shaping": replace(PHIL, penalty=False),
-    # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning.
-    "cloning_only": replace(IA, q_term=False),
+    # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning,
+    # and so without exploration.
+    "cloning_only": replace(IA, q_term=False, settings=UNEXPLORED),
     # RLIF (2311.12996): -1 where an intervention begins, which here is charged to the action that
     # the human overruled, and 0 elsewhere.
     "rlif_td3": replace(
@@ -94,19 +96,21 @@ ALGORITHMS: dict[str, Algorithm] = {
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
     # Layer normalisation in the critics all rows have. Two critics, not ten. Beside a human who
-    # lets nothing fail the critics see no failure, and find every action good.
+    # lets nothing fail the critics see no failure, and find every action good. One update of the
+    # actor a step.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
-        updates_per_step=2, settings={**UNIFORM, "return_steps": 1},
+        updates_per_step=2, settings={**UNIFORM, "return_steps": 1, "policy_delay": 2},
     ),
     # Predictive preference learning (2510.01545): in the L = 4 states that the overruled action
     # would have led to, the human's is the better one. Cloning counts as much. No Q term.
     "ppl_td3": replace(
         IA, penalty=False, q_term=False, rewarded=False, human_share=0.5, foresight=4,
-        settings={**UNIFORM, **UNIT_VALUES, "cloning_weight": 1.0},
+        settings={**UNIFORM, **UNIT_VALUES, **UNEXPLORED, "cloning_weight": 1.0},
     ),
-    # The robot asks, as in AIM (2506.09176), but by the critics' disagreement instead of a critic
-    # of its own. What it asked for is no objection: nothing is penalised.
+    # The robot asks, with a budget, as in ThriftyDAgger (2109.08273), where the critics disagree;
+    # AIM (2506.09176) has a critic of its own for that. What it asked for is no objection: nothing
+    # is penalised.
     "phil_gated": replace(PHIL, penalty=False, asks=0.05),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,

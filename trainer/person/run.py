@@ -52,7 +52,7 @@ NICENESS = 10
 """Of the validations' process and of the updates' thread, and those that torch starts from it: the
 person's loop goes first."""
 LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
-PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share", "human_shift")
+PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share")
 """What makes a scripted human imperfect."""
 
 

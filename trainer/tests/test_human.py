@@ -9,9 +9,9 @@ import torch
 
 from edge_runtime.util import UserError
 from trainer.drivers import constant_driver, load_driver
-from trainer.environments import make_environment
+from trainer.environments import expert_of, make_environment
 from trainer.human.dagger import imitate
-from trainer.human.guide import ASKED, Asking, HumanGuide, Inattentive
+from trainer.human.guide import ASKED, Asking, Attention, HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
@@ -101,11 +101,15 @@ def test_what_does_not_fit_together_is_refused(tmp_path):
         load_driver(str(tmp_path), LeftTurnEnv())
 
 
-@pytest.mark.parametrize(("scenario", "drives"), [("left_turn", 20), ("congestion", 10)])
-def test_the_trigger_lets_the_expert_drive(scenario, drives):
+@pytest.mark.parametrize(
+    ("scenario", "human", "drives"),
+    [("left_turn", "expert", 20), ("congestion", "expert", 10),
+     ("left_turn", "trainer.human.left_turn:SlowHuman", 20)],
+)  # fmt: skip
+def test_the_trigger_lets_the_expert_drive(scenario, human, drives):
     """Or the policy would be punished for driving like the human: theorem 1's assumption."""
     env = make_environment(scenario)
-    expert, trigger = env.expert(), env.expert()
+    expert, trigger = expert_of(env, human), expert_of(env, human)
 
     def judged(observation):
         action = expert.act(observation)
@@ -118,12 +122,12 @@ def test_the_trigger_lets_the_expert_drive(scenario, drives):
         assert drive(env, judged, seed)[1]["outcome"] == "goal"
 
 
-def watch(reasons, places=(), **hold):
+def watch(reasons, places=(), **how):
     """What a human does of whom the trigger says so: its steps at the wheel, and those held."""
     judged, returned = iter(reasons), iter(places)
     trigger: Any = SimpleNamespace(reset=lambda: None)
     trigger.wants_control, trigger.may_return = lambda _: next(judged), lambda: next(returned, True)
-    guide = HumanGuide(constant_driver(-1.0), trigger, **hold)
+    guide = HumanGuide(constant_driver(-1.0), trigger, **how)
     steps = [guide.watch(np.zeros((2, 45, 80), np.uint8), FULL) for _ in reasons]
     taken = [step for step in steps if step]
     assert all(step.action == BRAKE for step in taken)
@@ -145,6 +149,8 @@ NO, YES = False, True
          [NO, YES, YES, YES, NO, YES, YES, YES, NO], [YES, NO, NO, YES, NO, NO]),
         # By default for a second and a half.
         ([CRASH] + [NONE] * 20, {}, [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
+        # Where the robot only asks, for a third of that.
+        ([ASKED] + [NONE] * 9, {}, [YES] * 5 + [NO] * 5, [YES] + [NO] * 4),
         # A reason that lasts prolongs the same intervention.
         (["stuck", "stuck", CRASH, NONE, NONE], {"hold_steps": 2},
          [YES] * 4 + [NO], [YES, NO, NO, NO]),
@@ -178,22 +184,37 @@ def reasons(trigger, count):
     return [trigger.wants_control(FULL) for _ in range(count)]
 
 
+def noticed(attention, *periods, count):
+    """What a human notices of a reason that is there in these periods."""
+    return [attention.notices("collision" if n in periods else None) for n in range(count)]
+
+
 def test_a_late_human_comes_some_steps_after_its_reason_and_an_inattentive_one_not_at_all():
     random = np.random.default_rng(0)
-    assert reasons(Inattentive(Alarm(2), (3.0, 3.0), 0.0, random), 8).index("collision") == 5
+    assert noticed(Attention((3.0, 3.0), 0.0, random), 2, count=8).index("collision") == 5
     delays = set()
     for _ in range(40):
-        late = Inattentive(Alarm(1), (3.0, 8.0), 0.0, random)
-        delays.add(reasons(late, 12).index("collision") - 1)
+        late = Attention((3.0, 8.0), 0.0, random)
+        delays.add(noticed(late, 1, count=12).index("collision") - 1)
     assert delays == {3, 4, 5, 6, 7, 8}
-    assert reasons(Inattentive(Alarm(*range(40)), (0.0, 0.0), 1.0, random), 40) == [None] * 40
-    half = [reasons(Inattentive(Alarm(0), (0.0, 0.0), 0.5, random), 1)[0] for _ in range(400)]
+    always = range(40)
+    assert noticed(Attention((0.0, 0.0), 1.0, random), *always, count=40) == [None] * 40
+    half = [noticed(Attention((0.0, 0.0), 0.5, random), 0, count=1)[0] for _ in range(400)]
     assert half.count("collision") == pytest.approx(200, abs=40)
     # What is overlooked is seen a second and a half later, if it is still there.
     drawn = iter([0.0, *[0.9] * 9])
     once: Any = SimpleNamespace(random=drawn.__next__, uniform=lambda *ends: 0.0)
-    seen = reasons(Inattentive(Alarm(*range(40)), (0.0, 0.0), 0.5, once), 20)
+    seen = noticed(Attention((0.0, 0.0), 0.5, once), *always, count=20)
     assert seen.index("collision") == 16
+
+
+def test_at_the_wheel_every_human_is_attentive():
+    """A reason that is still there keeps it there, however much it overlooks beside the policy."""
+    drawn = iter([0.9, *[0.0] * 9])  # Notices the first reason, and would notice no other
+    once: Any = SimpleNamespace(random=drawn.__next__, uniform=lambda *ends: 0.0)
+    attention = Attention((0.0, 0.0), 0.5, once)
+    held, _ = watch([CRASH] * 30 + [NONE] * 4, hold_steps=3, attention=attention)
+    assert held == [YES] * 32 + [NO] * 2
 
 
 def test_the_robot_asks_where_its_doubt_is_high_once_it_knows_what_that_is():

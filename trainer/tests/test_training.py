@@ -107,7 +107,7 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     tmp_path, monkeypatch, row, warmup_steps
 ):
     monkeypatch.setattr(Asking, "MEMORY", 60)
-    human: dict[str, Any] = {"late_to_s": 0.8, "missed_share": 0.3, "human_shift": -0.2}
+    human: dict[str, Any] = {"late_to_s": 0.8, "missed_share": 0.3}
     learner = replace(SMALL, warmup_steps=warmup_steps)
     config = replace(TINY, algorithm=row, learner=learner, **human)
     whole, reasons = TrainingRun(config, tmp_path / "whole"), set[Any]()

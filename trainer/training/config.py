@@ -14,7 +14,6 @@ MOST_THREADS = 1024
 RANGES = {
     FROM_ONE: ("episodes", "evaluation_runs", "checkpoint_every"),
     SHARE: ("guided_share", "poor_guidance_share", "missed_share"),
-    (-2.0, 2.0): ("human_shift",),
     (0, 2**63 - 1): ("seed",),
     (0, MOST_THREADS): ("threads",),
 }
@@ -54,9 +53,6 @@ class RunConfig:
     """Longest such time."""
     missed_share: float = 0.0
     """Share of the reasons to take over that the human overlooks, for 15 control periods each."""
-    human_shift: float = 0.0
-    """What is added to each of the human's actions: a human who drives in another way than the
-    reward asks for, slower or more to one side."""
     penalise_stuck: bool = False
     """Whether taking over from a car that only waits too long is penalised, too. A stuck car
     looks like one that rightly waits, so the penalty teaches to fear waiting."""

@@ -17,7 +17,7 @@ from edge_runtime.util import UserError
 from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
-from trainer.human.guide import STUCK, Asking, Guide, HumanGuide, Inattentive, Intervention, Trigger
+from trainer.human.guide import STUCK, Asking, Attention, Guide, HumanGuide, Intervention, Trigger
 from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import NETWORKS, TD3Learner
@@ -216,11 +216,12 @@ class TrainingRun:
             if config.delay_known:
                 raise UserError(f"{config.algorithm} asks about what is seen now: no delay_known")
             trigger = self.gate = Asking(trigger, asks)
+        attention = None
         if config.late_to_s or config.missed_share:
             period_s = self.env.control_period_s
             late_steps = config.late_from_s / period_s, config.late_to_s / period_s
-            trigger = Inattentive(trigger, late_steps, config.missed_share, self.guidance)
-        return HumanGuide(driver, trigger)
+            attention = Attention(late_steps, config.missed_share, self.guidance)
+        return HumanGuide(driver, trigger, attention=attention)
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
@@ -295,12 +296,8 @@ class TrainingRun:
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:
-        """Shift a demonstration, or make it a wrong action, as often as the settings ask for."""
-        config = self.config
-        if intervention is not None and config.human_shift:
-            shifted = np.clip(intervention.action + np.float32(config.human_shift), -1.0, 1.0)
-            intervention = replace(intervention, action=shifted)
-        share = config.poor_guidance_share
+        """Make a demonstration a wrong action, as often as the settings ask for."""
+        config, share = self.config, self.config.poor_guidance_share
         if intervention is None or not share or self.guidance.random() >= share:
             return intervention
         shape = intervention.action.shape
