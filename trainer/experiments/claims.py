@@ -420,5 +420,8 @@ GOALS: tuple[Claim, ...] = (
           ahead, DENSE, [PHIL], BASELINES, [SUCCESS]),
     Claim("goals", "PHIL-TD3 is ahead of IA-TD3 after biased guidance", "in one scene",
           ahead, SCENES, [Line("phil_td3", BIASED)], [Line("ia_td3", BIASED)], [SUCCESS]),
+    Claim("goals", "why not: without cloning PHIL-TD3 survives biased guidance", "ahead of itself",
+          ahead, SCENES, [Line("phil_without_cloning", BIASED)], [Line("phil_td3", BIASED)],
+          [SUCCESS]),
 )  # fmt: skip
 """What this project wants of the learner, beyond what the paper says."""

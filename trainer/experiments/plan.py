@@ -126,6 +126,7 @@ LINES: Lines = (
     (ONE_FRAME, FOUR, SCENARIOS, MANY),
     (RANDOM, GUIDED, SCENARIOS, MANY),
     (NORMAL, PARTS, SCENARIOS, MANY),
+    (BIASED, PARTS[:1], SCENARIOS, MANY),
     (NORMAL, (*PRIORITIES, *BUFFERS), SCENARIOS, MANY),
     (NORMAL, WEIGHTS, SCENARIOS, MANY),
 )
@@ -173,7 +174,9 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "printed": Experiment("the settings as the paper prints them", FOUR, (NORMAL, PRINTED)),
     "floor": Experiment("the best constant action", (CONSTANT,)),
     "goals": Experiment(
-        "what this project wants of the learner", (*FOUR, *TESTED_ONLY), (NORMAL, BIASED)
+        "what this project wants of the learner",
+        (*FOUR, *PARTS[:1], *TESTED_ONLY),
+        (NORMAL, BIASED),
     ),
     "cost": Experiment("what a training cost, and whether it lasts", FOUR),
 }
