@@ -47,10 +47,11 @@ class Estimate(NamedTuple):
 
     def text(self, digits: int = 2) -> str:
         """As in "0.97 [0.93, 0.99]"; a dash for nothing, the interval alone where no number is."""
-        if not self.size:
+        bounded = np.isfinite([self.low, self.high]).any()
+        if not self.size or (np.isnan(self.value) and not bounded):
             return "–"
         shown, low, high = (f"{number:.{digits}f}" for number in self[:3])
-        if np.isinf([self.low, self.high]).all():
+        if not bounded:
             return shown
         return f"{shown} [{low}, {high}]".replace("nan ", "").replace("inf", "∞")
 
@@ -98,6 +99,13 @@ def all_of(answers: Sequence[Holds]) -> Holds:
     if "no" in answers:
         return "no"
     return "yes" if answers and set(answers) == {"yes"} else "undecided"
+
+
+def enough_of(answers: Sequence[Holds], count: int) -> Holds:
+    """Yes where so many are, no where so many no longer can be."""
+    if answers.count("yes") >= count:
+        return "yes"
+    return "no" if len(answers) - answers.count("no") < count else "undecided"
 
 
 def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
@@ -342,8 +350,8 @@ class Results:
         """Each seed's part in the change of the distance by poor guidance, mean of the scenes."""
         lines = Line(line.algorithm, RANDOM), line
         found = [_ratio(*(self.numbers(one, each, DISTANCE) for each in lines)) for one in scenes]
-        seeds = set[int].intersection(*map(set, found))
-        return {seed: float(np.mean([one[seed] for one in found])) - 1.0 for seed in sorted(seeds)}
+        seeds = [seed for seed in found[0] if all(seed in one for one in found)]
+        return {seed: float(np.mean([one[seed] for one in found])) - 1.0 for seed in seeds}
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""

@@ -24,7 +24,7 @@ from trainer.pictures import write_figure
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
-ALONE = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
+OTHER_HUMANS = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
 """Other humans who drive by themselves."""
 
 
@@ -81,6 +81,7 @@ def typical_curves(results: Results, human: str) -> dict[str, dict[str, Any]]:
 
 def _page(results: Results, store: Store) -> Iterator[str]:
     wanted = len(plan.units_of([plan.GUIDANCE], results.seeds))
+    slow = store.plan.of("racetrack")
     budgets = ", ".join(f"{data.words(name)} {store.plan.steps[name]:,}" for name in TASKS)
     yield from (
         "# The fair table of human guidance",
@@ -92,8 +93,9 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         f"({budgets}). **Every human here is a script or a model of one: no person's cost is "
         "claimed.** Seconds are simulated ones in which the human drove. Numbers are means of the "
         "seeds with their 95 % interval; what it took to a level is the median of the seeds, the "
-        "least and the most of them (∞: never), and how many get there. Validations are 250 steps "
-        "apart (racetrack: 500, of ten drives), so no finer difference counts. The actor that is "
+        "least and the most of them (∞: never), and how many get there. Validations are "
+        f"{store.plan.evaluate_every_steps} steps apart (racetrack: {slow.evaluate_every_steps}, "
+        f"of {slow.evaluation_runs} drives), so no finer difference counts. The actor that is "
         "tested is the best in them by success, then by the scene's return, for every row.",
         "",
         f"![Success of the policy alone by what the human has given]({plan.GUIDANCE}.png)",
@@ -106,7 +108,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         f"take-overs to {LEARNED:.0%}", "human s in all", "failures",
         *(f"{name}, %" for name in CONDITIONS), "return over the human's",
     )  # fmt: skip
-    lines = [*(Line(row, plan.GOOD) for row in (*plan.ROWS, plan.EXPERT)), *ALONE]
+    lines = [*(Line(row, plan.GOOD) for row in (*plan.ROWS, plan.EXPERT)), *OTHER_HUMANS]
     rows = [
         _row(results, task, line, found)
         for task in TASKS
@@ -118,7 +120,8 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         "## PHIL-TD3's place",
         "",
         "With the same human: each row less PHIL-TD3, pair by pair of seeds; of the human's "
-        "seconds the median, the least and the most.",
+        "seconds the median, the least and the most. ∞: the row never gets there; -∞: PHIL-TD3 "
+        "never does; 0: neither.",
         "",
     )
     places = [
@@ -182,8 +185,7 @@ def _place(results: Results, task: str, row: str) -> Iterator[str]:
         for each in (line, phil)
     )
     both = [(given[seed], its[seed]) for seed in given.keys() & its.keys()]
-    more = [own - other for own, other in both if min(own, other) < np.inf]
-    yield spread(more) if more else "–"
+    yield spread([own - other if own != other else 0.0 for own, other in both]) if both else "–"
 
 
 def _cells(results: Results, row: str) -> Iterator[str]:

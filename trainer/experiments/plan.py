@@ -110,7 +110,8 @@ LABELS = {
 }
 FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")  # What the paper compares throughout
 GUIDED = FOUR[:3]
-PARTS = ("phil_without_cloning", "phil_without_shaping")
+NO_CLONING = ("phil_without_cloning",)
+PARTS = (*NO_CLONING, "phil_without_shaping")
 PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
 BUFFERS = ("rd2_phil", "rd2_td3")
 WEIGHTS = ("phil_advantage_0.1", "phil_advantage_100")
@@ -126,7 +127,7 @@ LINES: Lines = (
     (ONE_FRAME, FOUR, SCENARIOS, MANY),
     (RANDOM, GUIDED, SCENARIOS, MANY),
     (NORMAL, PARTS, SCENARIOS, MANY),
-    (BIASED, PARTS[:1], SCENARIOS, MANY),
+    (BIASED, NO_CLONING, SCENARIOS, MANY),
     (NORMAL, (*PRIORITIES, *BUFFERS), SCENARIOS, MANY),
     (NORMAL, WEIGHTS, SCENARIOS, MANY),
 )
@@ -175,7 +176,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "floor": Experiment("the best constant action", (CONSTANT,)),
     "goals": Experiment(
         "what this project wants of the learner",
-        (*FOUR, *PARTS[:1], *TESTED_ONLY),
+        (*FOUR, *NO_CLONING, *TESTED_ONLY),
         (NORMAL, BIASED),
     ),
     "cost": Experiment("what a training cost, and whether it lasts", FOUR),
@@ -264,7 +265,7 @@ class Unit(NamedTuple):
 
     @property
     def scripted_human(self) -> str:
-        """The script of the human, or of whom the human model was made, by which one is made."""
+        """Names the script that guides, or the one that the human model imitates."""
         human = SETTINGS[self.setting].human
         if ":" in human:
             return human

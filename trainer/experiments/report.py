@@ -9,6 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
+from statistics import median_low
 from typing import Any
 
 import numpy as np
@@ -113,11 +114,10 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         "writes this page and its figures from `left_turn.jsonl` and `congestion.jsonl`, one line "
         f"a training. {len(results.found)} of {wanted} trainings and tests are there.",
         "",
-        "What differs from the paper: the scenes are drawn by highway-env's traffic and not by "
-        "CARLA; the budget is counted in environment steps, the same for every algorithm: "
-        f"{steps}, where the paper trains for 400 episodes; and the learner has the settings of "
-        f"this project, {_ours()}. What the paper's own settings give is [printed](#"
-        f"{_anchor('printed')}).",
+        "What differs from the paper: highway-env's traffic stands in for CARLA's; the budget is "
+        f"counted in environment steps, the same for every algorithm: {steps}, where the paper "
+        f"trains for 400 episodes; and the settings are this project's, {_ours()}. What the "
+        f"paper's own settings give is [printed](#{_anchor('printed')}).",
         "",
         f"The policy is validated alone every {store.plan.evaluate_every_steps} steps; the best "
         f"validated actor drives {store.plan.test_runs} test drives in each scene, of which the "
@@ -125,11 +125,12 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         "",
         "A comparison holds, or does not, where a 95 % interval of the difference, paired by "
         "training seed, lies on one side of its bar, which is 0 where none is named; else it is "
-        "undecided. A claim holds where all of its comparisons do, and does not where one does "
-        "not; the clearest of those is shown. The intervals are over training seeds, in these "
-        "scenes with these test drives; the human model is a single one. Learning curves are "
-        "judged twice: as the paper does, on training episodes in which the human helps, where "
-        "whom the human rescues is at the goal; and by the policy alone on validation drives.",
+        "undecided. A claim holds where all of its comparisons do, or as many as are wanted, and "
+        "does not where that cannot be; the weakest of those that decide is shown. The intervals "
+        "are over training seeds, in these scenes with these test drives; the human model is a "
+        "single one. Learning curves are judged twice: as the paper does, on training episodes, in "
+        "which a policy that the human saves arrives, too; and by the policy alone on validation "
+        "drives.",
         "",
     )
     if results.stale:
@@ -168,13 +169,15 @@ def _in_bfloat16(results: Results, lines: Sequence[Line]) -> str:
 
 
 def _ours() -> str:
-    """The learner's settings that are not the paper's, as the presets have them."""
-    ours, printed = (asdict(plan.PRESETS[name].learner) for name in ("ours", "printed"))
+    """The settings that are not the paper's, as the presets have them."""
+    ours, printed = (asdict(plan.PRESETS[name]) for name in ("ours", "printed"))
+    for values in (ours, printed):
+        values |= values.pop("learner")
     return ", ".join(
-        f"`{name}` {value:g} for {printed[name]:g}" if isinstance(value, float) else
         f"`{name}` {value} for {printed[name]}"
-        for name, value in ours.items() if value != printed[name]
-    )  # fmt: skip
+        for name, value in ours.items()
+        if value != printed[name]
+    )
 
 
 def _anchor(name: str) -> str:
@@ -237,11 +240,11 @@ def _distances(results: Results, name: str) -> Iterator[str]:
 def _floor(results: Results) -> Iterator[str]:
     for scenario in SCENARIOS:
         for result in results.of(scenario, Line(plan.CONSTANT)):
-            action, success = result.record["action"], result.record["success_of"]
+            record = result.record
+            action, success = f"{record['action']:g}", record["success_of"]
             yield (
-                f"Best in the {words(scenario)}: {action:g}, of {len(success)} tried. It brings "
-                f"{success[f'{action:g}']:.0%} of {plan.PLAN.search_runs} validation drives to the "
-                "goal."
+                f"Best in the {words(scenario)}: {action}, of {len(success)} tried. It brings "
+                f"{success[action]:.0%} of {record['search'][0]} validation drives to the goal."
             )
             yield ""
 
@@ -287,7 +290,8 @@ def until(found: Sequence[Result], level: float, what: str) -> str:
 
     A seed that never does costs more than any other. In brackets, how many do.
     """
-    costs = [getattr(one.until(level), what, np.inf) for one in found]
+    reached = [one.until(level) for one in found]
+    costs = [getattr(cost, what) if cost else np.inf for cost in reached]
     there = int(np.isfinite(costs).sum())
     return f"{spread(costs)} ({there})" if there else "–"
 
@@ -296,7 +300,7 @@ def spread(numbers: Sequence[float]) -> str:
     """Median, least and most, as in "12 [8, ∞]"; of five, 15 of 16 times the true median lies
     between the least and the most.
     """
-    middle, least, most = np.median(numbers), min(numbers), max(numbers)
+    middle, least, most = median_low(numbers), min(numbers), max(numbers)
     return f"{middle:,.0f} [{least:,.0f}, {most:,.0f}]".replace("inf", "∞")
 
 
@@ -360,10 +364,10 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
             if not found or (metric == data.REWARD and line.setting == "printed"):
                 continue  # the printed reward is on another scale
             curves, grid = np.stack([result.curve(kind, metric) for result in found]), found[0].grid
-            mean, spread = curves.mean(axis=0), curves.std(axis=0, ddof=len(curves) > 1)
+            mean, std = curves.mean(axis=0), curves.std(axis=0, ddof=min(len(curves) - 1, 1))
             look = {"ls": "-" if line.setting == NORMAL else "--", "color": colour(line, place)}
             panel.plot(grid, mean, **look, lw=1.8, label=f"{line.name}, seeds: {len(found)}")
-            band = mean - spread, mean + spread
+            band = mean - std, mean + std
             panel.fill_between(grid, *band, color=look["color"], alpha=0.15, lw=0)
         if metric != data.REWARD:
             best = 1.0 if metric == data.SUCCESS else plan.FULL_PATH_M[scenario]
@@ -407,8 +411,8 @@ def draw_groups(
             else:
                 values = np.array([*results.numbers(place, line, quantity, kind).values()])
                 if len(values):
-                    spread = values.std(ddof=1) if len(values) > 1 else None
-                    axis.errorbar(x, values.mean(), spread, capsize=2, **look)
+                    std = values.std(ddof=1) if len(values) > 1 else None
+                    axis.errorbar(x, values.mean(), std, capsize=2, **look)
         axis.set_xticks(range(len(places)), [words(place) for place in places], fontsize=8)
         axis.set_xlim(-0.6, len(places) - 0.4)
         axis.grid(alpha=0.3)

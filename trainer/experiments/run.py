@@ -19,8 +19,6 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
-from importlib import import_module
-from importlib.util import find_spec
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -465,10 +463,12 @@ def _connected(address: str) -> Any:
     except ImportError:
         raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
     if not ray.is_initialized():
-        # Nodes need the libraries; our own code is sent to them, and the foreign tasks, if we are
-        # where they lie.
-        names = ("edge_runtime", "bridge", "trainer", "examples")
-        modules = {"py_modules": [import_module(name) for name in names if find_spec(name)]}
+        import bridge
+        import edge_runtime
+        import trainer
+
+        # Nodes need the libraries; our own code is sent to them.
+        modules = {"py_modules": [edge_runtime, bridge, trainer]}
         try:
             ray.init(address=address, runtime_env=modules, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:

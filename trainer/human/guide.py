@@ -104,7 +104,7 @@ class Asking(Trigger):
 
 
 class Attention:
-    """A human's who comes late, or not at all: what is overlooked is not looked at for a while.
+    """The attention of a human who comes late, or overlooks a reason and then is blind for a while.
 
     ``late_steps`` are the least and the longest delay, in control periods, of which each is drawn
     anew; ``missed_share`` is how often it notices nothing. A late human takes over from what the

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from trainer.learner.kernel import FEATURES, FILTERS, FRAME, SIDE, trunk_features
 from trainer.util import cpu_info
 
-_INSTRUCTIONS = re.compile(r"\b(avx512_bf16|amx_bf16|bf16)\b")
+_INSTRUCTIONS = re.compile(r"\b(avx512_bf16|bf16)\b")
 """As Linux names them on x86-64 and on aarch64."""
 
 
@@ -35,8 +35,8 @@ _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|amx_bf16|bf16)\b")
 def bfloat16_is_faster(device_type: str) -> bool:
     """Whether ``device_type`` (``cpu``, ``cuda``) multiplies bfloat16 faster than float32.
 
-    Intel's processors have the instruction, but start it half as often as one of float32: an update
-    takes 84 ms with it and 73 without (``results/bench/xeon_threads_1.json``).
+    Intel's have instructions for it that bring nothing here: on a Xeon an update takes 84 ms with
+    them and 73 without (``results/bench/xeon_threads_1.json``).
     """
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)

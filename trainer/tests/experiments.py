@@ -79,7 +79,7 @@ def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
     computed = {"training_s": 300 + unit.seed}
     record = {"id": "", "unit": unit._asdict(), "tests": tests, "computed": computed}
     if unit.algorithm == CONSTANT:
-        return {**record, "action": 0.1, "success_of": {"0": 0.2, "0.1": 0.3}}
+        return {**record, "action": 0.1, "success_of": {"0": 0.2, "0.1": 0.3}, "search": [2, 2]}
     if not unit.trained:
         return record
     ends = np.arange(60, BUDGET + 60, 60)

@@ -14,6 +14,7 @@ from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, wri
 from trainer.tests.test_commands import call
 
 SEEDS = 3
+CONSTANT = data.Line("constant")
 LEFT = data.Scene("left_turn", "nominal")
 
 
@@ -163,6 +164,7 @@ class TestClaims:
         [
             (0, 2_000, 1.0, "yes"),  # There at 500 or before: 4 times as soon, if not more
             (0, 2_000, 50.0, "undecided"),
+            (2_000, 4_000, 50.0, "no"),
             (0, 0, 1.0, "undecided"),
             (7_000, 2_000, 1.0, "no"),  # Never: in less than a third of the time at best
         ],
@@ -203,7 +205,24 @@ class TestClaims:
             for found in filter(None, claims.judge_both(everything, claim)):
                 assert found.holds in ("yes", "no", "undecided")
                 assert found.text not in ("", "not measured")
-            assert claims.judge_both(results, claim)[0].holds == "undecided"
+            nothing = claims.judge_both(results, claim)[0]
+            assert (nothing.text, nothing.holds) == ("not measured", "undecided")
+
+    @pytest.mark.parametrize(("enough", "holds"), [(0, "no"), (1, "yes"), (2, "yes"), (3, "no")])
+    def test_a_claim_holds_where_enough_of_its_comparisons_do(self, everything, enough, holds):
+        claim = claims.Claim(
+            "fig9", "", "", claims.ahead, [LEFT], [claims.HI], [claims.PHIL, claims.PER, CONSTANT],
+            [data.SUCCESS], enough=enough,
+        )  # fmt: skip
+        found = claims.judge(everything, claim, data.ALONE)
+        assert (found.holds, found.text[:13]) == (holds, "2 of 3 hold; ")
+        assert ("over PHIL-TD3" in found.text) == (holds == "no")
+
+    @given(st.lists(st.sampled_from(["yes", "no", "undecided"]), max_size=6), st.integers(1, 6))
+    def test_what_is_missing_can_only_decide_what_was_undecided(self, answers, count):
+        before = data.enough_of([*answers, "undecided"], count)
+        after = {data.enough_of([*answers, answer], count) for answer in ("yes", "no")}
+        assert before == "undecided" or after == {before}
 
 
 @pytest.fixture
@@ -232,8 +251,8 @@ def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
     # The policy alone is above 98 % in the validation after 1,500 steps: the human has given both
     # of the first two episodes by then, all that there is.
     until = ["1,500 [1,500, 1,500] (1)", *["123 [123, 123] (1)"] * 2]
-    costs = ["10.0", "10.0", "1,234", "56", "7"]
-    assert cells[1:-1] == ["left turn", "1", *until, *costs]
+    costs = ["10.0", "10.0", "1,234", "56", "7", "6,000"]
+    assert cells[1:] == ["left turn", "1", *until, *costs]
 
 
 def test_a_seed_that_never_learned_costs_more_than_any_other():
@@ -264,6 +283,7 @@ def test_the_report_is_made_of_the_records_alone(store, monkeypatch):
                for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
     assert set(re.findall(r"\((#[^)]*)\)", page)) <= anchors
     assert "20.70±1.82" in page
+    assert "`return_steps` 8 for 1" in page
     assert str(store.results.parent) not in page
 
 

@@ -227,6 +227,20 @@ class TestPlan:
             assert {name: getattr(config.learner, name) for name in row} == row
 
 
+def test_the_table_of_guidance_has_its_own_humans_and_its_own_tuning(monkeypatch):
+    def config(setting):
+        unit = planned.Unit("left_turn", "phil_td3", setting, 1)
+        return planned.run_config(unit, planned.GUIDANCE_PLAN, Path("humans"))
+
+    before = [config(setting) for setting in ("good", "normal")]
+    assert config("slower").human == "trainer.human.left_turn:SlowHuman"
+    assert config("late").human == config("good").human == "expert"
+    monkeypatch.setitem(planned.TUNED, "phil_td3", {"cloning_weight": 3.0})
+    good, normal = (config(setting) for setting in ("good", "normal"))
+    assert (good.learner.cloning_weight, normal) == (3.0, before[1])
+    assert good != before[0]
+
+
 def test_a_foreign_task_is_learned_and_reported_beside_its_expert(tmp_path, one_thread):
     units = [planned.Unit("hill", name, "good", seed)
              for name, seed in (("expert", 0), ("pvp4real_td3", 1))]  # fmt: skip

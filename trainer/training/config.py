@@ -39,7 +39,8 @@ class RunConfig:
     steps: int = 0
     """Environment steps after which the episode under way is the last; 0: episodes decide."""
     human: str = "expert"
-    """Who guides: the word expert, or a human model's directory."""
+    """Who guides: the word expert, ``module:Class`` of another script, or a human model's
+    directory."""
     guided_share: float = 1.0
     """Share of the episodes that the human watches. (The authors' code: a third in the left
     turn.)"""
