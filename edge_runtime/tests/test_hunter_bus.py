@@ -88,6 +88,8 @@ def vehicle(channel):
 
 def drive(chassis, vehicle):
     def is_quick():
+        if any("no command" in fault for fault in vehicle.feedback(time.monotonic()).faults):
+            enable(vehicle)  # This process itself stood still for so long.
         vehicle.command(PEDAL, time.monotonic())
         return chassis.speeds[-1] > 0.2
 
