@@ -42,7 +42,6 @@ from trainer.experiments.data import (
     Result,
     Results,
     above,
-    all_of,
     bootstrap,
     enough_of,
     mean_estimate,
@@ -119,7 +118,7 @@ def judge(results: Results, claim: Claim, kind: str) -> Comparison:
     """
     made = list(claim.test(results, kind, claim))
     verdicts = [one.holds for one in made]
-    holds = enough_of(verdicts, claim.enough) if claim.enough else all_of(verdicts)
+    holds = enough_of(verdicts, claim.enough)
     measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
     if not measured:
         return Comparison("not measured", "undecided", float("nan"), False)
@@ -180,14 +179,14 @@ def sooner(
     """
     for place, quantity in product(claim.places, claim.quantities):
 
-        def level(line: Line, place: Place = place, quantity: str = quantity) -> float:
+        def ended(line: Line, place: Place = place, quantity: str = quantity) -> float:
             value = results.estimate(place, line, quantity, kind).value
             return -np.inf if np.isnan(value) else value
 
         others = [line for line in claim.others if line]
         everybody = [*claim.ours, *others]
         complete = all(results.complete(place, line, quantity) for line in everybody)
-        for first, second in product(claim.ours, [max(others, key=level)] if best else others):
+        for first, second in product(claim.ours, [max(others, key=ended)] if best else others):
             own, other = (results.of(str(place), line) for line in (first, second))
             one, steps = sooner_by(own, other, kind, quantity, common)
             times = claim.bar or 1.0

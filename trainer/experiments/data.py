@@ -94,18 +94,12 @@ def within(difference: Estimate, reach: float) -> Holds:
     return "no" if difference.low > reach or difference.high < -reach else "undecided"
 
 
-def all_of(answers: Sequence[Holds]) -> Holds:
-    """Yes where all are, no where one is not."""
-    if "no" in answers:
+def enough_of(answers: Sequence[Holds], count: int = 0) -> Holds:
+    """Yes where so many are (0: all), no where so many no longer can be."""
+    least = count or len(answers)
+    if len(answers) - answers.count("no") < least:
         return "no"
-    return "yes" if answers and set(answers) == {"yes"} else "undecided"
-
-
-def enough_of(answers: Sequence[Holds], count: int) -> Holds:
-    """Yes where so many are, no where so many no longer can be."""
-    if answers.count("yes") >= count:
-        return "yes"
-    return "no" if len(answers) - answers.count("no") < count else "undecided"
+    return "yes" if answers and answers.count("yes") >= least else "undecided"
 
 
 def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:

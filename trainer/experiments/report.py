@@ -24,7 +24,6 @@ from trainer.experiments.claims import (
     AS_PRINTED,
     CLAIMS,
     GOALS,
-    OF_CURVES,
     Claim,
     Comparison,
     judge_both,
@@ -87,21 +86,14 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         elif name in MORE:
             yield from MORE[name](results)
         rows = [
-            (claim.text, claim.paper, f.text, f.holds, *((a.text, a.holds) if a else ("", "")))
+            (claim.text, claim.paper, f.text, f.holds, *((a.text, a.holds) if a else ()))
             for claim, f, a in judged
             if claim.source == name
         ]
         if rows:
-            head = (
-                "claim",
-                "wanted" if name == "goals" else "the paper",
-                "what decides",
-                "holds",
-                "policy alone",
-                "holds alone",
-            )
-            columns = len(head) if name in OF_CURVES else len(head) - 2
-            yield from markdown_table(head[:columns], [row[:columns] for row in rows])
+            paper = "wanted" if name == "goals" else "the paper"
+            head = ("claim", paper, "what decides", "holds", "policy alone", "holds alone")
+            yield from markdown_table(head[: len(rows[0])], rows)
 
 
 def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:

@@ -54,7 +54,7 @@ class TestStatistics:
         assert found == ["yes", "undecided", "no", "no"]
         answers: list[list[data.Holds]]
         answers = [["yes", "yes"], ["yes", "undecided"], ["no", "undecided"], []]
-        assert list(map(data.all_of, answers)) == ["yes", "undecided", "no", "undecided"]
+        assert list(map(data.enough_of, answers)) == ["yes", "undecided", "no", "undecided"]
 
 
 class TestData:

@@ -180,10 +180,6 @@ class Alarm:
         return True
 
 
-def reasons(trigger, count):
-    return [trigger.wants_control(FULL) for _ in range(count)]
-
-
 def noticed(attention, *periods, count):
     """What a human notices of a reason that is there in these periods."""
     return [attention.notices("collision" if n in periods else None) for n in range(count)]
