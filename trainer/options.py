@@ -20,6 +20,7 @@ from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS
 
 Group = argparse.ArgumentParser | argparse._ArgumentGroup
+DEVICES = ("cpu", "cuda")
 
 
 def add_scenario(parser: Group, default: str | None = "left_turn") -> None:
@@ -102,10 +103,27 @@ def meanings(config: type) -> dict[str, str]:
     return found
 
 
+def add_device(parser: Group) -> None:
+    """``--device``."""
+    parser.add_argument(
+        "--device", choices=DEVICES, default=DEVICES[0], help="where the learner computes"
+    )
+
+
+def check_device(device: str) -> None:
+    """Raise UserError unless the learner can compute there."""
+    import torch  # takes two seconds, which --help need not wait
+
+    if device not in DEVICES:
+        raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("no CUDA device is available; use --device cpu")
+
+
 def set_threads(count: int) -> None:
     """Limit torch's threads; 0 leaves them as they are."""
     if count:
-        import torch  # takes two seconds, which --help need not wait
+        import torch  # as above
 
         torch.set_num_threads(count)
 

@@ -11,7 +11,7 @@ from trainer.experiments.guidance import write_guidance, write_typical
 from trainer.experiments.plan import EXPERIMENTS, FOREIGN, GUIDANCE
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
-from trainer.options import add_time_limit, deadline_s
+from trainer.options import add_device, add_time_limit, check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
 from trainer.util import cores
 
@@ -68,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="compute on a Ray cluster instead of this machine: HOST:PORT, auto or local",
     )
+    add_device(how)
     add_time_limit(
         how,
         "begin nothing after this time, and stop what runs after its next episode; the same "
@@ -108,6 +109,9 @@ def run(arguments: argparse.Namespace) -> int:
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")
         return 0
+    if arguments.ray and arguments.device != "cpu":
+        raise UserError("--ray computes on processors: leave out --device")
+    check_device(arguments.device)
     wanted = plan.units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
@@ -118,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     done, _ = store.find(possible)
     # The clock that the processes have, too.
     stop_at_s = deadline_s(arguments.max_minutes, time.time)
-    left = [Task(unit, store, stop_at_s) for unit in possible if unit not in done]
+    left = [Task(unit, store, stop_at_s, arguments.device) for unit in possible if unit not in done]
     if left and arguments.ray:
         ends = run_on_ray(left, arguments.ray)
     else:

@@ -139,13 +139,13 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
     head = ("", "about", *answers, *(f"{answer}, alone" for answer in answers))
     yield from markdown_table(head, rows)
     yield from markdown_table(
-        ("setting", "meaning", "algorithms", "computed in bfloat16"),
+        ("setting", "meaning", "algorithms", "computed in"),
         (
             (
                 words(setting),
                 plan.SETTINGS[setting].meaning,
                 ", ".join(Line(name).name for name in algorithms),
-                _in_bfloat16(results, [Line(name, setting) for name in algorithms]),
+                _computed_in(results, [Line(name, setting) for name in algorithms]),
             )
             for setting, algorithms, *_ in plan.LINES
             if HUMAN_MODEL not in algorithms
@@ -153,11 +153,14 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
     )
 
 
-def _in_bfloat16(results: Results, lines: Sequence[Line]) -> str:
-    """How many of the trainings multiplied in bfloat16; the others did in float32."""
+def _computed_in(results: Results, lines: Sequence[Line]) -> str:
+    """How many of the trainings multiplied in what, and where."""
     found = chain(*(results.of(*each) for each in product(SCENARIOS, lines)))
-    reduced = [one.record["computed"].get("bfloat16", False) for one in found]
-    return f"{sum(reduced)} of {len(reduced)}"
+    counts = Counter(
+        ("bfloat16" if its.get("bfloat16") else "float32") + " on a GPU" * bool(its.get("gpu"))
+        for its in (one.record["computed"] for one in found)
+    )
+    return ", ".join(f"{count} {what}" for what, count in counts.most_common())
 
 
 def _ours() -> str:

@@ -188,6 +188,7 @@ class Task:
     store: Store
     stop_at_s: float = math.inf
     """Seconds of the epoch after which work stops with the next episode."""
+    device: str = "cpu"  # Where its learner computes
 
 
 def compute(task: Task) -> str:
@@ -246,7 +247,8 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
         "processor": util.processor_model(),
-        "bfloat16": bfloat16_is_faster("cpu"),
+        "gpu": torch.cuda.get_device_name() if task.device == "cuda" else None,
+        "bfloat16": bfloat16_is_faster(task.device),
         "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
         "source_revision": util.source_revision(),
@@ -261,7 +263,9 @@ def _train(task: Task, run_dir: Path) -> bool:
     It quits when time is out, and has no deadline in ``TrainingRun.train``: that one validates once
     more when it stops, as no unbroken run does.
     """
-    config = plan.run_config(task.unit, task.store.plan, task.store.humans)
+    config = replace(
+        plan.run_config(task.unit, task.store.plan, task.store.humans), device=task.device
+    )
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
     validated = over and rows[-1]["validation_success"] not in NOT_VALIDATED

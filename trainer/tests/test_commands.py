@@ -79,6 +79,7 @@ TOLD = [
     ("experiment fig99", "invalid choice"),
     ("experiment fig7 --seeds 0", "--seeds"),
     ("experiment report status", "stand alone"),
+    ("experiment fig7 --ray auto --device cuda", "on processors"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
     ("experiment report --results nowhere", "no results"),
 ]  # fmt: skip

@@ -37,6 +37,16 @@ def straight(tmp_path_factory):
     return store
 
 
+def test_a_unit_learns_where_its_task_says(tmp_path, monkeypatch):
+    def begin(config, *where, **how):
+        raise UserError(f"learns on {config.device}")
+
+    monkeypatch.setattr(running, "TrainingRun", begin)
+    for device in ("cpu", "cuda"):
+        with pytest.raises(UserError, match=f"learns on {device}"):
+            running.compute(running.Task(UNIT, store_in(tmp_path), device=device))
+
+
 def test_a_unit_ends_as_a_record_and_an_actor(straight):
     (record,) = straight.records("left_turn").values()
     ends = record["training"]["end_step"]
@@ -48,6 +58,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert record["human"] is None
     assert not any(record["training"]["human_steps"] + record["training"]["takeovers"])
     assert record["computed"]["processor"]
+    assert record["computed"]["gpu"] is None
     # It says what was trained: enough to train it again by hand.
     config = asdict(planned.run_config(UNIT, TINY, straight.humans))
     said = record["config"]

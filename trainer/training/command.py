@@ -18,8 +18,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
@@ -48,7 +46,6 @@ EXAMPLE = examples(
 DEFAULTS = RunConfig()
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
-DEVICES = ("cpu", "cuda")
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 SETTINGS: dict[str, Any] = {
     **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
@@ -107,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
     how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     options.add_time_limit(how, "stop after the episode that passes this time")
-    how.add_argument("--device", choices=DEVICES, default="cpu", help="where the learner computes")
+    options.add_device(how)
     options.add_threads(how)
     how.add_argument(
         "--rerun",
@@ -173,10 +170,7 @@ def train(
     Raises UserError: no such environment, algorithm, human or setting, or a directory that is
     taken.
     """
-    if device not in DEVICES:
-        raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("no CUDA device is available; use --device cpu")
+    options.check_device(device)
     if not is_expert(human) and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
         words = f"none of {known}, no module:Class and no human model's directory"
