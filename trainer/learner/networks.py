@@ -28,6 +28,7 @@ from trainer.learner.kernel import FEATURES, FILTERS, FRAME, SIDE, trunk_feature
 from trainer.util import cpu_info
 
 _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|bf16)\b")
+_MATRIX_UNIT = re.compile(r"\bamx_bf16\b")
 """As Linux names them on x86-64 and on aarch64."""
 
 
@@ -35,13 +36,13 @@ _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|bf16)\b")
 def bfloat16_is_faster(device_type: str) -> bool:
     """Whether ``device_type`` (``cpu``, ``cuda``) multiplies bfloat16 faster than float32.
 
-    Intel's have instructions for it that bring nothing here: on a Xeon an update takes 84 ms with
-    them and 73 without (``results/bench/xeon_threads_1.json``).
+    Of Intel's, those with a matrix unit; their vectors' bfloat16 instructions bring nothing here.
     """
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     lines = cpu_info()
-    return any(map(_INSTRUCTIONS.search, lines)) and not any("GenuineIntel" in it for it in lines)
+    intel = any("GenuineIntel" in line for line in lines)
+    return any(map((_MATRIX_UNIT if intel else _INSTRUCTIONS).search, lines))
 
 
 HIDDEN = (256, 128, 64)

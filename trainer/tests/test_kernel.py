@@ -172,6 +172,21 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
     assert caplog.records == []
 
 
+@needs_kernel
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+@pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
+def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew, frames):
+    pictures = _pictures(9)[:, frames]
+    parameters, features = _parameters(pictures.shape[1]), []
+    for flags in ("", "-mno-amx-bf16"):
+        if anew(CXX=f"c++ {flags}") is None:
+            pytest.skip("the compiler knows no matrix unit")
+        features += [_gradients(pictures, parameters, _slopes(9), it)[0] for it in (True, False)]
+    reduced, single, by_pairs, again = features
+    assert torch.equal(single, again)
+    assert (reduced - by_pairs).norm() < 0.01 * single.norm()
+
+
 @pytest.mark.skipif(
     not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="there is no compiler here"
 )

@@ -130,7 +130,8 @@ def processor(monkeypatch):
     ("lines", "faster"),
     [(["flags : fma avx2 avx512f avx512_bf16 avx512_vnni"], True),
      (["vendor_id : AuthenticAMD", "flags : avx512_bf16"], True),
-     (["vendor_id : GenuineIntel", "flags : avx512_bf16 amx_bf16"], False),
+     (["vendor_id : GenuineIntel", "flags : avx512_bf16"], False),
+     (["vendor_id : GenuineIntel", "flags : avx512_bf16 amx_bf16 amx_tile"], True),
      (["Features : fp asimd i8mm bf16"], True), (["flags : fma avx2 avx512f"], False),
      (["Features : fp asimd ebf16x"], False), ([], False)],
 )  # fmt: skip

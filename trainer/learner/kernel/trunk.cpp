@@ -17,6 +17,11 @@
 #if defined(__AVX512BF16__)
 #include <immintrin.h>
 #endif
+#if defined(__AVX512BF16__) && defined(__AMX_TILE__) && defined(__AMX_BF16__) && defined(__linux__)
+#define HAS_TILES
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
 
 namespace {
 
@@ -116,8 +121,9 @@ constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTER
 // convolve are called planes below, the 9 results products.
 //
 // In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie side
-// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. Where
-// the processor has no such instruction, reduced precision is single precision.
+// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. A
+// matrix unit needs no planes, see ByTiles. Where the processor has neither, reduced precision is
+// single precision.
 
 // The 9 planes of the channels that share a cell: x0 - x1, x1 and x2 - x1 in both directions.
 template <class L, typename Cell, typename Pixel>
@@ -195,21 +201,13 @@ std::vector<Cell> split_weights(const float* weights, float scale) {
     return split;
 }
 
-// Adds up blocks of 2x2 outputs from their products, which lie ``stride`` apart, and pools them. As
-// in torch, the first of equals wins.
-inline void pool(const float* products, int stride, float bias, float* output, uint8_t* winner) {
-    Vector down[2][3];
-    for (int right = 0; right < 3; ++right) {
-        const Vector middle = load(products + (3 + right) * stride);
-        down[0][right] = load(products + right * stride) + middle;
-        down[1][right] = middle + load(products + (6 + right) * stride);
-    }
-    Vector best = down[0][0] + down[0][1];
+// Pools blocks of 2x2 outputs. As in torch, the first of equals wins.
+inline void pool(const Vector (&block)[4], float bias, float* output, uint8_t* winner) {
+    Vector best = block[0];
     Integers place = {};
     for (int next = 1; next < 4; ++next) {
-        const Vector value = down[next / 2][next % 2] + down[next / 2][next % 2 + 1];
-        const Integers wins = value > best;
-        best = wins ? value : best;
+        const Integers wins = block[next] > best;
+        best = wins ? block[next] : best;
         place = wins ? Integers{} + next : place;
     }
     best += bias;
@@ -217,6 +215,17 @@ inline void pool(const float* products, int stride, float bias, float* output, u
     store(output, best < Vector{} ? Vector{} : best);  // not the mask: NaN should stay NaN
     *reinterpret_cast<LooseBytes*>(winner) =
         __builtin_convertvector(on ? place : Integers{} + OFF, Bytes);
+}
+
+// Adds up blocks of 2x2 outputs from their products, which lie ``stride`` apart.
+inline void add_up(const float* products, int stride, Vector (&block)[4]) {
+    Vector down[2][3];
+    for (int right = 0; right < 3; ++right) {
+        const Vector middle = load(products + (3 + right) * stride);
+        down[0][right] = load(products + right * stride) + middle;
+        down[1][right] = middle + load(products + (6 + right) * stride);
+    }
+    for (int i = 0; i < 4; ++i) block[i] = down[i / 2][i % 2] + down[i / 2][i % 2 + 1];
 }
 
 // One product at WIDE vectors of positions for GROUP filters, with all sums in registers.
@@ -249,44 +258,193 @@ void convolve(const Cell* planes, const Cell* weights, const float* bias, float*
             for (int filter = 0; filter < L::GROUP; ++filter)
                 for (int i = 0; i < TILE; i += LANES) {
                     const int at = (group + filter) * L::SIZE + tile + i;
-                    pool(&products[0][filter][i], L::GROUP * TILE, bias[group + filter],
-                         outputs + at, winners + at);
+                    Vector block[4];
+                    add_up(&products[0][filter][i], L::GROUP * TILE, block);
+                    pool(block, bias[group + filter], outputs + at, winners + at);
                 }
         }
 }
 
+// A layer by its planes.
+template <class L, typename Number>
+struct ByPlanes {
+    using Cell = typename L::template Fitting<Number>;
+    struct Scratch {
+        Cell planes[L::PLANES];
+    };
+    const std::vector<Cell> weights;
+    ByPlanes(const float* given, float scale) : weights(split_weights<L, Cell>(given, scale)) {}
+
+    template <typename Pixel>
+    void run(const Pixel* image, const float* bias, float* outputs, uint8_t* winners,
+             Scratch& scratch) const {
+        make_all_planes<L>(image, L::IMAGE_SIZE, scratch.planes);
+        convolve<L>(scratch.planes, weights.data(), bias, outputs, winners);
+    }
+};
+template <class L>
+using Single = ByPlanes<L, float>;
+template <class L>
+using Paired = ByPlanes<L, Pair>;
+
+#if defined(HAS_TILES)
+// A layer by a processor's matrix unit (AMX), which multiplies tiles of 16 rows of 64 bytes so fast
+// that planes would not pay. A tile of weights is [filter][pair of a row of the filter], one of the
+// image [pair][16 positions], each row a pixel further on: they overlap where they lie.
+
+// What the system asks for before a process may use the unit's registers.
+inline bool tiles_permitted() {
+    constexpr int REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+    static const bool permitted = syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
+    return permitted;
+}
+
+// The registers' shapes while this lives; then those from before, which are another library's.
+class Tiles {
+    struct alignas(64) Shapes {
+        uint8_t palette, start_row, reserved[14];
+        uint16_t row_bytes[16];
+        uint8_t rows[16];
+    };
+    Shapes before = {}, now = {};
+
+public:
+    explicit Tiles(int filters) {
+        now.palette = 1;
+        for (int tile = 0; tile < 8; ++tile) {
+            now.rows[tile] = tile < 6 ? filters : SIDE;
+            now.row_bytes[tile] = tile == 4 || tile == 5 ? SIDE * sizeof(Pair) : 64;
+        }
+        _tile_storeconfig(&before);
+        _tile_loadconfig(&now);
+    }
+    ~Tiles() { _tile_loadconfig(&before); }
+};
+
+template <class L>
+struct ByTiles {
+    static constexpr int STACKS = (L::CHANNELS + 1) / 2, ROW = L::FILTERS * SIDE;
+    struct Scratch {
+        Pair image[STACKS][L::IMAGE_SIZE];
+        float sums[2][2][L::FILTERS][LANES];  // [row][right half][filter][position]
+    };
+    static constexpr int LAST_PAIR = (2 * L::ROWS + SIDE - 2) * L::IMAGE_PITCH +
+                                     2 * vectors(L::COLUMNS) * LANES + SIDE - 2;
+    static_assert(LAST_PAIR < L::IMAGE_SIZE, "tiles must not leave the image");
+    static_assert((L::ROWS - 1) * L::PITCH + vectors(L::COLUMNS) * LANES <= L::SIZE,
+                  "nor whole vectors the outputs");
+    std::vector<Pair> weights;  // [stack][row of the filter][filter][column]
+
+    ByTiles(const float* given, float scale) : weights(STACKS * SIDE * ROW) {
+        for (int filter = 0; filter < L::FILTERS; ++filter)
+            for (int pixel = 0; pixel < SIDE * SIDE; ++pixel, given += L::CHANNELS)
+                for (int stack = 0; stack < STACKS; ++stack)
+                    pack_channels(given, stack, 1, scale,
+                                  &weights[(stack * SIDE + pixel / SIDE) * ROW + filter * SIDE +
+                                           pixel % SIDE]);
+    }
+
+    template <typename Pixel>
+    void run(const Pixel* image, const float* bias, float* outputs, uint8_t* winners,
+             Scratch& scratch) const {
+        for (int stack = 0; stack < STACKS; ++stack)
+            for (int i = 0; i < L::IMAGE_SIZE; ++i)
+                pack_channels(image + i, stack, L::IMAGE_SIZE, 1.0f, &scratch.image[stack][i]);
+        const Tiles shapes(L::FILTERS);
+        // Rows in order: what a vector writes behind its row is overwritten by the next.
+        for (int row = 0; row < L::ROWS; ++row)
+            for (int column = 0; column < L::COLUMNS; column += LANES) {
+                multiply(&scratch.image[0][2 * row * L::IMAGE_PITCH + 2 * column], scratch.sums);
+                for (int filter = 0; filter < L::FILTERS; ++filter) {
+                    Vector block[4];
+                    for (int i = 0; i < 4; ++i) {
+                        const auto& halves = scratch.sums[i / 2];
+                        block[i] = (Vector)_mm512_permutex2var_ps(load(halves[0][filter]),
+                                                                  (__m512i)(EVEN + i % 2),
+                                                                  load(halves[1][filter]));
+                    }
+                    const int at = filter * L::SIZE + row * L::PITCH + column;
+                    pool(block, bias[filter], outputs + at, winners + at);
+                }
+            }
+    }
+
+private:
+    static constexpr Integers EVEN = {0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30};
+
+    // A single channel is paired with zeros.
+    template <typename Number>
+    static void pack_channels(const Number* from, int stack, int stride, float scale, Pair* to) {
+        const bool whole = 2 * stack + 1 < L::CHANNELS;
+        from += 2 * stack * stride;
+        pack({from[0] * scale, whole ? from[stride] * scale : 0.0f}, to);
+    }
+
+    // Two rows of 32 outputs; ``image`` is where the first one's window begins.
+    void multiply(const Pair* image, float (&sums)[2][2][L::FILTERS][LANES]) const {
+        constexpr int PIXEL = sizeof(Pair), FILTER = SIDE * sizeof(Pair);
+        settle();
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+        for (int stack = 0; stack < STACKS; ++stack)
+            for (int row = 0; row <= SIDE; ++row) {
+                const Pair* pixels = image + stack * L::IMAGE_SIZE + row * L::IMAGE_PITCH;
+                const Pair* filters = &weights[stack * SIDE * ROW];
+                _tile_loadd(6, pixels, PIXEL);
+                _tile_loadd(7, pixels + LANES, PIXEL);
+                if (row < SIDE) {
+                    _tile_loadd(4, filters + row * ROW, FILTER);
+                    _tile_dpbf16ps(0, 4, 6);
+                    _tile_dpbf16ps(1, 4, 7);
+                }
+                if (row > 0) {
+                    _tile_loadd(5, filters + (row - 1) * ROW, FILTER);
+                    _tile_dpbf16ps(2, 5, 6);
+                    _tile_dpbf16ps(3, 5, 7);
+                }
+            }
+        _tile_stored(0, sums[0][0], 64);
+        _tile_stored(1, sums[0][1], 64);
+        _tile_stored(2, sums[1][0], 64);
+        _tile_stored(3, sums[1][1], 64);
+        settle();
+    }
+
+    // GCC's tile instructions do not tell it that they read and write memory.
+    static void settle() { asm volatile("" ::: "memory"); }
+};
+#endif
+
 // What a thread needs for one image. It starts as zeros: unused positions may hold anything, but
 // reading them should not meet slow denormal numbers.
-template <int FRAMES, typename Cell>
+template <int FRAMES, template <class> class Way>
 struct ForwardScratch {
     using First = FirstLayer<FRAMES>;
-    typename First::template Fitting<Cell> planes1[First::PLANES];
-    Cell planes2[Second::PLANES];
+    typename Way<First>::Scratch first;
+    typename Way<Second>::Scratch second;
     float hidden[First::OUTPUTS], outputs[Second::OUTPUTS];
     uint8_t winners1[First::OUTPUTS], winners2[Second::OUTPUTS];
 };
 
-template <int FRAMES, typename Cell>
+template <int FRAMES, template <class> class Way>
 void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights1,
              const float* bias1, const float* weights2, const float* bias2, float* features,
              float* hidden, uint8_t* winners1, uint8_t* winners2, int threads) {
     using First = FirstLayer<FRAMES>;
-    using Cell1 = typename First::template Fitting<Cell>;
-    const auto split1 = split_weights<First, Cell1>(weights1, 1.0f / 255.0f);
-    const auto split2 = split_weights<Second, Cell>(weights2, 1.0f);
+    const Way<First> first(weights1, 1.0f / 255.0f);
+    const Way<Second> second(weights2, 1.0f);
 #pragma omp parallel num_threads(threads) if (images > 1)
     {
-        const auto scratch = std::make_unique<ForwardScratch<FRAMES, Cell>>();
+        const auto scratch = std::make_unique<ForwardScratch<FRAMES, Way>>();
 #pragma omp for schedule(dynamic)
         for (int64_t image = 0; image < images; ++image) {
             float* between = hidden ? hidden + image * First::OUTPUTS : scratch->hidden;
             uint8_t* won1 = hidden ? winners1 + image * First::OUTPUTS : scratch->winners1;
             uint8_t* won2 = hidden ? winners2 + image * Second::OUTPUTS : scratch->winners2;
-            make_all_planes<First>(frames + image * image_stride, First::IMAGE_SIZE,
-                                   scratch->planes1);
-            convolve<First>(scratch->planes1, split1.data(), bias1, between, won1);
-            make_all_planes<Second>(between, First::SIZE, scratch->planes2);
-            convolve<Second>(scratch->planes2, split2.data(), bias2, scratch->outputs, won2);
+            first.run(frames + image * image_stride, bias1, between, won1, scratch->first);
+            second.run(between, bias2, scratch->outputs, won2, scratch->second);
             for (int row = 0; row < Second::FILTERS * Second::ROWS; ++row)
                 std::copy_n(scratch->outputs + row / Second::ROWS * Second::SIZE +
                                 row % Second::ROWS * Second::PITCH,
@@ -500,8 +658,12 @@ void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, 
                    const float* weights1, const float* bias1, const float* weights2,
                    const float* bias2, float* features, float* hidden, uint8_t* winners1,
                    uint8_t* winners2, int reduced, int threads) {
-    const auto run = channels == 1 ? (reduced ? forward<1, Pair> : forward<1, float>)
-                                   : (reduced ? forward<2, Pair> : forward<2, float>);
+    auto run = channels == 1 ? (reduced ? forward<1, Paired> : forward<1, Single>)
+                             : (reduced ? forward<2, Paired> : forward<2, Single>);
+#if defined(HAS_TILES)
+    if (reduced && tiles_permitted())
+        run = channels == 1 ? forward<1, ByTiles> : forward<2, ByTiles>;
+#endif
     run(frames, image_stride, images, weights1, bias1, weights2, bias2, features, hidden, winners1,
         winners2, threads);
 }
