@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[*EXPERIMENTS, ALL, STATUS, REPORT, GUIDANCE, TYPICAL],
         help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need; {STATUS}: how much is "
         f"done; {REPORT}: draw the figures and judge the claims from what is done; {GUIDANCE}: "
-        "compute and report the table of human guidance, which is not the paper's; "
+        "compute and report the table of human guidance, which is not the paper's, or with "
+        f"{STATUS} how much of it is done; "
         f"{TYPICAL}: write the curves that a person's coach shows, from both tables' records",
     )
     what.add_argument(
@@ -88,23 +89,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compute, say how much is done, or report; returns the exit status."""
     names = list(dict.fromkeys(arguments.names))
-    if len(names) > 1 and {STATUS, REPORT, GUIDANCE, TYPICAL} & set(names):
-        raise UserError(f"{STATUS}, {REPORT}, {GUIDANCE} and {TYPICAL} stand alone")
+    alone = {STATUS, REPORT, GUIDANCE, TYPICAL} & set(names)
+    if len(names) > 1 and alone and set(names) != {STATUS, GUIDANCE}:
+        raise UserError(
+            f"{STATUS}, {REPORT}, {GUIDANCE} and {TYPICAL} stand alone, or {STATUS} with {GUIDANCE}"
+        )
     if names == [TYPICAL]:
         results = Path(arguments.results or "results")
         write_typical(results, Path(arguments.humans), arguments.seeds, TYPICAL_FILE)
         print(f"wrote {TYPICAL_FILE}")
         return 0
     work, quick, place = plan.PLAN, plan.QUICK, "paper"
-    if names == [GUIDANCE]:
+    if GUIDANCE in names:
         work, quick, place = plan.GUIDANCE_PLAN, plan.QUICK_GUIDANCE, GUIDANCE
     results = Path(arguments.results or f"results/{place}")
     runs, humans = Path(arguments.runs or f"runs/{place}"), Path(arguments.humans)
     store = Store(work, results, runs, humans)
     if arguments.quick:
         store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
-    if names == [STATUS]:
-        print("\n".join(store.status_lines(arguments.seeds)))
+    if STATUS in names:
+        counted = GUIDANCE if GUIDANCE in names else ALL
+        print("\n".join(store.status_lines(counted, arguments.seeds)))
         return 0
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")

@@ -169,9 +169,9 @@ class Store:
         (self.run_dir(unit) / CHECKPOINT_FILE).unlink(missing_ok=True)
         return FINISHED
 
-    def status_lines(self, seeds: int) -> Iterator[str]:
-        """A line for each algorithm and setting: how many of its units are done."""
-        units = plan.units_of(["all"], seeds)
+    def status_lines(self, name: str, seeds: int) -> Iterator[str]:
+        """A line for each algorithm and setting of an experiment: how many units are done."""
+        units = plan.units_of([name], seeds)
         found, stale = self.find(units)
         done = Counter(unit[:3] for unit in found)
         for line, count in Counter(unit[:3] for unit in units).items():

@@ -312,6 +312,8 @@ def test_status_counts_the_units(capsys, store):
     last = out.splitlines()[-1]
     assert last.startswith("0 of ")
     assert "; 10 records of other settings" in last
+    status, out, _ = said(capsys, "status", "guidance", *places)
+    assert (status, "0 of 482 units done" in out, "pvp_td3" in out) == (0, True, True)
 
 
 def test_without_its_human_a_unit_is_left_out(capsys, tmp_path):
