@@ -285,7 +285,7 @@ CHECKS = (
           "everything, but `trainer train` takes several times as long",
           "a C++ compiler: apt install g++"),
     Check("training", "GPU", partial(python_says, _GPU),
-          "no `trainer train --device cuda`; the processor trains, too",
+          "no `--device cuda`; the processor trains, too",
           "an NVIDIA GPU with its driver, and torch with CUDA"),
     Check("person", "window", partial(python_says, _WINDOW),
           "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",

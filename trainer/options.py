@@ -112,7 +112,7 @@ def add_device(parser: Group) -> None:
 
 def check_device(device: str) -> None:
     """Raise UserError unless the learner can compute there."""
-    import torch  # takes two seconds, which --help need not wait
+    import torch  # see set_threads
 
     if device not in DEVICES:
         raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
@@ -123,7 +123,7 @@ def check_device(device: str) -> None:
 def set_threads(count: int) -> None:
     """Limit torch's threads; 0 leaves them as they are."""
     if count:
-        import torch  # as above
+        import torch  # takes two seconds, which --help need not wait
 
         torch.set_num_threads(count)
 

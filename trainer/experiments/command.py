@@ -21,6 +21,7 @@ EXAMPLE = examples(
     "python -m trainer experiment all --scenario congestion",
     "python -m trainer experiment report",
     "python -m trainer experiment guidance --max-minutes 60",
+    "python -m trainer experiment status guidance",
 )
 ALL, STATUS, REPORT, TYPICAL = "all", "status", "report", "typical"
 MOST_SEEDS = 1000

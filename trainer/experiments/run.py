@@ -39,6 +39,8 @@ from trainer.experiments.plan import Plan, Unit
 from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
+from trainer.options import read_json
+from trainer.training.config import CONFIG_FILE
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 
@@ -218,7 +220,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         **plan.deciding(unit, store.plan, store.humans),
         "testing": plan.testing(unit, store.plan),
     }
-    seconds = {}
+    seconds, device = {}, "cpu"
     if unit.trained:
         make_directory(run_dir)
         if not _train(task, run_dir):
@@ -232,6 +234,8 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         record["totals"] = totals(rows, record["period_s"])
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
+        # Not the task's: it may have been trained before.
+        device = read_json(run_dir / CONFIG_FILE, "settings")["device"]
         policy = str(run_dir)
     elif unit.algorithm == plan.CONSTANT:
         record["action"], record["success_of"] = best_constant(unit.scenario, store.plan)
@@ -247,8 +251,8 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
         "processor": util.processor_model(),
-        "gpu": torch.cuda.get_device_name() if task.device == "cuda" else None,
-        "bfloat16": bfloat16_is_faster(task.device),
+        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "bfloat16": bfloat16_is_faster(device),
         "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
         "source_revision": util.source_revision(),
@@ -395,7 +399,7 @@ def _work(task: Task) -> None:
     sys.exit(list(EXITS.values()).index(end))
 
 
-WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)  # What a unit goes on from
+WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE, CONFIG_FILE)  # What a unit goes on from
 Files = dict[str, bytes]
 Parcel = tuple[Task, Files, Files]
 """A task on its way to a node: with its human model, and with what it goes on from."""

@@ -94,6 +94,13 @@ def test_bad_input_gets_one_line_and_status_2(words, said, capsys, tmp_path, mon
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]
 
 
+@pytest.mark.parametrize("command", ["experiment fig7", "train --out x"])
+def test_without_a_gpu_no_command_computes_on_one(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "no CUDA device" in refusal(capsys, *command.split(), "--device", "cuda")
+
+
 def test_evaluate_reports_what_the_contract_asks_for(capsys):
     words = "evaluate expert --scenario congestion --condition variant --runs 2 --seed 5"
     status, out, _ = call(capsys, *words.split())

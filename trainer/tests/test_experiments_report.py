@@ -266,6 +266,16 @@ def test_a_seed_that_never_learned_costs_more_than_any_other():
     assert report.until(found[2:], 0.9, "steps") == "–"
 
 
+def test_the_page_says_in_what_and_where_the_trainings_were_computed():
+    units = [Unit("left_turn", "phil_td3", NORMAL, seed) for seed in (1, 2, 3)]
+    results = results_of(units, 3)
+    _, second, third = (results.found[unit].record["computed"] for unit in units)
+    second.update(bfloat16=True)
+    third.update(bfloat16=True, gpu="H100")
+    said = report._computed_in(results, [claims.PHIL])
+    assert said == "1 float32, 1 bfloat16, 1 bfloat16 on a GPU"
+
+
 def test_the_report_is_made_of_the_records_alone(store, monkeypatch):
     write = report.write_figure
 

@@ -177,13 +177,19 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
 @pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
 def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew, frames):
     pictures = _pictures(9)[:, frames]
-    parameters, features = _parameters(pictures.shape[1]), []
-    for flags in ("", "-mno-amx-bf16"):
-        if anew(CXX=f"c++ {flags}") is None:
-            pytest.skip("the compiler knows no matrix unit")
-        features += [_gradients(pictures, parameters, _slopes(9), it)[0] for it in (True, False)]
-    reduced, single, by_pairs, again = features
+    parameters = _parameters(pictures.shape[1])
+
+    def features(library):
+        found = [_gradients(pictures, parameters, _slopes(9), it)[0] for it in (True, False)]
+        return *found, bool(library.trunk_has_tiles())
+
+    reduced, single, by_tiles = features(kernel.load())
+    if not (without := anew(CXX="c++ -mno-amx-bf16")):
+        pytest.skip("the compiler knows no matrix unit")
+    by_pairs, again, tiles = features(without)
     assert torch.equal(single, again)
+    assert not tiles
+    assert torch.equal(reduced, by_pairs) != by_tiles
     assert (reduced - by_pairs).norm() < 0.01 * single.norm()
 
 

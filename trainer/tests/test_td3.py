@@ -1,6 +1,7 @@
 import itertools
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -118,24 +119,30 @@ def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is
 def processor(monkeypatch):
     """Pretend to have a processor of these flags."""
 
-    def pretend(*lines):
+    def pretend(*lines, tiles=0):
         monkeypatch.setattr(networks, "cpu_info", lambda: lines)
+        kernel = SimpleNamespace(trunk_has_tiles=lambda: tiles)
+        monkeypatch.setattr(networks, "load_kernel", lambda: None if tiles is None else kernel)
         networks.bfloat16_is_faster.cache_clear()
 
     yield pretend
     networks.bfloat16_is_faster.cache_clear()
 
 
+@pytest.mark.parametrize(("tiles", "faster"), [(1, True), (0, False), (None, False)])
+def test_an_intel_is_faster_in_bfloat16_by_its_matrix_unit_only(processor, tiles, faster):
+    processor("vendor_id : GenuineIntel", "flags : avx512_bf16 amx_bf16", tiles=tiles)
+    assert networks.bfloat16_is_faster("cpu") == faster
+
+
 @pytest.mark.parametrize(
     ("lines", "faster"),
     [(["flags : fma avx2 avx512f avx512_bf16 avx512_vnni"], True),
      (["vendor_id : AuthenticAMD", "flags : avx512_bf16"], True),
-     (["vendor_id : GenuineIntel", "flags : avx512_bf16"], False),
-     (["vendor_id : GenuineIntel", "flags : avx512_bf16 amx_bf16 amx_tile"], True),
      (["Features : fp asimd i8mm bf16"], True), (["flags : fma avx2 avx512f"], False),
      (["Features : fp asimd ebf16x"], False), ([], False)],
 )  # fmt: skip
-def test_the_processors_flags_and_its_vendor_decide(processor, lines, faster):
+def test_the_flags_of_other_processors_decide(processor, lines, faster):
     processor(*lines)
     assert networks.bfloat16_is_faster("cpu") == faster
 

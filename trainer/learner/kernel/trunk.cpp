@@ -76,7 +76,7 @@ constexpr int WIDE = REGISTERS / 16;   // vectors of positions computed together
 constexpr uint8_t OFF = 4;             // in the place of a winner (0..3): ReLU is off
 
 // A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. They are numbered along
-// rows of PITCH and computed up to SIZE, so that no loop has a remainder. The surplus is not used.
+// rows of PITCH with room up to SIZE, so that no loop has a remainder. The surplus is not used.
 template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
           int COLUMNS_>
 struct Layer {
@@ -121,9 +121,9 @@ constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTER
 // convolve are called planes below, the 9 results products.
 //
 // In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie side
-// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. A
-// matrix unit needs no planes, see ByTiles. Where the processor has neither, reduced precision is
-// single precision.
+// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. Where
+// the processor has no such instruction, reduced precision is single precision. Where it has a
+// matrix unit, too, there are no planes (ByTiles).
 
 // The 9 planes of the channels that share a cell: x0 - x1, x1 and x2 - x1 in both directions.
 template <class L, typename Cell, typename Pixel>
@@ -289,17 +289,21 @@ using Paired = ByPlanes<L, Pair>;
 
 #if defined(HAS_TILES)
 // A layer by a processor's matrix unit (AMX), which multiplies tiles of 16 rows of 64 bytes so fast
-// that planes would not pay. A tile of weights is [filter][pair of a row of the filter], one of the
-// image [pair][16 positions], each row a pixel further on: they overlap where they lie.
+// that planes would not pay. A tile of weights is [filter][column of the filter], one of the image
+// [column of the filter][16 positions]. Each row of the latter begins a pixel after the one before:
+// they overlap in memory, and nothing is copied.
 
-// What the system asks for before a process may use the unit's registers.
+// The system wants to be asked before a process uses the unit's registers.
 inline bool tiles_permitted() {
     constexpr int REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     static const bool permitted = syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
     return permitted;
 }
 
-// The registers' shapes while this lives; then those from before, which are another library's.
+// GCC's tile loads and configurations do not tell it which memory they read.
+inline void settle() { asm volatile("" ::: "memory"); }
+
+// The tiles' shapes while this lives; then those from before, which may be another library's.
 class Tiles {
     struct alignas(64) Shapes {
         uint8_t palette, start_row, reserved[14];
@@ -315,6 +319,7 @@ public:
             now.rows[tile] = tile < 6 ? filters : SIDE;
             now.row_bytes[tile] = tile == 4 || tile == 5 ? SIDE * sizeof(Pair) : 64;
         }
+        settle();
         _tile_storeconfig(&before);
         _tile_loadconfig(&now);
     }
@@ -332,7 +337,7 @@ struct ByTiles {
                                      2 * vectors(L::COLUMNS) * LANES + SIDE - 2;
     static_assert(LAST_PAIR < L::IMAGE_SIZE, "tiles must not leave the image");
     static_assert((L::ROWS - 1) * L::PITCH + vectors(L::COLUMNS) * LANES <= L::SIZE,
-                  "nor whole vectors the outputs");
+                  "whole vectors must not leave the outputs");
     std::vector<Pair> weights;  // [stack][row of the filter][filter][column]
 
     ByTiles(const float* given, float scale) : weights(STACKS * SIDE * ROW) {
@@ -348,7 +353,7 @@ struct ByTiles {
     void run(const Pixel* image, const float* bias, float* outputs, uint8_t* winners,
              Scratch& scratch) const {
         for (int stack = 0; stack < STACKS; ++stack)
-            for (int i = 0; i < L::IMAGE_SIZE; ++i)
+            for (int i = 0; i <= LAST_PAIR; ++i)
                 pack_channels(image + i, stack, L::IMAGE_SIZE, 1.0f, &scratch.image[stack][i]);
         const Tiles shapes(L::FILTERS);
         // Rows in order: what a vector writes behind its row is overwritten by the next.
@@ -409,11 +414,7 @@ private:
         _tile_stored(1, sums[0][1], 64);
         _tile_stored(2, sums[1][0], 64);
         _tile_stored(3, sums[1][1], 64);
-        settle();
     }
-
-    // GCC's tile instructions do not tell it that they read and write memory.
-    static void settle() { asm volatile("" ::: "memory"); }
 };
 #endif
 
@@ -654,6 +655,15 @@ int trunk_outputs() { return Second::OUTPUTS; }
 // Whether ``reduced`` is bfloat16 here, and not single precision.
 int trunk_has_bfloat16() { return !std::is_same_v<Pair, float>; }
 
+// Whether a matrix unit multiplies it.
+int trunk_has_tiles() {
+#if defined(HAS_TILES)
+    return tiles_permitted();
+#else
+    return 0;
+#endif
+}
+
 void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, int channels,
                    const float* weights1, const float* bias1, const float* weights2,
                    const float* bias2, float* features, float* hidden, uint8_t* winners1,
@@ -661,7 +671,7 @@ void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, 
     auto run = channels == 1 ? (reduced ? forward<1, Paired> : forward<1, Single>)
                              : (reduced ? forward<2, Paired> : forward<2, Single>);
 #if defined(HAS_TILES)
-    if (reduced && tiles_permitted())
+    if (reduced && trunk_has_tiles())
         run = channels == 1 ? forward<1, ByTiles> : forward<2, ByTiles>;
 #endif
     run(frames, image_stride, images, weights1, bias1, weights2, bias2, features, hidden, winners1,
