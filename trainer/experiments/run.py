@@ -251,7 +251,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     seconds["tests_s"] = round(time.monotonic() - tested_s)
     record["computed"] = {
         "processor": util.processor_model(),
-        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "gpu": _gpu() if device == "cuda" else None,
         "bfloat16": bfloat16_is_faster(device),
         "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,
@@ -259,6 +259,11 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         **seconds,
     }
     return record
+
+
+def _gpu() -> str:
+    """The GPU's name."""
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "of another machine"
 
 
 def _train(task: Task, run_dir: Path) -> bool:
