@@ -288,11 +288,6 @@ template <class L>
 using Paired = ByPlanes<L, Pair>;
 
 #if defined(HAS_TILES)
-// A layer by a processor's matrix unit (AMX), which multiplies tiles of 16 rows of 64 bytes so fast
-// that planes would not pay. A tile of weights is [filter][column of the filter], one of the image
-// [column of the filter][16 positions]. Each row of the latter begins a pixel after the one before:
-// they overlap in memory, and nothing is copied.
-
 // The system wants to be asked before a process uses the unit's registers.
 inline bool tiles_permitted() {
     constexpr int REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
@@ -326,6 +321,10 @@ public:
     ~Tiles() { _tile_loadconfig(&before); }
 };
 
+// A layer by a processor's matrix unit (AMX), which multiplies tiles of 16 rows of 64 bytes so fast
+// that planes would not pay. A tile of weights is [filter][column of the filter], one of the image
+// [column of the filter][16 positions]. Each row of the latter begins a pixel after the one before:
+// they overlap in memory, and nothing is copied.
 template <class L>
 struct ByTiles {
     static constexpr int STACKS = (L::CHANNELS + 1) / 2, ROW = L::FILTERS * SIDE;
