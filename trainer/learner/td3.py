@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -182,11 +183,10 @@ class TD3Learner:
         padded = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
         corners = torch.randint(
             2 * most + 1, (len(frames), 2), generator=self.noise, device=self.device
-        ).tolist()
-        shifted, (height, width) = np.empty_like(frames), frames.shape[2:]
-        for row, (top, left) in enumerate(corners):
-            shifted[row] = padded[row, :, top : top + height, left : left + width]
-        return shifted
+        )
+        top, left = corners.cpu().numpy().T
+        windows = sliding_window_view(padded, frames.shape[2:], (2, 3))
+        return windows[np.arange(len(frames)), :, top, left]
 
     @torch.no_grad()
     def _targets(self, batch: Batch) -> Tensor:

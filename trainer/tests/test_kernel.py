@@ -120,6 +120,23 @@ def test_reduced_precision_is_bfloat16_where_processor_and_compiler_have_it(fram
     assert not torch.equal(reduced, single)
 
 
+@needs_kernel
+@pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
+def test_gradients_in_reduced_precision_are_much_the_same(frames):
+    """Where both passes backward know the same winners, and only factors are rounded."""
+    pictures, slopes = _pictures(33)[:, frames], _slopes(33)
+    parameters = _parameters(pictures.shape[1])
+    features = trunk_features(pictures, *parameters)
+    right = torch.autograd.grad(features, parameters, slopes, retain_graph=True)
+    node: Any = features.grad_fn
+    node.reduced = True
+    gradients = torch.autograd.grad(features, parameters, slopes)
+    library = kernel.load()
+    assert torch.equal(gradients[0], right[0]) != bool(library and library.trunk_has_tiles())
+    for gradient, exact in zip(gradients, right, strict=True):
+        assert (gradient - exact).norm() < 0.01 * exact.norm()
+
+
 def test_other_pictures_take_the_torch_path():
     assert trunk_features(_pictures(0)[:, :2], *_parameters(2)).shape == (0, 1792)
     parameters = _parameters(3)

@@ -54,7 +54,7 @@ def load() -> ctypes.CDLL | None:
     pointer, threads = ctypes.c_void_p, ctypes.c_int
     pictures = (pointer, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
     library.trunk_forward.argtypes = (*pictures, *(pointer,) * 8, ctypes.c_int, threads)
-    library.trunk_backward.argtypes = (*pictures, *(pointer,) * 9, threads)
+    library.trunk_backward.argtypes = (*pictures, *(pointer,) * 9, ctypes.c_int, threads)
     library.trunk_forward.restype = library.trunk_backward.restype = None
     return library
 
@@ -131,9 +131,9 @@ def trunk_features(
 
     Differentiable once with respect to the parameters. The compiled kernel serves the networks of
     this project on the CPU; anything else, and every export, takes the torch operations.
-    Under ``torch.autocast`` the kernel's forward pass multiplies in bfloat16, where the processor
-    can; its sums, features and gradients stay in single precision. The torch operations follow
-    autocast's own rules, which round features too.
+    Under ``torch.autocast`` the kernel multiplies in bfloat16 where the processor can: forward, and
+    by a matrix unit backward, too. Its sums, features and gradients stay in single precision. The
+    torch operations follow autocast's own rules, which round features too.
 
     Args:
         frames: uint8 [batch, n, 45, 80] with n = 1 or 2. A slice of a longer stack of frames,
@@ -238,6 +238,7 @@ class _Trunk(torch.autograd.Function):
         winners1 = torch.empty(images, library.trunk_hidden(), dtype=torch.uint8)
         winners2 = torch.empty(images, library.trunk_outputs(), dtype=torch.uint8)
         ctx.save_for_backward(frames, parameters[2], hidden, winners1, winners2)
+        ctx.reduced = torch.is_autocast_enabled("cpu")
         return _forward(frames, parameters, (hidden, winners1, winners2))
 
     @staticmethod
@@ -256,6 +257,7 @@ class _Trunk(torch.autograd.Function):
         library.trunk_backward(
             *_pictures(frames),
             *(tensor.data_ptr() for tensor in (*given, *results)),
+            ctx.reduced,
             torch.get_num_threads(),
         )
         weight1, bias1, weight2, bias2 = results

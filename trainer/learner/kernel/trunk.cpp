@@ -120,10 +120,10 @@ constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTER
 // multiplications are saved, and equal inputs still give exactly equal outputs. The 9 pictures to
 // convolve are called planes below, the 9 results products.
 //
-// In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie side
-// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. Where
-// the processor has no such instruction, reduced precision is single precision. Where it has a
-// matrix unit, too, there are no planes (ByTiles).
+// In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie
+// side by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision.
+// Where the processor has no such instruction, reduced precision is single precision. Where it has
+// a matrix unit, too, there are no planes (ByTiles).
 
 // The 9 planes of the channels that share a cell: x0 - x1, x1 and x2 - x1 in both directions.
 template <class L, typename Cell, typename Pixel>
@@ -298,6 +298,11 @@ inline bool tiles_permitted() {
 // GCC's tile loads and configurations do not tell it which memory they read.
 inline void settle() { asm volatile("" ::: "memory"); }
 
+struct Shape {
+    uint8_t rows;
+    uint16_t row_bytes;
+};
+
 // The tiles' shapes while this lives; then those from before, which may be another library's.
 class Tiles {
     struct alignas(64) Shapes {
@@ -308,11 +313,11 @@ class Tiles {
     Shapes before = {}, now = {};
 
 public:
-    explicit Tiles(int filters) {
+    explicit Tiles(const Shape (&shapes)[8]) {
         now.palette = 1;
         for (int tile = 0; tile < 8; ++tile) {
-            now.rows[tile] = tile < 6 ? filters : SIDE;
-            now.row_bytes[tile] = tile == 4 || tile == 5 ? SIDE * sizeof(Pair) : 64;
+            now.rows[tile] = shapes[tile].rows;
+            now.row_bytes[tile] = shapes[tile].row_bytes;
         }
         settle();
         _tile_storeconfig(&before);
@@ -354,7 +359,9 @@ struct ByTiles {
         for (int stack = 0; stack < STACKS; ++stack)
             for (int i = 0; i <= LAST_PAIR; ++i)
                 pack_channels(image + i, stack, L::IMAGE_SIZE, 1.0f, &scratch.image[stack][i]);
-        const Tiles shapes(L::FILTERS);
+        constexpr Shape SUMS = {L::FILTERS, 64}, PIXELS = {SIDE, 64};
+        constexpr Shape WEIGHTS = {L::FILTERS, SIDE * sizeof(Pair)};
+        const Tiles tiles({SUMS, SUMS, SUMS, SUMS, WEIGHTS, WEIGHTS, PIXELS, PIXELS});
         // Rows in order: what a vector writes behind its row is overwritten by the next.
         for (int row = 0; row < L::ROWS; ++row)
             for (int column = 0; column < L::COLUMNS; column += LANES) {
@@ -455,9 +462,12 @@ void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const 
 
 // The gradients of features to those of the weights.
 //
-// A pooled output passes its gradient to one position of four, the winner, and to none where ReLU is
-// off. What remains is a list of spikes: a gradient, and where the winner's window starts. The
+// A pooled output passes its gradient to one position of four, the winner, and to none where ReLU
+// is off. What remains is a list of spikes: a gradient, and where the winner's window starts. The
 // gradients of weights and inputs are sums over these lists.
+//
+// In reduced precision a matrix unit multiplies the spikes and all zeros between them, and is twice
+// as fast (BackByTiles). Factors are rounded to bfloat16, and sums are in single precision.
 
 // The gradient of a pooled output that has one, and where its winner's window starts.
 struct Spike {
@@ -537,100 +547,334 @@ void interleave(const Number* planar, float* interleaved) {
             interleaved[i * L::CELL + channel] = planar[channel * L::IMAGE_SIZE + i];
 }
 
-// Gradients of a layer's parameters.
+// Of one image: what its pass forward kept, and the gradients of its features.
+struct Kept {
+    const uint8_t* frames;
+    const float* hidden;
+    const uint8_t *winners1, *winners2;
+    const float* gradients;
+};
+
+// Where gradients of weights stand while they are summed: in windows, channels innermost.
 template <class L>
+struct InWindows {
+    static constexpr int SIZE = L::FILTERS * SIDE * L::PADDED_WINDOW;
+    static int place(int filter, int row, int column, int channel) {
+        return (filter * SIDE + row) * L::PADDED_WINDOW + column * L::CELL + channel;
+    }
+};
+
+// Gradients of a layer's parameters.
+template <class L, class Order>
 struct Gradients {
-    float weights[L::FILTERS][SIDE][L::PADDED_WINDOW], bias[L::FILTERS];
+    float weights[Order::SIZE], bias[L::FILTERS];
 
     void add(const Gradients& other) {
-        const float* from = &other.weights[0][0][0];
-        float* to = &weights[0][0][0];
-        for (size_t i = 0; i < sizeof(weights) / sizeof(float); ++i) to[i] += from[i];
+        for (int i = 0; i < Order::SIZE; ++i) weights[i] += other.weights[i];
         for (int filter = 0; filter < L::FILTERS; ++filter) bias[filter] += other.bias[filter];
     }
 
     void write(float scale, float* to_weights, float* to_bias) const {
         for (int row = 0; row < L::FILTERS * SIDE; ++row)
             for (int i = 0; i < SIDE * L::CHANNELS; ++i)
-                *to_weights++ =
-                    weights[row / SIDE][row % SIDE][i / L::CHANNELS * L::CELL + i % L::CHANNELS] *
-                    scale;
+                *to_weights++ = weights[Order::place(row / SIDE, row % SIDE, i / L::CHANNELS,
+                                                     i % L::CHANNELS)] *
+                                scale;
         std::copy_n(bias, L::FILTERS, to_bias);
     }
 };
-
-template <int FRAMES>
+template <int FRAMES, template <class> class Order>
 struct Sums {
-    Gradients<FirstLayer<FRAMES>> first;
-    Gradients<Second> second;
+    Gradients<FirstLayer<FRAMES>, Order<FirstLayer<FRAMES>>> first;
+    Gradients<Second, Order<Second>> second;
 };
 
-// What a thread needs for one image; channels are innermost.
+// The lists, one filter's at a time; channels are innermost.
 template <int FRAMES>
-struct BackwardScratch {
+struct BackBySpikes {
     using First = FirstLayer<FRAMES>;
-    alignas(64) float image[First::IMAGE_SIZE * First::CELL];
-    alignas(64) float hidden[First::SIZE * Second::CELL];
-    alignas(64) float hidden_gradients[First::SIZE * Second::CELL];
-    Spike spikes[First::SIZE];  // of one filter at a time
-};
-
-template <int FRAMES>
-void backward_image(const float* weights2, const uint8_t* winners1, const uint8_t* winners2,
-                    const float* gradients, BackwardScratch<FRAMES>& scratch, Sums<FRAMES>& sums) {
-    using First = FirstLayer<FRAMES>;
-    Spike* spikes = scratch.spikes;
-    const auto sum = [spikes](int count) {
-        float total = 0;
-        for (int i = 0; i < count; ++i) total += spikes[i].gradient;
-        return total;
+    using Totals = Sums<FRAMES, InWindows>;
+    struct Scratch {
+        alignas(64) float image[First::IMAGE_SIZE * First::CELL];
+        alignas(64) float hidden[First::SIZE * Second::CELL];
+        alignas(64) float hidden_gradients[First::SIZE * Second::CELL];
+        Spike spikes[First::SIZE];
     };
-    std::fill_n(scratch.hidden_gradients, First::SIZE * Second::CELL, 0.0f);
-    for (int filter = 0; filter < Second::FILTERS; ++filter) {
-        const int count = list_spikes<Second>(gradients + filter * POOLED, Second::COLUMNS, 1,
-                                              winners2 + filter * Second::SIZE, spikes);
-        add_windows<Second>(spikes, count, scratch.hidden, sums.second.weights[filter][0]);
-        spread_spikes<Second>(spikes, count, weights2 + filter * SIDE * Second::PADDED_WINDOW,
-                              scratch.hidden_gradients);
-        sums.second.bias[filter] += sum(count);
+    std::vector<float> weights2;  // padded
+
+    explicit BackBySpikes(const float* given) : weights2(InWindows<Second>::SIZE) {
+        for (int pixel = 0; pixel < Second::FILTERS * SIDE * SIDE; ++pixel)
+            std::copy_n(given + pixel * Second::CHANNELS, Second::CHANNELS,
+                        &weights2[InWindows<Second>::place(0, pixel / SIDE, pixel % SIDE, 0)]);
     }
-    for (int filter = 0; filter < First::FILTERS; ++filter) {
-        const int count = list_spikes<First>(
-            scratch.hidden_gradients + filter, First::PITCH * Second::CELL, Second::CELL,
-            winners1 + filter * First::SIZE, spikes);
-        add_windows<First>(spikes, count, scratch.image, sums.first.weights[filter][0]);
-        sums.first.bias[filter] += sum(count);
+
+    void run(const Kept& kept, Scratch& scratch, Totals& sums) const {
+        interleave<First>(kept.frames, scratch.image);
+        interleave<Second>(kept.hidden, scratch.hidden);
+        Spike* spikes = scratch.spikes;
+        const auto sum = [spikes](int count) {
+            float total = 0;
+            for (int i = 0; i < count; ++i) total += spikes[i].gradient;
+            return total;
+        };
+        std::fill_n(scratch.hidden_gradients, First::SIZE * Second::CELL, 0.0f);
+        for (int filter = 0; filter < Second::FILTERS; ++filter) {
+            const int count = list_spikes<Second>(kept.gradients + filter * POOLED, Second::COLUMNS,
+                                                  1, kept.winners2 + filter * Second::SIZE, spikes);
+            const int window = InWindows<Second>::place(filter, 0, 0, 0);
+            add_windows<Second>(spikes, count, scratch.hidden, sums.second.weights + window);
+            spread_spikes<Second>(spikes, count, &weights2[window], scratch.hidden_gradients);
+            sums.second.bias[filter] += sum(count);
+        }
+        for (int filter = 0; filter < First::FILTERS; ++filter) {
+            const int count = list_spikes<First>(
+                scratch.hidden_gradients + filter, First::PITCH * Second::CELL, Second::CELL,
+                kept.winners1 + filter * First::SIZE, spikes);
+            add_windows<First>(spikes, count, scratch.image,
+                               sums.first.weights + InWindows<First>::place(filter, 0, 0, 0));
+            sums.first.bias[filter] += sum(count);
+        }
     }
+};
+
+#if defined(HAS_TILES)
+// Pairs of bfloat16, a vector of them. GCC converts bytes several times as slowly by itself.
+typedef uint32_t Pairs __attribute__((vector_size(4 * LANES)));
+constexpr Pairs NUMBERS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+inline Pairs load(const Pair* from) { return (Pairs)_mm512_loadu_si512(from); }
+inline void store(Pair* to, Pairs pairs) { _mm512_storeu_si512(to, (__m512i)pairs); }
+inline Pairs widen(const uint8_t* from) {
+    return (Pairs)_mm512_cvtepu8_epi32(_mm_loadu_si128((const __m128i*)from));
 }
+inline Vector load(const uint8_t* from) {
+    return (Vector)_mm512_cvtepi32_ps((__m512i)widen(from));
+}
+inline Pairs rounded(Vector values) {  // in the lower halves
+    return (Pairs)_mm512_cvtepu16_epi32((__m256i)_mm512_cvtneps_pbh((__m512)values));
+}
+inline void interleave(Pairs even, Pairs odd, Pair* to) {
+    const Pairs half = NUMBERS / 2 + NUMBERS % 2 * LANES;
+    for (int i = 0; i < 2; ++i, to += LANES)
+        store(to, (Pairs)_mm512_permutex2var_epi32(
+                      (__m512i)even, (__m512i)(half + i * LANES / 2), (__m512i)odd));
+}
+
+// In the tiles that the matrix unit leaves: [filter][column of the filter][channel of a stack]. The
+// last four numbers of a row are not used.
+template <class L>
+struct InTiles {
+    static constexpr int STACKS = (L::CHANNELS + 1) / 2;
+    static constexpr int TILE = L::FILTERS * LANES, SIZE = STACKS * SIDE * TILE;
+    static int place(int filter, int row, int column, int channel) {
+        return (channel / 2 * SIDE + row) * TILE + filter * LANES + column * 2 + channel % 2;
+    }
+};
+
+// What the gradients of a layer's weights are products of.
+template <class L>
+struct Spread {
+    static constexpr int MARGIN = SIDE - 1, WIDTH = vectors(L::COLUMNS) * LANES;
+    static constexpr int STACKS = InTiles<L>::STACKS, TILE = InTiles<L>::TILE;
+    // The spikes among zeros, and zeros above and below; a pair are neighbours in a row.
+    alignas(64) Pair spikes[2 * L::ROWS + 2 * MARGIN][L::FILTERS][WIDTH];
+    // The image; a pair are a pixel and the next one. A second channel that there is not is 0.
+    alignas(64) Pair image[STACKS][L::IMAGE_SIZE][2];
+    static constexpr int LAST_PIXEL =
+        (2 * L::ROWS - 1 + MARGIN) * L::IMAGE_PITCH + 2 * (WIDTH - 1) + LANES / 2 - 1;
+    static_assert((LAST_PIXEL / LANES + 1) * LANES < L::IMAGE_SIZE,
+                  "whole vectors must not leave the image");
+
+    template <typename Pixel>
+    void take_image(const Pixel* pixels) {
+        const auto pairs = [](const Pixel* at) {
+            return rounded(load(at)) | rounded(load(at + 1)) << 16;
+        };
+        for (int stack = 0; stack < STACKS; ++stack, pixels += 2 * L::IMAGE_SIZE)
+            for (int i = 0; i <= LAST_PIXEL; i += LANES) {
+                const bool whole = 2 * stack + 1 < L::CHANNELS;
+                interleave(pairs(pixels + i), whole ? pairs(pixels + L::IMAGE_SIZE + i) : Pairs{},
+                           image[stack][i]);
+            }
+    }
+
+    // Puts gradients [filter][row][PITCH] where their winners stand.
+    template <int PITCH>
+    void take_gradients(const float* gradients, const uint8_t* winners, float* bias) {
+        for (int filter = 0; filter < L::FILTERS; ++filter) {
+            Vector sum = {};
+            for (int row = 0; row < L::ROWS; ++row)
+                for (int column = 0; column < L::COLUMNS; column += LANES) {
+                    const uint8_t* at = winners + filter * L::SIZE + row * L::PITCH + column;
+                    const Pairs winner = NUMBERS + column < L::COLUMNS ? widen(at) : Pairs{} + OFF;
+                    const Vector gradient =
+                        load(gradients + (filter * L::ROWS + row) * PITCH + column);
+                    const Pairs value = rounded(gradient);
+                    Pair* to = &spikes[MARGIN + 2 * row][filter][column];
+                    for (unsigned i = 0; i < 4; i += 2, to += L::FILTERS * WIDTH)
+                        store(to, (winner == i ? value : Pairs{}) |
+                                      (winner == i + 1 ? value << 16 : Pairs{}));
+                    sum += winner == OFF ? Vector{} : gradient;
+                }
+            bias[filter] += _mm512_reduce_add_ps((__m512)sum);
+        }
+    }
+
+    // Adds a row of the image, times the six rows of spikes whose windows it is in, for each row.
+    void add_windows(float* sums) const {
+        constexpr Shape SPIKES = {L::FILTERS, 64};
+        const Tiles tiles({SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, {LANES, 64}});
+        for (int stack = 0; stack < STACKS; ++stack, sums += SIDE * TILE) {
+            settle();
+            _tile_loadd(0, sums, 64);
+            _tile_loadd(1, sums + TILE, 64);
+            _tile_loadd(2, sums + 2 * TILE, 64);
+            _tile_loadd(3, sums + 3 * TILE, 64);
+            _tile_loadd(4, sums + 4 * TILE, 64);
+            _tile_loadd(5, sums + 5 * TILE, 64);
+            for (int column = 0; column < L::COLUMNS; column += LANES)
+                for (int row = 0; row < 2 * L::ROWS + MARGIN; ++row) {
+                    constexpr int UP = L::FILTERS * WIDTH, ROW = WIDTH * sizeof(Pair);
+                    const Pair* at = &spikes[MARGIN + row][0][column];
+                    _tile_loadd(7, image[stack][row * L::IMAGE_PITCH + 2 * column],
+                                4 * sizeof(Pair));
+                    _tile_loadd(6, at, ROW);
+                    _tile_dpbf16ps(0, 6, 7);
+                    _tile_loadd(6, at - UP, ROW);
+                    _tile_dpbf16ps(1, 6, 7);
+                    _tile_loadd(6, at - 2 * UP, ROW);
+                    _tile_dpbf16ps(2, 6, 7);
+                    _tile_loadd(6, at - 3 * UP, ROW);
+                    _tile_dpbf16ps(3, 6, 7);
+                    _tile_loadd(6, at - 4 * UP, ROW);
+                    _tile_dpbf16ps(4, 6, 7);
+                    _tile_loadd(6, at - 5 * UP, ROW);
+                    _tile_dpbf16ps(5, 6, 7);
+                }
+            _tile_stored(0, sums, 64);
+            _tile_stored(1, sums + TILE, 64);
+            _tile_stored(2, sums + 2 * TILE, 64);
+            _tile_stored(3, sums + 3 * TILE, 64);
+            _tile_stored(4, sums + 4 * TILE, 64);
+            _tile_stored(5, sums + 5 * TILE, 64);
+            settle();
+        }
+    }
+};
+
+template <int FRAMES>
+struct BackByTiles {
+    using First = FirstLayer<FRAMES>;
+    using Totals = Sums<FRAMES, InTiles>;
+    static constexpr int MARGIN = SIDE - 1, WIDTH = Spread<First>::WIDTH;
+    static constexpr int SPIKES = 2 * Second::COLUMNS;
+    struct Scratch {
+        Spread<First> first;
+        Spread<Second> second;
+        // The second layer's spikes again; a pair are two filters.
+        alignas(64) Pair spikes[2 * Second::ROWS + 2 * MARGIN][Second::FILTERS / 2][SPIKES];
+        // A row of them times each column of the filters, with zeros to the left and right.
+        alignas(64) float products[SIDE][Second::CHANNELS][LANES + SPIKES + LANES];
+        alignas(64) float hidden_gradients[Second::CHANNELS][First::ROWS][WIDTH];
+    };
+    // Tiles of two columns of the filters times what two rows of spikes are multiplied with.
+    alignas(64) Pair weights2[SIDE / 2][SIDE][Second::CHANNELS][2][Second::FILTERS / 2];
+
+    explicit BackByTiles(const float* given) {
+        const auto at = [given](int filter, int row, int column, int channel) {
+            return given[((filter * SIDE + row) * SIDE + column) * Second::CHANNELS + channel];
+        };
+        for (int row = 0; row < SIDE; ++row)
+            for (int column = 0; column < SIDE; ++column)
+                for (int channel = 0; channel < Second::CHANNELS; ++channel)
+                    for (int i = 0; i < Second::FILTERS; i += 2)
+                        pack({at(i, row, column, channel), at(i + 1, row, column, channel)},
+                             &weights2[row / 2][column][channel][1 - row % 2][i / 2]);
+    }
+
+    void run(const Kept& kept, Scratch& scratch, Totals& sums) const {
+        scratch.second.take_image(kept.hidden);
+        scratch.second.template take_gradients<Second::COLUMNS>(kept.gradients, kept.winners2,
+                                                                sums.second.bias);
+        scratch.second.add_windows(sums.second.weights);
+        spread_back(scratch);
+        scratch.first.take_image(kept.frames);
+        scratch.first.template take_gradients<WIDTH>(&scratch.hidden_gradients[0][0][0],
+                                                     kept.winners1, sums.first.bias);
+        scratch.first.add_windows(sums.first.weights);
+    }
+
+private:
+    // The gradients of the second layer's image: moves no spikes, but the products.
+    void spread_back(Scratch& scratch) const {
+        static_assert(Second::COLUMNS == LANES);
+        for (int row = MARGIN; row < MARGIN + 2 * Second::ROWS; ++row)
+            for (int i = 0; i < Second::FILTERS / 2; ++i) {
+                const Pairs even = load(scratch.second.spikes[row][2 * i]);
+                const Pairs odd = load(scratch.second.spikes[row][2 * i + 1]);
+                interleave((even & 0xffff) | odd << 16, even >> 16 | (odd & 0xffff0000),
+                           scratch.spikes[row][i]);
+            }
+        constexpr Shape WEIGHTS = {2 * Second::CHANNELS, 64};
+        const Tiles tiles(
+            {WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS, {LANES, 64}});
+        constexpr int PRODUCT = sizeof(scratch.products[0][0]);
+        for (int row = 0; row < First::ROWS; ++row) {
+            for (int column = 0; column < SPIKES; column += LANES) {
+                settle();
+                _tile_zero(0);
+                _tile_zero(1);
+                _tile_zero(2);
+                for (int up = 0; up < SIDE; up += 2) {
+                    _tile_loadd(7, &scratch.spikes[MARGIN + row - up - 1][0][column],
+                                SPIKES * sizeof(Pair));
+                    _tile_loadd(3, weights2[up / 2][0], 64);
+                    _tile_loadd(4, weights2[up / 2][2], 64);
+                    _tile_loadd(5, weights2[up / 2][4], 64);
+                    _tile_dpbf16ps(0, 3, 7);
+                    _tile_dpbf16ps(1, 4, 7);
+                    _tile_dpbf16ps(2, 5, 7);
+                }
+                _tile_stored(0, &scratch.products[0][0][LANES + column], PRODUCT);
+                _tile_stored(1, &scratch.products[2][0][LANES + column], PRODUCT);
+                _tile_stored(2, &scratch.products[4][0][LANES + column], PRODUCT);
+                settle();
+            }
+            for (int channel = 0; channel < Second::CHANNELS; ++channel)
+                for (int column = 0; column < WIDTH; column += LANES) {
+                    Vector sum = {};
+                    for (int left = 0; left < SIDE; ++left)
+                        sum += load(&scratch.products[left][channel][LANES + column - left]);
+                    store(&scratch.hidden_gradients[channel][row][column], sum);
+                }
+        }
+    }
+};
+#endif
 
 constexpr int64_t CHUNK = 8;  // images that share their sums
 
-template <int FRAMES>
+template <int FRAMES, template <int> class Way>
 void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights2,
               const float* hidden, const uint8_t* winners1, const uint8_t* winners2,
               const float* gradients, float* to_weights1, float* to_bias1, float* to_weights2,
               float* to_bias2, int threads) {
-    using First = FirstLayer<FRAMES>;
-    std::vector<float> padded2(Second::FILTERS * SIDE * Second::PADDED_WINDOW);
-    for (int pixel = 0; pixel < Second::FILTERS * SIDE * SIDE; ++pixel)
-        std::copy_n(weights2 + pixel * Second::CHANNELS, Second::CHANNELS,
-                    &padded2[pixel / SIDE * Second::PADDED_WINDOW + pixel % SIDE * Second::CELL]);
-    std::vector<Sums<FRAMES>> sums((images + CHUNK - 1) / CHUNK);
+    using Totals = typename Way<FRAMES>::Totals;
+    constexpr int HIDDEN = FirstLayer<FRAMES>::OUTPUTS;
+    const Way<FRAMES> way(weights2);
+    std::vector<Totals> sums((images + CHUNK - 1) / CHUNK);
 #pragma omp parallel num_threads(threads) if (images > CHUNK)
     {
-        const auto scratch = std::make_unique<BackwardScratch<FRAMES>>();
+        const auto scratch = std::make_unique<typename Way<FRAMES>::Scratch>();
 #pragma omp for schedule(dynamic)
         for (int64_t first = 0; first < images; first += CHUNK)
-            for (int64_t image = first; image < std::min(images, first + CHUNK); ++image) {
-                interleave<First>(frames + image * image_stride, scratch->image);
-                interleave<Second>(hidden + image * First::OUTPUTS, scratch->hidden);
-                backward_image<FRAMES>(padded2.data(), winners1 + image * First::OUTPUTS,
-                                       winners2 + image * Second::OUTPUTS,
-                                       gradients + image * FEATURES, *scratch, sums[first / CHUNK]);
-            }
+            for (int64_t image = first; image < std::min(images, first + CHUNK); ++image)
+                way.run({frames + image * image_stride, hidden + image * HIDDEN,
+                         winners1 + image * HIDDEN, winners2 + image * Second::OUTPUTS,
+                         gradients + image * FEATURES},
+                        *scratch, sums[first / CHUNK]);
     }
-    Sums<FRAMES> total = {};
-    for (const Sums<FRAMES>& part : sums) {
+    Totals total = {};
+    for (const Totals& part : sums) {
         total.first.add(part.first);
         total.second.add(part.second);
     }
@@ -643,8 +887,8 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
 // channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need
 // is kept in hidden and winners1, trunk_hidden() numbers an image each, and in winners2,
-// trunk_outputs() numbers an image. All three are null if there will be none. ``reduced`` asks the
-// forward pass for bfloat16.
+// trunk_outputs() numbers an image. All three are null if there will be none. ``reduced`` asks for
+// bfloat16; a backward pass has it by a matrix unit only.
 
 extern "C" {
 
@@ -680,8 +924,13 @@ void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, 
 void trunk_backward(const uint8_t* frames, int64_t image_stride, int64_t images, int channels,
                     const float* weights2, const float* hidden, const uint8_t* winners1,
                     const uint8_t* winners2, const float* gradients, float* to_weights1,
-                    float* to_bias1, float* to_weights2, float* to_bias2, int threads) {
-    const auto run = channels == 1 ? backward<1> : backward<2>;
+                    float* to_bias1, float* to_weights2, float* to_bias2, int reduced,
+                    int threads) {
+    auto run = channels == 1 ? backward<1, BackBySpikes> : backward<2, BackBySpikes>;
+#if defined(HAS_TILES)
+    if (reduced && trunk_has_tiles())
+        run = channels == 1 ? backward<1, BackByTiles> : backward<2, BackByTiles>;
+#endif
     run(frames, image_stride, images, weights2, hidden, winners1, winners2, gradients, to_weights1,
         to_bias1, to_weights2, to_bias2, threads);
 }
