@@ -414,10 +414,11 @@ def draw_groups(
         axis.set_axisbelow(True)
     handles = [Line2D([], [], label=line.name, **_marked(line, n)) for n, line in enumerate(lines)]
     figure.legend(handles=handles, fontsize=8, ncols=6, loc="outside upper center")
-    figure.supxlabel(
-        f"{SCENE_KEY}; point: mean and standard deviation of the seeds; box: drives that arrive",
-        fontsize=8,
-    )
+    (first, *_), quantity, _ = panels[0]
+    boxes = quantity in data.ARRIVED_ONLY
+    shown = "drives that arrive" if boxes else "points: mean and standard deviation of the seeds"
+    key = f"{SCENE_KEY}; " if isinstance(first, Scene) else ""
+    figure.supxlabel(key + shown, fontsize=8)
     return figure
 
 
