@@ -121,9 +121,10 @@ ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
 SPREAD, SECONDS = "spread_m", "seconds"
 """Standard deviation of the surviving distance from drive to drive; what 10,000 training steps
 took, validations apart."""
-KEPT, DROPPED, CHANGED = "kept", "dropped", "changed"
+KEPT, DROPPED, CHANGED, UNLEARNED = "kept", "dropped", "changed", "unlearned"
 """Share of the final distance that is left with one frame instead of two; success in the nominal
-scene minus that in the variant; relative change of the distance by random poor guidance."""
+scene minus that in the variant; relative change of the distance by random poor guidance; share of
+validation drives by which the end lies below the best."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
@@ -327,8 +328,8 @@ class Results:
                 for condition in ("nominal", "variant")
             )
             return {seed: nominal[seed] - variant[seed] for seed in nominal}
-        if quantity == SECONDS:
-            return {r.unit.seed: r.seconds for r in self.of(place, line)}
+        if quantity in (SECONDS, UNLEARNED):
+            return {r.unit.seed: getattr(r, quantity) for r in self.of(place, line)}
         return {r.unit.seed: r.end(kind, quantity) for r in self.of(place, line)}
 
     def estimate(self, place: Place, line: Line, quantity: str, kind: str = ALONE) -> Estimate:

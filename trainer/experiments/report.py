@@ -31,6 +31,7 @@ from trainer.experiments.claims import (
 from trainer.experiments.data import Line, Place, Result, Results, Scene, words
 from trainer.experiments.plan import EXPERIMENTS, HUMAN_MODEL, NORMAL, PAPER_TESTS, SCENARIOS
 from trainer.experiments.run import Store
+from trainer.learner.config import ALGORITHMS
 from trainer.pictures import write_figure
 from trainer.training import metrics
 
@@ -92,7 +93,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         ]
         if rows:
             paper = "wanted" if name == "goals" else "the paper"
-            head = ("claim", paper, "what decides", "holds", "policy alone", "holds alone")
+            head = ("claim", paper, "weakest comparison", "holds", "weakest, policy alone", "holds")
             yield from markdown_table(head[: len(rows[0])], rows)
 
 
@@ -108,35 +109,47 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         "",
         "What differs from the paper: highway-env's traffic stands in for CARLA's; the budget is "
         f"counted in environment steps, the same for every algorithm: {steps}, where the paper "
-        f"trains for 400 episodes; and the settings are this project's, {_ours()}. What the "
-        f"paper's own settings give is [printed](#{_anchor('printed')}).",
+        "trains for 400 episodes; and the settings are this project's. What the paper's own give "
+        f"is [printed](#{_anchor('printed')}).",
         "",
+        *_ours(),
         f"The policy is validated alone every {store.plan.evaluate_every_steps} steps; the best "
         f"validated actor drives {store.plan.test_runs} test drives in each scene, of which the "
         f"first {PAPER_TESTS} have the paper's seeds.",
         "",
-        "A comparison holds, or does not, where a 95 % interval of the difference, paired by "
-        "training seed, lies on one side of its bar, which is 0 where none is named; else it is "
-        "undecided. A claim holds where all of its comparisons do, or as many as are wanted, and "
-        "does not where that cannot be; the weakest of those that decide is shown. The intervals "
-        "are over training seeds, in these scenes with these test drives; the human model is a "
-        "single one. Learning curves are judged twice: as the paper does, on training episodes, in "
-        "which a policy that the human saves arrives, too; and by the policy alone on validation "
-        "drives.",
+        "A comparison is decided where its 95 % interval lies on one side of its bar (0 where none "
+        "is named): of a difference, paired by training seed, or of how many times as soon, by "
+        "drawing seeds (∞: a line may never get there). A claim holds where all of its "
+        "comparisons hold, or as many as are wanted. It does not hold where that cannot be. The "
+        "weakest comparison of those that decide is shown. The intervals are over training seeds, "
+        "in these scenes with these test drives. Learning curves "
+        "are judged twice: as the paper does, on training episodes, in which a policy that the "
+        "human saves arrives, too; and by the policy alone on validation drives.",
+        "",
+        "IA-TD3 is PHIL-TD3 without the Q advantage in its priorities. HI-TD3 does not imitate "
+        "the human either. Vanilla TD3 has no human. RD2-TD3 and RD2-PHIL are IA-TD3 and PHIL-TD3 "
+        "with a replay buffer for the human's transitions alone. The human is a model (DAgger, "
+        "one frame) of the scripted expert, a single one in each scenario. The table says what "
+        "kind of processor computed each; there the same seed has other bits.",
         "",
     )
     if results.stale:
         yield f"{len(results.stale)} records are of other settings than today's and left out."
         yield ""
-    answers = ("yes", "no", "undecided")
-    rows = []
-    for name, one in EXPERIMENTS.items():
-        its = [(found, alone) for claim, found, alone in judged if claim.source == name]
+    answers = {"yes": "holds", "no": "does not", "undecided": "undecided"}
+
+    def counted(title: str, about: str, claims: Iterable[Judged]) -> Iterator[tuple[str, ...]]:
+        its = [(found, alone) for _, found, alone in claims]
         if its:
             counts = (Counter(one.holds for one in each if one) for each in zip(*its, strict=True))
             cells = (f"{count[answer]}" if count else "" for count in counts for answer in answers)
-            rows.append((f"[{name}](#{_anchor(name)})", one.title, *cells))
-    head = ("", "about", *answers, *(f"{answer}, alone" for answer in answers))
+            yield (title, about, *cells)
+
+    rows = [*counted("all", "the paper's claims", (its for its in judged if its[0] in CLAIMS))]
+    for name, one in EXPERIMENTS.items():
+        its = (each for each in judged if each[0].source == name)
+        rows += counted(f"[{name}](#{_anchor(name)})", one.title, its)
+    head = ("", "about", *answers.values(), *(f"policy alone: {it}" for it in answers.values()))
     yield from markdown_table(head, rows)
     yield from markdown_table(
         ("setting", "meaning", "algorithms", "computed in"),
@@ -163,16 +176,13 @@ def _computed_in(results: Results, lines: Sequence[Line]) -> str:
     return ", ".join(f"{count} {what}" for what, count in counts.most_common())
 
 
-def _ours() -> str:
+def _ours() -> Iterator[str]:
     """The settings that are not the paper's, as the presets have them."""
     ours, printed = (asdict(plan.PRESETS[name]) for name in ("ours", "printed"))
     for values in (ours, printed):
         values |= values.pop("learner")
-    return ", ".join(
-        f"`{name}` {value} for {printed[name]}"
-        for name, value in ours.items()
-        if value != printed[name]
-    )
+    rows = [(f"`{name}`", f"{ours[name]}", f"{it}") for name, it in printed.items()]
+    yield from markdown_table(("setting", "ours", "printed"), [r for r in rows if r[1] != r[2]])
 
 
 def _anchor(name: str) -> str:
@@ -183,8 +193,9 @@ def _anchor(name: str) -> str:
 def _times(results: Results) -> Iterator[str]:
     """The paper's table of time efficiency beside ours."""
     yield (
-        "Seconds for 10,000 steps without validations, mean of the seeds. Trainings share their "
-        "machine with others; `python -m trainer bench` measures the time of a step undisturbed."
+        "Seconds for 10,000 steps without validations, mean of the seeds. The trainings ran on "
+        "several processors, beside others, which makes the intervals wide; `python -m trainer "
+        "bench` measures the time of a step undisturbed."
     )
     yield ""
     ours = (results.estimate(SCENARIOS[0], Line(name), data.SECONDS).text(0) for name in PAPER_S)
@@ -197,7 +208,7 @@ def _tests(results: Results) -> Iterator[str]:
     """Success of every policy in every scene."""
     yield (
         "Success in %, mean of the seeds, with its 95 % interval; in brackets that of the "
-        f"paper's {PAPER_TESTS} seeds alone."
+        f"paper's {PAPER_TESTS} seeds alone. {SCENE_KEY}."
     )
     yield ""
     rows = []
@@ -238,8 +249,10 @@ def _floor(results: Results) -> Iterator[str]:
             record = result.record
             action, success = f"{record['action']:g}", record["success_of"]
             yield (
-                f"Best in the {words(scenario)}: {action}, of {len(success)} tried. It brings "
-                f"{success[action]:.0%} of {record['search'][0]} validation drives to the goal."
+                f"The best of {len(success)} constant actions in the {words(scenario)} is {action} "
+                f"(of -1 to 1). It brings {success[action]:.0%} of {record['search'][0]} "
+                f"validation drives to the goal, and {result.mean('nominal', data.SUCCESS):.0%} of "
+                "the test drives."
             )
             yield ""
 
@@ -249,8 +262,8 @@ def _cost(results: Results) -> Iterator[str]:
     yield (
         "Environment steps, and seconds that the human drove, until the policy alone reaches "
         f"{LEARNED:.0%} or {WELL:.0%} of its validation drives: median of the seeds, the least and "
-        "the most of them (∞: never), and how many get there. The rest are means. Late: "
-        f"validations of the last {data.END_STEPS:,} steps, against the best one, which chance "
+        "the most of them (∞: never), and how many get there. The rest are means. Validation lost "
+        f"at the end: the mean of the last {data.END_STEPS:,} steps against the best, which chance "
         "makes better, too."
     )
     yield ""
@@ -259,14 +272,15 @@ def _cost(results: Results) -> Iterator[str]:
         found = [result for result in results.of(scenario, line) if result.unit.trained]
         if not found:
             continue
+        guided = ALGORITHMS[line.algorithm].guided
         rows.append(
             (
                 line.name,
                 words(scenario),
                 str(len(found)),
                 until(found, LEARNED, "steps"),
-                *(until(found, level, "human_s") for level in (LEARNED, WELL)),
-                f"{100 * np.mean([r.unlearned for r in found]):.1f}",
+                *(until(found, level, "human_s") if guided else "–" for level in (LEARNED, WELL)),
+                f"{100 * np.mean([r.unlearned for r in found]):.1f}".replace("-0.0", "0.0"),
                 f"{100 * max(r.unlearned for r in found):.1f}",
                 *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
                 f"{np.mean([r.record['totals']['updates'] for r in found]):,.0f}",
@@ -274,8 +288,9 @@ def _cost(results: Results) -> Iterator[str]:
         )
     head = (
         "", "scenario", "seeds", f"steps to {LEARNED:.0%}",
-        *(f"human s to {level:.0%}" for level in (LEARNED, WELL)), "late below best, points",
-        "at most", "human steps", "take-overs", "failures", "updates",
+        *(f"human s to {level:.0%}" for level in (LEARNED, WELL)),
+        "validation lost at the end, points", "by the worst seed", "human steps", "take-overs",
+        "failures", "updates",
     )  # fmt: skip
     yield from markdown_table(head, rows)
 

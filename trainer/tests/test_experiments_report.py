@@ -127,7 +127,7 @@ class TestClaims:
     ):
         found = finding(everything, test, ours, others, bar)
         assert found.holds == holds
-        assert ("vanilla TD3 over HI-TD3" in found.text) == (ours is claims.PER)
+        assert ("vanilla TD3 minus HI-TD3" in found.text) == (ours is claims.PER)
 
     def test_missing_trainings_leave_it_open(self):
         results = results_of([unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT], SEEDS)
@@ -158,6 +158,7 @@ class TestClaims:
         assert (np.isnan(ratio), said) == (True, "over 6,000 against 2,000 steps")
         both = sooner_by(other, own, common=True)[1]
         assert both == "within 500 against within 500 steps"
+        assert sooner_by(own, own, level=0.5) == (1.0, "1,000 against 1,000 steps")
 
     @pytest.mark.parametrize(
         ("own", "other", "bar", "holds"),
@@ -216,7 +217,7 @@ class TestClaims:
         )  # fmt: skip
         found = claims.judge(everything, claim, data.ALONE)
         assert (found.holds, found.text[:13]) == (holds, "2 of 3 hold; ")
-        assert ("over PHIL-TD3" in found.text) == (holds == "no")
+        assert ("minus PHIL-TD3" in found.text) == (holds == "no")
 
     @given(st.lists(st.sampled_from(["yes", "no", "undecided"]), max_size=6), st.integers(1, 6))
     def test_what_is_missing_can_only_decide_what_was_undecided(self, answers, count):
@@ -293,7 +294,7 @@ def test_the_report_is_made_of_the_records_alone(store, monkeypatch):
                for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
     assert set(re.findall(r"\((#[^)]*)\)", page)) <= anchors
     assert "20.70±1.82" in page
-    assert "`return_steps` 8 for 1" in page
+    assert "| `return_steps` | 8 | 1 |" in page
     assert str(store.results.parent) not in page
 
 

@@ -77,14 +77,16 @@ def test_ties_go_to_the_first_position_as_in_torch_in_reduced_precision_too(leve
 
 
 @needs_kernel
-def test_nothing_passes_where_relu_is_off_and_what_is_no_number_is_not_hidden():
+@pytest.mark.parametrize("reduced", [False, True])
+def test_nothing_passes_where_relu_is_off_and_what_is_no_number_is_not_hidden(reduced):
     parameters = _parameters(2)
     off, wild = (torch.full((n,), value) for n, value in ((16, -1e6), (6, torch.nan)))
     closed = [*parameters[:3], off.requires_grad_()]
-    features, gradients = _gradients(_pictures(2)[:, :2], closed, _slopes(2))
+    features, gradients = _gradients(_pictures(2)[:, :2], closed, _slopes(2), reduced)
     assert not any(each.any() for each in (features, *gradients))
     parameters[1] = wild
-    assert trunk_features(_pictures(1)[:, :2], *parameters).isnan().all()
+    with torch.autocast("cpu", torch.bfloat16, enabled=reduced):
+        assert trunk_features(_pictures(1)[:, :2], *parameters).isnan().all()
 
 
 @needs_kernel

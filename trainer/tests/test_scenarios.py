@@ -96,11 +96,11 @@ def gaps_m(env, of_the_ego_lane=False):
     [
         ("left_turn", "nominal", 60, 60),
         ("left_turn", "variant", 25, 24),
-        ("left_turn", "dense", 25, 24),
+        ("left_turn", "dense", 25, 25),
         ("congestion", "nominal", 20, 20),
         ("congestion", "noise", 20, 20),
         ("congestion", "variant", 25, 24),
-        ("congestion", "dense", 25, 24),
+        ("congestion", "dense", 25, 25),
     ],
 )
 def test_the_expert_arrives(scenario, condition, drives, arriving):

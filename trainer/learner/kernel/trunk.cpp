@@ -466,8 +466,8 @@ void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const 
 // is off. What remains is a list of spikes: a gradient, and where the winner's window starts. The
 // gradients of weights and inputs are sums over these lists.
 //
-// In reduced precision a matrix unit multiplies the spikes and all zeros between them, and is twice
-// as fast (BackByTiles). Factors are rounded to bfloat16, and sums are in single precision.
+// In reduced precision a matrix unit, where there is one, multiplies the spikes and all zeros
+// between them, which is faster (BackByTiles). Factors are bfloat16, sums in single precision.
 
 // The gradient of a pooled output that has one, and where its winner's window starts.
 struct Spike {
@@ -659,8 +659,8 @@ inline void interleave(Pairs even, Pairs odd, Pair* to) {
                       (__m512i)even, (__m512i)(half + i * LANES / 2), (__m512i)odd));
 }
 
-// In the tiles that the matrix unit leaves: [filter][column of the filter][channel of a stack]. The
-// last four numbers of a row are not used.
+// As the matrix unit leaves them: a tile is [filter][column of the filter][channel of a stack], and
+// the last four numbers of its rows are not used.
 template <class L>
 struct InTiles {
     static constexpr int STACKS = (L::CHANNELS + 1) / 2;
@@ -670,7 +670,7 @@ struct InTiles {
     }
 };
 
-// What the gradients of a layer's weights are products of.
+// The operands of a layer's weight gradients: spikes and image as pairs of bfloat16.
 template <class L>
 struct Spread {
     static constexpr int MARGIN = SIDE - 1, WIDTH = vectors(L::COLUMNS) * LANES;
@@ -719,7 +719,8 @@ struct Spread {
         }
     }
 
-    // Adds a row of the image, times the six rows of spikes whose windows it is in, for each row.
+    // Multiplies each row of the image by the six rows of spikes whose windows contain it, and adds
+    // the products to the sums.
     void add_windows(float* sums) const {
         constexpr Shape SPIKES = {L::FILTERS, 64};
         const Tiles tiles({SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, SPIKES, {LANES, 64}});
@@ -776,7 +777,8 @@ struct BackByTiles {
         alignas(64) float products[SIDE][Second::CHANNELS][LANES + SPIKES + LANES];
         alignas(64) float hidden_gradients[Second::CHANNELS][First::ROWS][WIDTH];
     };
-    // Tiles of two columns of the filters times what two rows of spikes are multiplied with.
+    // A tile: two columns of the filters x 6 channels, by two rows of them x 16 filters. The odd
+    // row comes first, since its spikes lie one row higher.
     alignas(64) Pair weights2[SIDE / 2][SIDE][Second::CHANNELS][2][Second::FILTERS / 2];
 
     explicit BackByTiles(const float* given) {
@@ -804,7 +806,8 @@ struct BackByTiles {
     }
 
 private:
-    // The gradients of the second layer's image: moves no spikes, but the products.
+    // The gradients of the second layer's image: multiplies the spikes by each column of the
+    // filters where they stand, and adds the six products, shifted.
     void spread_back(Scratch& scratch) const {
         static_assert(Second::COLUMNS == LANES);
         for (int row = MARGIN; row < MARGIN + 2 * Second::ROWS; ++row)
