@@ -201,10 +201,10 @@ def sooner(
             one, steps = sooner_by(own, other, kind, quantity, common, level)
             times = claim.bar or 1.0
             found = f"{one.text(1)} times as soon, bar {times:g} ({steps})"
-            if steps and np.isnan(one.value) and not one.low and np.isinf(one.high):
+            if np.isnan(one.value) and (one.low, one.high) == (0.0, np.inf):
                 found = f"cannot be compared ({steps})"
-            text = f"{found}: {first.name} against {second.name}, "
-            text += _where(claim, place, quantity)
+            where = _where(claim, place, quantity)
+            text = f"{found}: {first.name} against {second.name}, {where}"
             holds = above(one, times)
             end = one.high if holds == "no" else one.low
             yield Comparison(text, holds, end - times if one.size else np.nan, complete)

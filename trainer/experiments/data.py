@@ -229,7 +229,8 @@ class Result:
     @property
     def unlearned(self) -> float:
         """Share of validation drives by which the end lies below the best validation."""
-        return float(max(self.record["validation"]["success"])) - self.end(ALONE, SUCCESS)
+        best = float(max(self.record["validation"]["success"]))
+        return max(best - self.end(ALONE, SUCCESS), 0.0)  # A mean of equals may be rounded up
 
     @property
     def costs(self) -> Costs:

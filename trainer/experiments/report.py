@@ -280,7 +280,7 @@ def _cost(results: Results) -> Iterator[str]:
                 str(len(found)),
                 until(found, LEARNED, "steps"),
                 *(until(found, level, "human_s") if guided else "–" for level in (LEARNED, WELL)),
-                f"{100 * np.mean([r.unlearned for r in found]):.1f}".replace("-0.0", "0.0"),
+                f"{100 * np.mean([r.unlearned for r in found]):.1f}",
                 f"{100 * max(r.unlearned for r in found):.1f}",
                 *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
                 f"{np.mean([r.record['totals']['updates'] for r in found]):,.0f}",

@@ -766,7 +766,7 @@ template <int FRAMES>
 struct BackByTiles {
     using First = FirstLayer<FRAMES>;
     using Totals = Sums<FRAMES, InTiles>;
-    static constexpr int MARGIN = SIDE - 1, WIDTH = Spread<First>::WIDTH;
+    static constexpr int MARGIN = Spread<Second>::MARGIN, WIDTH = Spread<First>::WIDTH;
     static constexpr int SPIKES = 2 * Second::COLUMNS;
     struct Scratch {
         Spread<First> first;
