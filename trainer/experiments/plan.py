@@ -15,7 +15,7 @@ import numpy as np
 
 from edge_runtime.util import read_bytes
 from trainer.environments import COMMAND_NOISE, CONDITIONS, expert_of, make_environment
-from trainer.human.guide import HumanGuide
+from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.model import MODEL_FILE
 from trainer.learner.config import ALGORITHMS, Algorithm
 from trainer.training.config import BIASED as BIASED_GUIDANCE
@@ -402,7 +402,8 @@ def behaviour(
     alone what changes nothing. Numbers are rounded, since libraries differ in their last bits.
     """
     env = make_environment(scenario, condition, printed_reward)
-    guide = HumanGuide(expert_of(env, human), expert_of(env, human))
+    held = steps_held(env.control_period_s)
+    guide = HumanGuide(expert_of(env, human), expert_of(env, human), held)
     seen = hashlib.sha256()
     for seed in range(3):
         observation, info = env.reset(seed=seed)
@@ -414,6 +415,8 @@ def behaviour(
             action = policy if intervention is None else intervention.action
             observation, reward, terminated, truncated, info = env.step(action)
             ended = terminated or truncated
+            if observation.dtype.kind == "f":
+                observation = observation.round(6) + 0.0
             seen.update(observation.tobytes())
             numbers = [reward, info["distance_m"], *map(float, action)]
             why = None if intervention is None else (intervention.reason, intervention.first)

@@ -17,7 +17,7 @@ from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import options
 from trainer.environments import expert_of, make_environment
-from trainer.human.guide import HumanGuide
+from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
 from trainer.person.recording import demonstrate, find_recordings
 from trainer.util import Purpose, claimed, episode_seed
@@ -122,7 +122,7 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
     config = model.config
     # Each with a memory of its own: a person who takes over looks at the scene afresh.
     expert, adviser = expert_of(env), expert_of(env)
-    guide = HumanGuide(expert, expert_of(env))
+    guide = HumanGuide(expert, expert_of(env), steps_held(env.control_period_s))
     for episode in range(config.episodes):
         # One episode in so many; with 0 none is.
         every = config.demonstrate_every

@@ -137,6 +137,14 @@ class Attention:
         return self._reason if self._steps_left == 0 else None
 
 
+HOLD_S = 1.5
+
+
+def steps_held(period_s: float) -> int:
+    """For how many control periods a human holds the wheel."""
+    return round(HOLD_S / period_s)
+
+
 class HumanGuide:
     """Turns trigger and driver into interventions.
 
@@ -149,7 +157,7 @@ class HumanGuide:
         self,
         driver: Driver,
         trigger: Trigger,
-        hold_steps: int = 15,
+        hold_steps: int,
         attention: Attention | None = None,
     ) -> None:
         self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps

@@ -62,7 +62,9 @@ UNEXPLORED = {"exploration_initial": 0.0, "exploration_final": 0.0}
 PVP = Algorithm(
     penalty=False, behaviour_cloning=False, advantage_weight=0.0, rewarded=False,
     proxy_values=True, human_share=0.5,
-    settings={**UNIFORM, **UNIT_VALUES, "return_steps": 1, "cloning_weight": 1.0},
+    settings={
+        **UNIFORM, **UNIT_VALUES, **UNEXPLORED, "return_steps": 1, "cloning_weight": 1.0
+    },
 )  # fmt: skip
 
 ALGORITHMS: dict[str, Algorithm] = {
@@ -91,7 +93,8 @@ ALGORITHMS: dict[str, Algorithm] = {
         IA, behaviour_cloning=False, rewarded=False,
         settings={**UNIT_VALUES, "intervention_penalty": -1.0},
     ),
-    # Proxy value propagation (2502.03369, NeurIPS 2023), and with cloning (2503.04969).
+    # Proxy value propagation (2502.03369, NeurIPS 2023), and with cloning (2503.04969). What is not
+    # rewarded is not explored, either.
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
@@ -109,9 +112,9 @@ ALGORITHMS: dict[str, Algorithm] = {
         settings={**UNIFORM, **UNIT_VALUES, **UNEXPLORED, "cloning_weight": 1.0},
     ),
     # The robot asks, with a budget, as in ThriftyDAgger (2109.08273), where the critics disagree;
-    # AIM (2506.09176) has a critic of its own for that. What it asked for is no objection: nothing
-    # is penalised.
-    "phil_gated": replace(PHIL, penalty=False, asks=0.05),
+    # AIM (2506.09176) has a critic of its own for that. Until they know what doubt is the human
+    # watches, and only what it objected to then is penalised.
+    "phil_gated": replace(PHIL, asks=0.05),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
 and the others are what came after it."""

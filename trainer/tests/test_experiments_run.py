@@ -234,7 +234,7 @@ class TestPlan:
         for unit, config in configs.items():
             paths = {"model": f"humans/{unit.scenario}"}
             assert config.human == paths.get(unit.setting, unit.scripted_human)
-            row = ALGORITHMS[unit.algorithm].settings
+            row = {**ALGORITHMS[unit.algorithm].settings, **planned.TUNED.get(unit.algorithm, {})}
             assert {name: getattr(config.learner, name) for name in row} == row
 
 

@@ -11,7 +11,7 @@ from edge_runtime.util import UserError
 from trainer.drivers import constant_driver, load_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.dagger import imitate
-from trainer.human.guide import ASKED, Asking, Attention, HumanGuide
+from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, steps_held
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
@@ -122,12 +122,12 @@ def test_the_trigger_lets_the_expert_drive(scenario, human, drives):
         assert drive(env, judged, seed)[1]["outcome"] == "goal"
 
 
-def watch(reasons, places=(), **how):
+def watch(reasons, places=(), hold_steps=15, **how):
     """What a human does of whom the trigger says so: its steps at the wheel, and those held."""
     judged, returned = iter(reasons), iter(places)
     trigger: Any = SimpleNamespace(reset=lambda: None)
     trigger.wants_control, trigger.may_return = lambda _: next(judged), lambda: next(returned, True)
-    guide = HumanGuide(constant_driver(-1.0), trigger, **how)
+    guide = HumanGuide(constant_driver(-1.0), trigger, hold_steps, **how)
     steps = [guide.watch(np.zeros((2, 45, 80), np.uint8), FULL) for _ in reasons]
     taken = [step for step in steps if step]
     assert all(step.action == BRAKE for step in taken)
@@ -147,8 +147,8 @@ NO, YES = False, True
         # Held on to; only the first step is an intervention.
         ([NONE, CRASH, NONE, NONE, NONE, CRASH, NONE, NONE, NONE], {"hold_steps": 3},
          [NO, YES, YES, YES, NO, YES, YES, YES, NO], [YES, NO, NO, YES, NO, NO]),
-        # By default for a second and a half.
-        ([CRASH] + [NONE] * 20, {}, [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
+        # For a second and a half, which at the scenarios' pace are 15 periods.
+        ([CRASH] + [NONE] * 20, {"hold_steps": steps_held(0.1)}, [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
         # Where the robot only asks, for a third of that.
         ([ASKED] + [NONE] * 9, {}, [YES] * 5 + [NO] * 5, [YES] + [NO] * 4),
         # A reason that lasts prolongs the same intervention.

@@ -6,7 +6,7 @@ import pytest
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import constant_driver
 from trainer.environments import make_environment
-from trainer.human.guide import HumanGuide
+from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL, NOTHING, drive, episode
@@ -193,7 +193,7 @@ def guided(guide: HumanGuide, action: np.ndarray):
 @pytest.mark.parametrize("pedal", [0.3, 1.0])
 def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
-    guide = HumanGuide(LeftTurnHuman(env), LeftTurnHuman(env))
+    guide = HumanGuide(LeftTurnHuman(env), LeftTurnHuman(env), steps_held(0.1))
     for seed in range(15):
         guide.reset()
         _, info = drive(env, guided(guide, np.array([pedal], np.float32)), seed)

@@ -146,6 +146,8 @@ def trained(directory, length=1, outcome="goal", human_steps=(), reason="collisi
         ("rlif_td3", "collision", False, -7.0),
         ("rlif_td3", "stuck", False, -7.0),
         ("pvp_td3", "collision", True, 0.0),
+        ("phil_gated", "collision", False, -7.0),
+        ("phil_gated", "asked", False, 0.0),
     ],
 )
 @pytest.mark.parametrize("penalty_on", ["human", "overruled"])

@@ -16,7 +16,7 @@ from bridge.environments import describe
 from edge_runtime.manifest import Car
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
-from trainer.human.guide import HumanGuide
+from trainer.human.guide import HumanGuide, steps_held
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.environment import EgoVehicle
@@ -282,7 +282,7 @@ def expert_driver(env, seed):
 def guided_driver(env, seed):
     """A policy that drives on, then one that stands still, under the guide's eyes."""
     expert = env.expert()
-    guide = HumanGuide(expert, env.expert())
+    guide = HumanGuide(expert, env.expert(), steps_held(0.1))
     for action, _ in random_driver(env, seed):
         wanted = -np.abs(action) if seed % 2 else action
         taken = guide.watch(env.frames, wanted)

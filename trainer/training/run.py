@@ -17,7 +17,17 @@ from edge_runtime.util import UserError
 from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
-from trainer.human.guide import STUCK, Asking, Attention, Guide, HumanGuide, Intervention, Trigger
+from trainer.human.guide import (
+    ASKED,
+    STUCK,
+    Asking,
+    Attention,
+    Guide,
+    HumanGuide,
+    Intervention,
+    Trigger,
+    steps_held,
+)
 from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import NETWORKS, TD3Learner
@@ -216,12 +226,11 @@ class TrainingRun:
             if config.delay_known:
                 raise UserError(f"{config.algorithm} asks about what is seen now: no delay_known")
             trigger = self.gate = Asking(trigger, asks)
-        attention = None
+        attention, period_s = None, self.env.control_period_s
         if config.late_to_s or config.missed_share:
-            period_s = self.env.control_period_s
             late_steps = config.late_from_s / period_s, config.late_to_s / period_s
             attention = Attention(late_steps, config.missed_share, self.guidance)
-        return HumanGuide(driver, trigger, attention=attention)
+        return HumanGuide(driver, trigger, steps_held(period_s), attention)
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
@@ -328,6 +337,8 @@ class TrainingRun:
         """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""
         row = self.algorithm
         if intervention is None or not intervention.first or not row.penalty:
+            return False
+        if intervention.reason == ASKED:  # That is no objection.
             return False
         return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
 
