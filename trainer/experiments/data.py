@@ -111,8 +111,6 @@ def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
 
 
 BySeed = dict[int, float]  # Training seed -> a number of that training
-GRID_STEPS = 500
-"""Curves are drawn and compared at multiples of it: the distance between two validations."""
 END_STEPS = 1_500  # What ended within so many steps of the last one is the end of a training
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
@@ -175,6 +173,7 @@ class Costs(NamedTuple):
     human_steps: int
     takeovers: int
     failures: int  # Training episodes that missed the goal, whoever drove
+    episodes: int
     human_s: float
     steps: float  # Of the environment
 
@@ -186,11 +185,16 @@ class Result:
     unit: Unit
     record: Mapping[str, Any]
 
+    @property
+    def every_steps(self) -> int:
+        """The distance between two validations."""
+        return int(self.record["config"]["evaluate_every_steps"])
+
     @cached_property
     def grid(self) -> Numbers:
-        """The multiples of ``GRID_STEPS`` up to the budget of steps, or the budget alone."""
+        """The multiples of that distance up to the budget of steps."""
         budget = int(self.record["config"]["steps"])
-        return np.arange(min(GRID_STEPS, budget), budget + 1, GRID_STEPS, dtype=float)
+        return np.arange(self.every_steps, budget + 1, self.every_steps, dtype=float)
 
     def points(self, kind: str, metric: str) -> tuple[Numbers, Numbers]:
         """At which steps a metric was measured, and its values; in training once an episode."""
@@ -216,7 +220,7 @@ class Result:
             return np.interp(self.grid, steps, values)
         means = []
         for end in self.grid:
-            inside = (steps > end - GRID_STEPS) & (steps <= end)
+            inside = (steps > end - self.every_steps) & (steps <= end)
             next_one = min(int(np.searchsorted(steps, end)), len(values) - 1)
             means.append(values[inside].mean() if inside.any() else values[next_one])
         return np.array(means)
@@ -254,8 +258,9 @@ class Result:
         human, takeovers = (np.asarray(columns[n])[so_far] for n in ("human_steps", "takeovers"))
         outcomes = np.asarray(columns["outcome"])[so_far]
         human_steps, period_s = int(human.sum()), self.record.get("period_s", 0.1)
-        failures = sum(failed(outcome) for outcome in outcomes.tolist())
-        return Costs(human_steps, int(takeovers.sum()), failures, human_steps * period_s, step)
+        failures = sum(map(failed, outcomes.tolist()))
+        counts = human_steps, int(takeovers.sum()), failures, len(outcomes)
+        return Costs(*counts, human_steps * period_s, step)
 
     def reached(self, condition: str) -> NDArray[np.bool_]:
         """Which test drives reached the goal, by seed."""

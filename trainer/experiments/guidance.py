@@ -4,8 +4,8 @@ One page and one figure beside the records, made of what is there.
 """
 
 import json
-from collections.abc import Iterator
-from itertools import chain
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,42 @@ from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
 from trainer.experiments import data, plan
-from trainer.experiments.data import Line, Result, Results
-from trainer.experiments.report import COMMAND, LEARNED, WELL, colour, spread, until
+from trainer.experiments.data import Line, Results
+from trainer.experiments.report import (
+    COMMAND,
+    LEARNED,
+    WELL,
+    colour,
+    computed_in,
+    spread,
+    until,
+)
 from trainer.experiments.run import Store
+from trainer.learner.config import ALGORITHMS
 from trainer.pictures import write_figure
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
+USUAL = (plan.GOOD, plan.MODEL)  # Humans that a line need not name
+ENOUGH = 9  # Pairs of seeds, of ten: by chance one of 93 rivals that are equals has so many
+LEARNS_FROM = {
+    PHIL: "reward, a penalty on what is overruled, imitation; replay by TD error and Q advantage",
+    "ia_td3": "the same, replay by TD error alone",
+    "hi_td3": "reward and penalty",
+    "per_td3": "reward; nobody guides",
+    "cloning_only": "imitation alone",
+    "rlif_td3": "-1 for what is overruled, and no reward",
+    "pvp_td3": "+1 for what the human does, -1 for what it overrules, and no reward; "
+    "half of a minibatch is the human's, drawn evenly",
+    "pvp4real_td3": "the same, and imitation",
+    "rlpd_td3": "reward; half of a minibatch is the human's, drawn evenly; two updates a step",
+    "ppl_td3": "imitation, and preferences in what the simulator foresees of overruled actions",
+    "phil_gated": "as PHIL-TD3; the human watches 500 steps, and then comes when the robot asks",
+}
+"""What each row is, for the page."""
 OTHER_HUMANS = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
 """Other humans who drive by themselves."""
+Cell = Callable[[Results, str, Line], str]  # What stands in a table, for a task and a line
 
 
 def write_guidance(store: Store, seeds: int) -> Path:
@@ -83,118 +110,214 @@ def _page(results: Results, store: Store) -> Iterator[str]:
     wanted = len(plan.units_of([plan.GUIDANCE], results.seeds))
     slow = store.plan.of("racetrack")
     budgets = ", ".join(f"{data.words(name)} {store.plan.steps[name]:,}" for name in TASKS)
+    lines = [Line(row, human) for row in plan.ROWS for human in plan.HUMANS]
     yield from (
         "# The fair table of human guidance",
         "",
         f"`{COMMAND} {plan.GUIDANCE}` computes what is missing and writes this page. "
         f"{len(results.found)} of {wanted} trainings and tests are there.",
         "",
-        "Every row has the same scenes, human, replay buffer and budget of environment steps "
+        "Every row has the same scenes, human and budget of environment steps "
         f"({budgets}). **Every human here is a script or a model of one: no person's cost is "
-        "claimed.** Seconds are simulated ones in which the human drove. Numbers are means of the "
-        "seeds with their 95 % interval; what it took to a level is the median of the seeds, the "
-        "least and the most of them (∞: never), and how many get there. Validations are "
-        f"{store.plan.evaluate_every_steps} steps apart (racetrack: {slow.evaluate_every_steps}, "
-        f"of {slow.evaluation_runs} drives), so no finer difference counts. The actor that is "
-        "tested is the best in them by success, then by the scene's return, for every row.",
+        "claimed.** Seconds are simulated ones in which the human drove. It watches all the time, "
+        "except beside the robot that asks.",
         "",
-        f"![Success of the policy alone by what the human has given]({plan.GUIDANCE}.png)",
+        "Numbers are means of the training seeds with their 95 % interval, of no width where all "
+        "seeds agree. What it took to a level is the median of the seeds, the least and the most "
+        "of them (∞: never), and how many get there. A level counts as reached in the first "
+        f"validation that shows it. Validations are {store.plan.evaluate_every_steps} steps "
+        f"apart, of {store.plan.evaluation_runs} drives (racetrack: {slow.evaluate_every_steps}, "
+        f"{slow.evaluation_runs}): no finer difference counts, and a policy that swings gets "
+        "there by luck sooner. The actor that is tested is the best in them by success, then by "
+        "the scene's return, for every row. Test drives: "
+        f"{store.plan.test_runs} in each scene (racetrack: {slow.test_runs}). The two tasks that "
+        "are not ours have three seeds, and no variant.",
         "",
-        f"## With {plan.HUMANS[plan.GOOD].meaning}",
+        f"Computed in: {computed_in(results, lines, TASKS)}.",
         "",
     )
-    head = (
-        "", "task", "seeds", *(f"human s to {level:.0%}" for level in (LEARNED, WELL)),
-        f"take-overs to {LEARNED:.0%}", "human s in all", "failures",
-        *(f"{name}, %" for name in CONDITIONS), "return over the human's",
+    if results.stale:
+        yield f"{len(results.stale)} records are of other settings than today's and left out."
+        yield ""
+    yield from _what_the_rows_are()
+    rows = [Line(row, plan.GOOD) for row in plan.ROWS]
+    humans = [Line(plan.EXPERT, plan.GOOD), *OTHER_HUMANS]
+    yield from (f"## With {plan.HUMANS[plan.GOOD].meaning}", "")
+    yield from (f"![Success of the policy alone by what the human gave]({plan.GUIDANCE}.png)", "")
+    yield from ("What a training cost:", "", *_table(results, TASKS, rows, COSTS))
+    yield from ("What came of it, the policy alone. Lost at the end are validation drives that the "
+                "last actors fail and the best one did not:", "",
+                *_table(results, TASKS, [*rows, *humans], OUTCOMES))  # fmt: skip
+    yield from _place(results)
+    yield from ("## Which row forgives which human", "", "In the left turn:", "")
+    yield from (f"- {data.words(name)}: {human.meaning}" for name, human in plan.HUMANS.items())
+    yield ""
+    for title, cell in FORGIVENESS.items():
+        yield from markdown_table(
+            (title, *map(data.words, plan.HUMANS)),
+            [
+                (Line(row).name,
+                 *(cell(results, plan.LEFT[0], Line(row, human)) for human in plan.HUMANS))
+                for row in plan.HELPED
+            ],
+        )  # fmt: skip
+
+
+def _what_the_rows_are() -> Iterator[str]:
+    def named(settings: Mapping[str, Any]) -> str:
+        return ", ".join(f"`{name}={value}`" for name, value in settings.items())
+
+    yield from (
+        "## What the rows are",
+        "",
+        "All share one learner. A row has settings of its own where its paper's would not fit "
+        "ours; the last column is what three trainings each, on a seed that is not in the table, "
+        "[chose](../README.md#what-the-settings-of-the-experiments-were-chosen-by). `trainer train "
+        "--algorithm NAME` has the former; the latter want `--set`. Without a reward a crash costs "
+        "the critics nothing: only what the human objects to does.",
+        "",
+    )
+    yield from markdown_table(
+        ("", "`NAME`", "learns from", "settings of its own", "chosen"),
+        [
+            (Line(row).name, f"`{row}`", what, named(ALGORITHMS[row].settings),
+             named(plan.TUNED.get(row, {})))
+            for row, what in LEARNS_FROM.items()
+        ],
     )  # fmt: skip
-    lines = [*(Line(row, plan.GOOD) for row in (*plan.ROWS, plan.EXPERT)), *OTHER_HUMANS]
+
+
+def _table(
+    results: Results, tasks: Sequence[str], lines: Sequence[Line], columns: Mapping[str, Cell]
+) -> Iterator[str]:
+    """A row a task and line of which there is something."""
     rows = [
-        _row(results, task, line, found)
-        for task in TASKS
-        for line in lines
-        if (found := results.of(task, line))
-    ]
-    yield from markdown_table(head, rows)
+        (Line(line.algorithm).name if line.setting in USUAL else line.name, data.words(task),
+         *(cell(results, task, line) for cell in columns.values()))
+        for task, line in product(tasks, lines)
+        if results.of(task, line)
+    ]  # fmt: skip
+    return markdown_table(("", "task", *columns), rows)
+
+
+def _place(results: Results) -> Iterator[str]:
     yield from (
         "## PHIL-TD3's place",
         "",
         "With the same human: each row less PHIL-TD3, pair by pair of seeds; of the human's "
         "seconds the median, the least and the most. ∞: the row never gets there; -∞: PHIL-TD3 "
-        "never does; 0: neither.",
+        f"never does; 0: neither. {len(plan.HELPED) - 1} rows are compared in {len(TASKS)} tasks: "
+        "one or two of so many intervals leave 0 out by chance.",
+        "",
+        "The rule, made before there was a record: PHIL-TD3 stays what `trainer train` trains by "
+        f"default unless a row needs less of the human to {LEARNED:.0%} in {ENOUGH} of the "
+        f"{len(plan.SCENARIOS) * plan.DEFAULT_SEEDS} pairs of the left turn and the congestion, "
+        "and is behind in none of their six scenes, by intervals that leave 0 out.",
         "",
     )
-    places = [
-        (Line(row).name, data.words(task), *_place(results, task, row))
-        for task in TASKS
-        for row in plan.HELPED
-        if row != PHIL and results.of(task, Line(row, plan.GOOD))
-    ]
-    yield from markdown_table(
-        ("", "task", "success, nominal, points", f"human s to {LEARNED:.0%}"), places
-    )
-    yield from (
-        "## Which row forgives which human",
-        "",
-        "Left turn: success of the policy alone in %, then the human's seconds until it "
-        f"reached {LEARNED:.0%} in validation.",
-        "",
-    )
-    kinds = [f"{data.words(name)}: {human.meaning}" for name, human in plan.HUMANS.items()]
-    yield from markdown_table(
-        ("", *kinds), [(Line(row).name, *_cells(results, row)) for row in plan.ROWS]
-    )
-    if results.stale:
-        yield f"{len(results.stale)} records are of other settings than today's and left out."
+    rivals = [row for row in plan.HELPED if row != PHIL]
+    yield from _table(results, TASKS, [Line(row, plan.GOOD) for row in rivals], PLACE)
+    better = [Line(row).name for row in rivals if takes_its_place(results, row)]
+    yield f"By that rule {', '.join(better) or 'no row'} takes its place."
+    yield ""
 
 
-def _row(results: Results, task: str, line: Line, found: list[Result]) -> tuple[str, ...]:
-    nominal, tested = data.Scene(task, "nominal"), found[0].record["tests"]
-    shares = {
-        name: results.estimate(data.Scene(task, name), line, data.SUCCESS).as_share()
-        for name in tested
-    }
-    over = results.differences(nominal, line, Line(plan.EXPERT, plan.GOOD), data.REWARD).values()
-    usual = line.setting in (plan.GOOD, plan.MODEL)
-    return (
-        Line(line.algorithm).name if usual else line.name,
-        data.words(task),
-        str(len(found)),
-        *(_costs(found) if found[0].unit.trained else ["–"] * 5),
-        *(shares.get(name, "–") for name in CONDITIONS),
-        data.mean_estimate(over).text(2),
-    )
+def takes_its_place(results: Results, row: str) -> bool:
+    """Whether a row is to be the default instead of PHIL-TD3, by the rule on the page."""
+    pairs = [pair for task in plan.SCENARIOS for pair in _pairs(results, task, row)]
+    behind = [scene for scene in data.PAPER_SCENES if _points(results, scene, row).high < 0.0]
+    return sum(own < other for own, other in pairs) >= ENOUGH and not behind
 
 
-def _costs(found: list[Result]) -> Iterator[str]:
-    yield from (until(found, level, "human_s") for level in (LEARNED, WELL))
-    yield until(found, LEARNED, "takeovers")
-    for what in ("human_s", "failures"):
-        yield data.mean_estimate(getattr(one.costs, what) for one in found).text(0)
+def _pairs(results: Results, task: str, row: str) -> list[tuple[float, float]]:
+    """The human's seconds until a row and PHIL-TD3 had learned, seed by seed."""
+    seconds, phil = (
+        {one.unit.seed: cost.human_s if (cost := one.until(LEARNED)) else np.inf
+         for one in results.of(task, Line(each, plan.GOOD))}
+        for each in (row, PHIL)
+    )  # fmt: skip
+    return [(seconds[seed], phil[seed]) for seed in seconds.keys() & phil.keys()]
 
 
-def _place(results: Results, task: str, row: str) -> Iterator[str]:
-    line, phil = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
-    over = results.differences(data.Scene(task, "nominal"), line, phil, data.SUCCESS).values()
-    yield data.mean_estimate(over).times(100.0).text(1)
-    given, its = (
-        {
-            one.unit.seed: cost.human_s if (cost := one.until(LEARNED)) else np.inf
-            for one in results.of(task, each)
-        }
-        for each in (line, phil)
-    )
-    both = [(given[seed], its[seed]) for seed in given.keys() & its.keys()]
-    yield spread([own - other if own != other else 0.0 for own, other in both]) if both else "–"
+def _points(results: Results, scene: data.Scene, row: str) -> data.Estimate:
+    lines = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
+    return data.mean_estimate(results.differences(scene, *lines, data.SUCCESS).values()).times(100)
 
 
-def _cells(results: Results, row: str) -> Iterator[str]:
-    for human in plan.HUMANS:
-        found = results.of(plan.LEFT[0], Line(row, human))
-        share = results.estimate(
-            data.Scene(plan.LEFT[0], "nominal"), Line(row, human), data.SUCCESS
-        ).as_share()
-        yield f"{share}, {until(found, LEARNED, 'human_s')}" if found else "–"
+def sooner(results: Results, task: str, line: Line) -> str:
+    """The human's seconds until a row had learned, less PHIL-TD3's."""
+    less = [own - its if own != its else 0.0 for own, its in _pairs(results, task, line.algorithm)]
+    return spread(less) if less else "–"
+
+
+def _less_often(results: Results, task: str, line: Line) -> str:
+    pairs = _pairs(results, task, line.algorithm)
+    return f"{sum(own < other for own, other in pairs)} of {len(pairs)}"
+
+
+def _until(cost: str, level: float = LEARNED) -> Cell:
+    def cell(results: Results, task: str, line: Line) -> str:
+        found = results.of(task, line)
+        return until(found, level, cost) if found else "–"
+
+    return cell
+
+
+def _in_all(cost: str) -> Cell:
+    return lambda results, task, line: data.mean_estimate(
+        getattr(one.costs, cost) for one in results.of(task, line)
+    ).text(0)
+
+
+def _success(condition: str) -> Cell:
+    def cell(results: Results, task: str, line: Line) -> str:
+        found = [r for r in results.of(task, line) if condition in r.record["tests"]]
+        return data.mean_estimate(r.mean(condition, data.SUCCESS) for r in found).as_share()
+
+    return cell
+
+
+def _lost(results: Results, task: str, line: Line) -> str:
+    found = [one for one in results.of(task, line) if one.unit.trained]
+    return data.mean_estimate(100.0 * one.unlearned for one in found).text(1)
+
+
+def _over(results: Results, task: str, line: Line) -> str:
+    expert, nominal = Line(plan.EXPERT, plan.GOOD), data.Scene(task, "nominal")
+    over = results.differences(nominal, line, expert, data.REWARD)
+    return data.mean_estimate(over.values()).text(2)
+
+
+TO_LEARNED, S_TO_LEARNED = f"to {LEARNED:.0%}", f"human s to {LEARNED:.0%}"
+COSTS: Mapping[str, Cell] = {
+    "seeds": lambda results, task, line: str(len(results.of(task, line))),
+    f"steps {TO_LEARNED}": _until("steps"),
+    f"episodes {TO_LEARNED}": _until("episodes"),
+    S_TO_LEARNED: _until("human_s"),
+    f"human s to {WELL:.0%}": _until("human_s", WELL),
+    f"take-overs {TO_LEARNED}": _until("takeovers"),
+    "human s in all": _in_all("human_s"),
+    "failed episodes": _in_all("failures"),
+}
+OUTCOMES: Mapping[str, Cell] = {
+    **{f"{name}, %": _success(name) for name in CONDITIONS},
+    "lost at the end, points": _lost,
+    "return over the expert's": _over,
+}
+PLACE: Mapping[str, Cell] = {
+    "success, nominal, points": lambda results, task, line: _points(
+        results, data.Scene(task, "nominal"), line.algorithm
+    ).text(1),
+    S_TO_LEARNED: sooner,
+    "less in": _less_often,
+}
+FORGIVENESS: Mapping[str, Cell] = {
+    "success, nominal, %": OUTCOMES["nominal, %"],
+    "return over the expert's": _over,
+    S_TO_LEARNED: COSTS[S_TO_LEARNED],
+    "failed episodes": COSTS["failed episodes"],
+    "lost at the end, points": _lost,
+}
 
 
 def draw(results: Results) -> Figure:

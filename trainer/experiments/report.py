@@ -158,7 +158,7 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
                 words(setting),
                 plan.SETTINGS[setting].meaning,
                 ", ".join(Line(name).name for name in algorithms),
-                _computed_in(results, [Line(name, setting) for name in algorithms]),
+                computed_in(results, [Line(name, setting) for name in algorithms]),
             )
             for setting, algorithms, *_ in plan.LINES
             if HUMAN_MODEL not in algorithms
@@ -166,9 +166,9 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
     )
 
 
-def _computed_in(results: Results, lines: Sequence[Line]) -> str:
+def computed_in(results: Results, lines: Sequence[Line], tasks: Sequence[str] = SCENARIOS) -> str:
     """How many of the trainings multiplied in what, and where."""
-    found = chain(*(results.of(*each) for each in product(SCENARIOS, lines)))
+    found = chain(*(results.of(*each) for each in product(tasks, lines)))
     counts = Counter(
         ("bfloat16" if its.get("bfloat16") else "float32") + " on a GPU" * bool(its.get("gpu"))
         for its in (one.record["computed"] for one in found)

@@ -89,7 +89,7 @@ def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
     success = np.clip(np.interp(at_step, ends, learned), 0.0, 1.0)
     return {
         **record,
-        "config": {"steps": BUDGET},
+        "config": {"steps": BUDGET, "evaluate_every_steps": 500},
         "training": {
             "end_step": ends.tolist(),
             "return": (20.0 * learned - 10.0).tolist(),

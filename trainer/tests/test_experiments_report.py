@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data, report
-from trainer.experiments.guidance import _place, typical_curves
+from trainer.experiments.guidance import PLACE, takes_its_place, typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
+from trainer.tests import experiments
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 from trainer.tests.test_commands import call
 
@@ -85,15 +86,31 @@ class TestData:
         units = [Unit("left_turn", row, "good", seed) for row in rows for seed in (1, 2, 3)]
         results = results_of(units, SEEDS)
         phil, hi = (results.of("left_turn", data.Line(row, "good")) for row in rows)
-        over, seconds = _place(results, "left_turn", "hi_td3")
+        over, seconds, less = (
+            cell(results, "left_turn", data.Line("hi_td3", "good")) for cell in PLACE.values()
+        )
         points = [100.0 * (b.mean("nominal", "success") - a.mean("nominal", "success"))
                   for a, b in zip(phil, hi, strict=True)]  # fmt: skip
         assert over == data.mean_estimate(points).text(1)
         # HI-TD3 never gets to 90 %, PHIL-TD3 in each of its seeds.
         assert not any(one.until(0.9) for one in hi)
-        assert seconds == "∞ [∞, ∞]"
-        _, none = _place(results, "left_turn", "phil_td3")
-        assert none == "0 [0, 0]"
+        assert (seconds, less) == ("∞ [∞, ∞]", "0 of 3")
+        itself = [
+            cell(results, "left_turn", data.Line("phil_td3", "good")) for cell in PLACE.values()
+        ]
+        assert itself == ["0.0 [0.0, 0.0]", "0 [0, 0]", "0 of 3"]
+
+    def test_a_row_takes_its_place_that_costs_less_and_is_nowhere_behind(self, monkeypatch):
+        def judged(**skills):
+            monkeypatch.setattr(experiments, "SKILLS", skills)
+            units = [Unit(where, row, "good", seed)
+                     for where in ("left_turn", "congestion") for row in skills
+                     for seed in range(1, 6)]  # fmt: skip
+            return takes_its_place(results_of(units, 5), "hi_td3")
+
+        assert judged(phil_td3=0.95, hi_td3=1.0)
+        assert not judged(phil_td3=1.0, hi_td3=0.95)
+        assert not judged(phil_td3=0.95, hi_td3=0.95)
 
     def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
         assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0
@@ -273,7 +290,7 @@ def test_the_page_says_in_what_and_where_the_trainings_were_computed():
     _, second, third = (results.found[unit].record["computed"] for unit in units)
     second.update(bfloat16=True)
     third.update(bfloat16=True, gpu="H100")
-    said = report._computed_in(results, [claims.PHIL])
+    said = report.computed_in(results, [claims.PHIL])
     assert said == "1 float32, 1 bfloat16, 1 bfloat16 on a GPU"
 
 

@@ -148,7 +148,8 @@ NO, YES = False, True
         ([NONE, CRASH, NONE, NONE, NONE, CRASH, NONE, NONE, NONE], {"hold_steps": 3},
          [NO, YES, YES, YES, NO, YES, YES, YES, NO], [YES, NO, NO, YES, NO, NO]),
         # For a second and a half, which at the scenarios' pace are 15 periods.
-        ([CRASH] + [NONE] * 20, {"hold_steps": steps_held(0.1)}, [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
+        ([CRASH] + [NONE] * 20, {"hold_steps": steps_held(0.1)},
+         [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
         # Where the robot only asks, for a third of that.
         ([ASKED] + [NONE] * 9, {}, [YES] * 5 + [NO] * 5, [YES] + [NO] * 4),
         # A reason that lasts prolongs the same intervention.
