@@ -136,8 +136,10 @@ class Line(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The algorithm in words, with its setting where that is not the normal one."""
-        setting = "" if self.setting == NORMAL else f" ({words(self.setting)})"
+        """The algorithm in words, with its setting where that is not a usual one."""
+        setting = (
+            "" if self.setting in (NORMAL, plan.GOOD, plan.MODEL) else f" ({words(self.setting)})"
+        )
         return plan.LABELS[self.algorithm] + setting
 
 

@@ -5,7 +5,7 @@ One page and one figure beside the records, made of what is there.
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain, product
+from itertools import chain, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +16,17 @@ from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
-from trainer.experiments import data, plan
-from trainer.experiments.data import Line, Results
-from trainer.experiments.report import (
-    COMMAND,
-    LEARNED,
-    WELL,
-    colour,
-    computed_in,
-    spread,
-    until,
-)
+from trainer.experiments import data, plan, report
+from trainer.experiments.data import Line, Result, Results
+from trainer.experiments.report import COMMAND, LEARNED, Cell, colour, computed_in, spread, until
 from trainer.experiments.run import Store
 from trainer.learner.config import ALGORITHMS
 from trainer.pictures import write_figure
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
-USUAL = (plan.GOOD, plan.MODEL)  # Humans that a line need not name
 ENOUGH = 9  # Pairs of seeds, of ten: by chance one of 93 rivals that are equals has so many
+S_TO_LEARNED = f"human s to {LEARNED:.0%}"
 LEARNS_FROM = {
     PHIL: "reward, a penalty on what is overruled, imitation; replay by TD error and Q advantage",
     "ia_td3": "the same, replay by TD error alone",
@@ -52,7 +44,6 @@ LEARNS_FROM = {
 """What each row is, for the page."""
 OTHER_HUMANS = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
 """Other humans who drive by themselves."""
-Cell = Callable[[Results, str, Line], str]  # What stands in a table, for a task and a line
 
 
 def write_guidance(store: Store, seeds: int) -> Path:
@@ -144,23 +135,33 @@ def _page(results: Results, store: Store) -> Iterator[str]:
     humans = [Line(plan.EXPERT, plan.GOOD), *OTHER_HUMANS]
     yield from (f"## With {plan.HUMANS[plan.GOOD].meaning}", "")
     yield from (f"![Success of the policy alone by what the human gave]({plan.GUIDANCE}.png)", "")
-    yield from ("What a training cost:", "", *_table(results, TASKS, rows, COSTS))
-    yield from ("What came of it, the policy alone. Lost at the end are validation drives that the "
-                "last actors fail and the best one did not:", "",
-                *_table(results, TASKS, [*rows, *humans], OUTCOMES))  # fmt: skip
+    yield from ("What a training cost:", "", *report.table(results, product(TASKS, rows), COSTS))
+    yield from (
+        "What came of it, the policy alone. Lost at the end: how far the validations of the last "
+        f"{data.END_STEPS:,} steps are below the best one, which chance makes better, too.",
+        "",
+        *report.table(results, product(TASKS, [*rows, *humans]), outcomes(results), True),
+    )
     yield from _place(results)
     yield from ("## Which row forgives which human", "", "In the left turn:", "")
     yield from (f"- {data.words(name)}: {human.meaning}" for name, human in plan.HUMANS.items())
     yield ""
-    for title, cell in FORGIVENESS.items():
+    columns = {**COSTS, **outcomes(results)}
+    found = {row: [results.of(plan.LEFT[0], Line(row, human)) for human in plan.HUMANS]
+             for row in plan.HELPED}  # fmt: skip
+    for title in FORGIVENESS:
         yield from markdown_table(
             (title, *map(data.words, plan.HUMANS)),
-            [
-                (Line(row).name,
-                 *(cell(results, plan.LEFT[0], Line(row, human)) for human in plan.HUMANS))
-                for row in plan.HELPED
-            ],
+            [(Line(row).name, *(columns[title](its) if its else "–" for its in each))
+             for row, each in found.items()],
         )  # fmt: skip
+
+
+FORGIVENESS = (
+    "nominal, %", "return over the expert's", S_TO_LEARNED, "failed episodes",
+    "lost at the end, points",
+)  # fmt: skip
+"""What is told of every row beside every human."""
 
 
 def _what_the_rows_are() -> Iterator[str]:
@@ -187,19 +188,6 @@ def _what_the_rows_are() -> Iterator[str]:
     )  # fmt: skip
 
 
-def _table(
-    results: Results, tasks: Sequence[str], lines: Sequence[Line], columns: Mapping[str, Cell]
-) -> Iterator[str]:
-    """A row a task and line of which there is something."""
-    rows = [
-        (Line(line.algorithm).name if line.setting in USUAL else line.name, data.words(task),
-         *(cell(results, task, line) for cell in columns.values()))
-        for task, line in product(tasks, lines)
-        if results.of(task, line)
-    ]  # fmt: skip
-    return markdown_table(("", "task", *columns), rows)
-
-
 def _place(results: Results) -> Iterator[str]:
     yield from (
         "## PHIL-TD3's place",
@@ -216,7 +204,8 @@ def _place(results: Results) -> Iterator[str]:
         "",
     )
     rivals = [row for row in plan.HELPED if row != PHIL]
-    yield from _table(results, TASKS, [Line(row, plan.GOOD) for row in rivals], PLACE)
+    places = product(TASKS, [Line(row, plan.GOOD) for row in rivals])
+    yield from report.table(results, places, place_columns(results))
     better = [Line(row).name for row in rivals if takes_its_place(results, row)]
     yield f"By that rule {', '.join(better) or 'no row'} takes its place."
     yield ""
@@ -224,100 +213,89 @@ def _place(results: Results) -> Iterator[str]:
 
 def takes_its_place(results: Results, row: str) -> bool:
     """Whether a row is to be the default instead of PHIL-TD3, by the rule on the page."""
-    pairs = [pair for task in plan.SCENARIOS for pair in _pairs(results, task, row)]
-    behind = [scene for scene in data.PAPER_SCENES if _points(results, scene, row).high < 0.0]
+    pairs = [its for task in plan.SCENARIOS
+             for its in _pairs(results, results.of(task, Line(row, plan.GOOD)))]  # fmt: skip
+    lines = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
+    over = (results.differences(scene, *lines, data.SUCCESS) for scene in data.PAPER_SCENES)
+    behind = any(data.mean_estimate(points.values()).high < 0.0 for points in over)
     return sum(own < other for own, other in pairs) >= ENOUGH and not behind
 
 
-def _pairs(results: Results, task: str, row: str) -> list[tuple[float, float]]:
+def _pairs(results: Results, found: Sequence[Result]) -> list[tuple[float, float]]:
     """The human's seconds until a row and PHIL-TD3 had learned, seed by seed."""
+    task = found[0].unit.scenario if found else ""
     seconds, phil = (
-        {one.unit.seed: cost.human_s if (cost := one.until(LEARNED)) else np.inf
-         for one in results.of(task, Line(each, plan.GOOD))}
-        for each in (row, PHIL)
-    )  # fmt: skip
+        {one.unit.seed: cost.human_s if (cost := one.until(LEARNED)) else np.inf for one in each}
+        for each in (found, results.of(task, Line(PHIL, plan.GOOD)))
+    )
     return [(seconds[seed], phil[seed]) for seed in seconds.keys() & phil.keys()]
 
 
-def _points(results: Results, scene: data.Scene, row: str) -> data.Estimate:
-    lines = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
-    return data.mean_estimate(results.differences(scene, *lines, data.SUCCESS).values()).times(100)
+def place_columns(results: Results) -> Mapping[str, Cell]:
+    """A row less PHIL-TD3: success, the human's seconds, and in how many pairs these are fewer."""
+
+    def sooner(found: Sequence[Result]) -> str:
+        pairs = _pairs(results, found)
+        return spread([own - other if own != other else 0.0 for own, other in pairs] or [np.nan])
+
+    def less_in(found: Sequence[Result]) -> str:
+        pairs = _pairs(results, found)
+        return f"{sum(own < other for own, other in pairs)} of {len(pairs)}"
+
+    return {
+        "success, nominal, points": _over(results, Line(PHIL, plan.GOOD), data.SUCCESS, 100.0, 1),
+        S_TO_LEARNED: sooner,
+        "less in": less_in,
+    }
 
 
-def sooner(results: Results, task: str, line: Line) -> str:
-    """The human's seconds until a row had learned, less PHIL-TD3's."""
-    less = [own - its if own != its else 0.0 for own, its in _pairs(results, task, line.algorithm)]
-    return spread(less) if less else "–"
+def _over(
+    results: Results, other: Line, quantity: str, factor: float = 1.0, digits: int = 2
+) -> Cell:
+    """A quantity of the nominal drives less another line's."""
 
-
-def _less_often(results: Results, task: str, line: Line) -> str:
-    pairs = _pairs(results, task, line.algorithm)
-    return f"{sum(own < other for own, other in pairs)} of {len(pairs)}"
-
-
-def _until(cost: str, level: float = LEARNED) -> Cell:
-    def cell(results: Results, task: str, line: Line) -> str:
-        found = results.of(task, line)
-        return until(found, level, cost) if found else "–"
+    def cell(found: Sequence[Result]) -> str:
+        task, *line, _ = found[0].unit
+        nominal = data.Scene(task, "nominal")
+        over = results.differences(nominal, Line(*line), other, quantity).values()
+        return data.mean_estimate(over).times(factor).text(digits)
 
     return cell
-
-
-def _in_all(cost: str) -> Cell:
-    return lambda results, task, line: data.mean_estimate(
-        getattr(one.costs, cost) for one in results.of(task, line)
-    ).text(0)
 
 
 def _success(condition: str) -> Cell:
-    def cell(results: Results, task: str, line: Line) -> str:
-        found = [r for r in results.of(task, line) if condition in r.record["tests"]]
-        return data.mean_estimate(r.mean(condition, data.SUCCESS) for r in found).as_share()
+    def cell(found: Sequence[Result]) -> str:
+        tested = [one for one in found if condition in one.record["tests"]]
+        return data.mean_estimate(one.mean(condition, data.SUCCESS) for one in tested).as_share()
 
     return cell
 
 
-def _lost(results: Results, task: str, line: Line) -> str:
-    found = [one for one in results.of(task, line) if one.unit.trained]
-    return data.mean_estimate(100.0 * one.unlearned for one in found).text(1)
+def _estimate(number: Callable[[Result], float], digits: int = 0) -> Cell:
+    return lambda found: data.mean_estimate(map(number, found)).text(digits)
 
 
-def _over(results: Results, task: str, line: Line) -> str:
-    expert, nominal = Line(plan.EXPERT, plan.GOOD), data.Scene(task, "nominal")
-    over = results.differences(nominal, line, expert, data.REWARD)
-    return data.mean_estimate(over.values()).text(2)
+def _lost(found: Sequence[Result]) -> str:
+    trained = (100.0 * one.unlearned for one in found if one.unit.trained)
+    return data.mean_estimate(trained).text(1)
 
 
-TO_LEARNED, S_TO_LEARNED = f"to {LEARNED:.0%}", f"human s to {LEARNED:.0%}"
 COSTS: Mapping[str, Cell] = {
-    "seeds": lambda results, task, line: str(len(results.of(task, line))),
-    f"steps {TO_LEARNED}": _until("steps"),
-    f"episodes {TO_LEARNED}": _until("episodes"),
-    S_TO_LEARNED: _until("human_s"),
-    f"human s to {WELL:.0%}": _until("human_s", WELL),
-    f"take-overs {TO_LEARNED}": _until("takeovers"),
-    "human s in all": _in_all("human_s"),
-    "failed episodes": _in_all("failures"),
+    **dict(islice(report.COSTS.items(), 4)),
+    f"episodes to {LEARNED:.0%}": until(LEARNED, "episodes"),
+    f"take-overs to {LEARNED:.0%}": until(LEARNED, "takeovers"),
+    "human s in all": _estimate(lambda one: one.costs.human_s),
+    "failed episodes": _estimate(lambda one: one.costs.failures),
 }
-OUTCOMES: Mapping[str, Cell] = {
-    **{f"{name}, %": _success(name) for name in CONDITIONS},
-    "lost at the end, points": _lost,
-    "return over the expert's": _over,
-}
-PLACE: Mapping[str, Cell] = {
-    "success, nominal, points": lambda results, task, line: _points(
-        results, data.Scene(task, "nominal"), line.algorithm
-    ).text(1),
-    S_TO_LEARNED: sooner,
-    "less in": _less_often,
-}
-FORGIVENESS: Mapping[str, Cell] = {
-    "success, nominal, %": OUTCOMES["nominal, %"],
-    "return over the expert's": _over,
-    S_TO_LEARNED: COSTS[S_TO_LEARNED],
-    "failed episodes": COSTS["failed episodes"],
-    "lost at the end, points": _lost,
-}
+
+
+def outcomes(results: Results) -> Mapping[str, Cell]:
+    """The columns of what came of a training."""
+    return {
+        **{f"{name}, %": _success(name) for name in CONDITIONS},
+        "lost at the end, points": _lost,
+        "return over the expert's": _over(results, Line(plan.EXPERT, plan.GOOD), data.REWARD),
+    }
 
 
 def draw(results: Results) -> Figure:

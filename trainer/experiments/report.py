@@ -267,43 +267,49 @@ def _cost(results: Results) -> Iterator[str]:
         "makes better, too."
     )
     yield ""
-    rows = []
-    for line, scenario in product(EVERY_LINE, SCENARIOS):
-        found = [result for result in results.of(scenario, line) if result.unit.trained]
-        if not found:
-            continue
-        guided = ALGORITHMS[line.algorithm].guided
-        rows.append(
-            (
-                line.name,
-                words(scenario),
-                str(len(found)),
-                until(found, LEARNED, "steps"),
-                *(until(found, level, "human_s") if guided else "–" for level in (LEARNED, WELL)),
-                f"{100 * np.mean([r.unlearned for r in found]):.1f}",
-                f"{100 * max(r.unlearned for r in found):.1f}",
-                *(f"{cost:,.0f}" for cost in np.mean([r.costs[:3] for r in found], axis=0)),
-                f"{np.mean([r.record['totals']['updates'] for r in found]):,.0f}",
-            )
-        )
-    head = (
-        "", "scenario", "seeds", f"steps to {LEARNED:.0%}",
-        *(f"human s to {level:.0%}" for level in (LEARNED, WELL)),
-        "validation lost at the end, points", "by the worst seed", "human steps", "take-overs",
-        "failures", "updates",
-    )  # fmt: skip
-    yield from markdown_table(head, rows)
+    yield from table(
+        results, [(where, its) for its, where in product(EVERY_LINE, SCENARIOS)], COSTS
+    )
 
 
-def until(found: Sequence[Result], level: float, what: str) -> str:
+Cell = Callable[[Sequence[Result]], str]
+"""What stands in a table's column, for the trainings of one line in one task."""
+
+
+def table(
+    results: Results,
+    places: Iterable[tuple[str, Line]],
+    columns: Mapping[str, Cell],
+    tested_only: bool = False,
+) -> Iterator[str]:
+    """A row for each task and line of which there is something; of what is ``tested_only``, too."""
+    found = ((*place, results.of(*place)) for place in places)
+    rows = [
+        (line.name, words(task), *(cell(its) for cell in columns.values()))
+        for task, line, its in found
+        if its and (tested_only or its[0].unit.trained)
+    ]
+    return markdown_table(("", "scenario", *columns), rows)
+
+
+def until(level: float, what: str) -> Cell:
     """A cost until the policy alone reached a level: median, least and most of the seeds.
 
     A seed that never does costs more than any other. In brackets, how many do.
     """
-    reached = [one.until(level) for one in found]
-    costs = [getattr(cost, what) if cost else np.inf for cost in reached]
-    there = int(np.isfinite(costs).sum())
-    return f"{spread(costs)} ({there})" if there else "–"
+
+    def cell(found: Sequence[Result]) -> str:
+        costs = [getattr(cost, what) if (cost := one.until(level)) else np.inf for one in found]
+        there = int(np.isfinite(costs).sum())
+        unguided = what in HUMANS and not ALGORITHMS[found[0].unit.algorithm].guided
+        return f"{spread(costs)} ({there})" if there and not unguided else "–"
+
+    return cell
+
+
+def mean(number: Callable[[Result], float], digits: int = 0) -> Cell:
+    """The mean of the seeds."""
+    return lambda found: f"{np.mean([number(one) for one in found]):,.{digits}f}"
 
 
 def spread(numbers: Sequence[float]) -> str:
@@ -316,6 +322,19 @@ def spread(numbers: Sequence[float]) -> str:
 
 LEARNED, WELL = metrics.LEARNED
 """Success of the policy alone at which it counts as learned, and as learned well."""
+HUMANS = ("human_s", "takeovers")  # Costs that are the human's
+COSTS: Mapping[str, Cell] = {
+    "seeds": lambda found: f"{len(found)}",
+    f"steps to {LEARNED:.0%}": until(LEARNED, "steps"),
+    **{f"human s to {level:.0%}": until(level, "human_s") for level in (LEARNED, WELL)},
+    "validation lost at the end, points": mean(lambda one: 100 * one.unlearned, 1),
+    "by the worst seed": lambda found: f"{100 * max(one.unlearned for one in found):.1f}",
+    "human steps": mean(lambda one: one.costs.human_steps),
+    "take-overs": mean(lambda one: one.costs.takeovers),
+    "failures": mean(lambda one: one.costs.failures),
+    "updates": mean(lambda one: one.record["totals"]["updates"]),
+}
+"""The columns of ``cost``."""
 MORE = {"fig9": _tests, "time": _times, "floor": _floor, "cost": _cost}
 """Experiment -> its tables beside its claims."""
 

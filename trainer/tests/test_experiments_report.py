@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data, report
-from trainer.experiments.guidance import PLACE, takes_its_place, typical_curves
+from trainer.experiments.guidance import place_columns, takes_its_place, typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
 from trainer.tests import experiments
@@ -86,18 +86,14 @@ class TestData:
         units = [Unit("left_turn", row, "good", seed) for row in rows for seed in (1, 2, 3)]
         results = results_of(units, SEEDS)
         phil, hi = (results.of("left_turn", data.Line(row, "good")) for row in rows)
-        over, seconds, less = (
-            cell(results, "left_turn", data.Line("hi_td3", "good")) for cell in PLACE.values()
-        )
+        over, seconds, less = (cell(hi) for cell in place_columns(results).values())
         points = [100.0 * (b.mean("nominal", "success") - a.mean("nominal", "success"))
                   for a, b in zip(phil, hi, strict=True)]  # fmt: skip
         assert over == data.mean_estimate(points).text(1)
         # HI-TD3 never gets to 90 %, PHIL-TD3 in each of its seeds.
         assert not any(one.until(0.9) for one in hi)
         assert (seconds, less) == ("∞ [∞, ∞]", "0 of 3")
-        itself = [
-            cell(results, "left_turn", data.Line("phil_td3", "good")) for cell in PLACE.values()
-        ]
+        itself = [cell(phil) for cell in place_columns(results).values()]
         assert itself == ["0.0 [0.0, 0.0]", "0 [0, 0]", "0 of 3"]
 
     def test_a_row_takes_its_place_that_costs_less_and_is_nowhere_behind(self, monkeypatch):
@@ -280,8 +276,8 @@ def test_a_seed_that_never_learned_costs_more_than_any_other():
         columns = results.found[unit].record["validation"]
         columns["success"] = [float(unit.seed < 3 and n >= unit.seed) for n in range(12)]
     found = results.of("left_turn", claims.PHIL)
-    assert report.until(found, 0.9, "steps") == "1,520 [1,020, ∞] (2)"
-    assert report.until(found[2:], 0.9, "steps") == "–"
+    assert report.until(0.9, "steps")(found) == "1,520 [1,020, ∞] (2)"
+    assert report.until(0.9, "steps")(found[2:]) == "–"
 
 
 def test_the_page_says_in_what_and_where_the_trainings_were_computed():
