@@ -27,21 +27,6 @@ TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
 ENOUGH = 9  # Pairs of seeds, of ten: by chance one of 93 rivals that are equals has so many
 S_TO_LEARNED = f"human s to {LEARNED:.0%}"
-LEARNS_FROM = {
-    PHIL: "reward, a penalty on what is overruled, imitation; replay by TD error and Q advantage",
-    "ia_td3": "the same, replay by TD error alone",
-    "hi_td3": "reward and penalty",
-    "per_td3": "reward; nobody guides",
-    "cloning_only": "imitation alone",
-    "rlif_td3": "-1 for what is overruled, and no reward",
-    "pvp_td3": "+1 for what the human does, -1 for what it overrules, and no reward; "
-    "half of a minibatch is the human's, drawn evenly",
-    "pvp4real_td3": "the same, and imitation",
-    "rlpd_td3": "reward; half of a minibatch is the human's, drawn evenly; two updates a step",
-    "ppl_td3": "imitation, and preferences in what the simulator foresees of overruled actions",
-    "phil_gated": "as PHIL-TD3; the human watches 500 steps, and then comes when the robot asks",
-}
-"""What each row is, for the page."""
 OTHER_HUMANS = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
 """Other humans who drive by themselves."""
 
@@ -171,19 +156,20 @@ def _what_the_rows_are() -> Iterator[str]:
     yield from (
         "## What the rows are",
         "",
-        "All share one learner. A row has settings of its own where its paper's would not fit "
-        "ours; the last column is what three trainings each, on a seed that is not in the table, "
+        "All share one learner; [what each learns from]"
+        "(../../trainer/README.md#the-fair-table-of-human-guidance). A row has settings of its own "
+        "where ours would not fit what it learns from. The last column is what three trainings "
+        "each, on a seed that is not in the table, "
         "[chose](../README.md#what-the-settings-of-the-experiments-were-chosen-by). `trainer train "
-        "--algorithm NAME` has the former; the latter want `--set`. Without a reward a crash costs "
-        "the critics nothing: only what the human objects to does.",
+        "--algorithm NAME` has the former; the latter want `--set`.",
         "",
     )
     yield from markdown_table(
-        ("", "`NAME`", "learns from", "settings of its own", "chosen"),
+        ("", "`NAME`", "settings of its own", "chosen"),
         [
-            (Line(row).name, f"`{row}`", what, named(ALGORITHMS[row].settings),
+            (Line(row).name, f"`{row}`", named(ALGORITHMS[row].settings),
              named(plan.TUNED.get(row, {})))
-            for row, what in LEARNS_FROM.items()
+            for row in plan.ROWS
         ],
     )  # fmt: skip
 
