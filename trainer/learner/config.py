@@ -59,11 +59,12 @@ UNIT_VALUES = {"saturation_weight": 3e-3}
 """Values lie between -1 and 1, a tenth of what our rewards make, and so does the price that the
 actor weighs against them."""
 UNEXPLORED = {"exploration_initial": 0.0, "exploration_final": 0.0}
+FASTER = {"actor_learning_rate": 3e-4}  # Chosen by the tuning (results/choices/rows.csv)
 PVP = Algorithm(
     penalty=False, behaviour_cloning=False, advantage_weight=0.0, rewarded=False,
     proxy_values=True, human_share=0.5,
     settings={
-        **UNIFORM, **UNIT_VALUES, **UNEXPLORED, "return_steps": 1, "cloning_weight": 1.0
+        **UNIFORM, **UNIT_VALUES, **FASTER, "return_steps": 1, "cloning_weight": 1.0
     },
 )  # fmt: skip
 
@@ -91,10 +92,10 @@ ALGORITHMS: dict[str, Algorithm] = {
     # the human overruled, and 0 elsewhere.
     "rlif_td3": replace(
         IA, behaviour_cloning=False, rewarded=False,
-        settings={**UNIT_VALUES, "intervention_penalty": -1.0},
+        settings={**UNIT_VALUES, **FASTER, "intervention_penalty": -1.0},
     ),
-    # Proxy value propagation (2502.03369, NeurIPS 2023), and with cloning (2503.04969). What is not
-    # rewarded is not explored, either.
+    # Proxy value propagation (2502.03369, NeurIPS 2023), and with cloning (2503.04969). Its
+    # authors do not explore; here it learns sooner where it does.
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
@@ -103,18 +104,21 @@ ALGORITHMS: dict[str, Algorithm] = {
     # actor a step.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
-        updates_per_step=2, settings={**UNIFORM, "return_steps": 1, "policy_delay": 2},
+        updates_per_step=2,
+        settings={**UNIFORM, **FASTER, "return_steps": 1, "policy_delay": 2},
     ),
     # Predictive preference learning (2510.01545): in the L = 4 states that the overruled action
     # would have led to, the human's is the better one. Cloning counts as much. No Q term.
     "ppl_td3": replace(
         IA, penalty=False, q_term=False, rewarded=False, human_share=0.5, foresight=4,
-        settings={**UNIFORM, **UNIT_VALUES, **UNEXPLORED, "cloning_weight": 1.0},
+        settings={
+            **UNIFORM, **UNIT_VALUES, **UNEXPLORED, "cloning_weight": 1.0, "preference_beta": 1.0
+        },
     ),
     # The robot asks, with a budget, as in ThriftyDAgger (2109.08273), where the critics disagree;
     # AIM (2506.09176) has a critic of its own for that. Until they know what doubt is the human
     # watches, and only what it objected to then is penalised.
-    "phil_gated": replace(PHIL, asks=0.05),
+    "phil_gated": replace(PHIL, asks=0.05, settings={"cloning_weight": 10.0}),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
 and the others are what came after it."""
