@@ -316,8 +316,9 @@ def spread(numbers: Sequence[float]) -> str:
     """Median, least and most, as in "12 [8, ∞]"; of five, 15 of 16 times the true median lies
     between the least and the most.
     """
-    middle, least, most = median_low(numbers), min(numbers), max(numbers)
-    return f"{middle:,.0f} [{least:,.0f}, {most:,.0f}]".replace("inf", "∞")
+    ends = (f"{number:,.0f}" for number in (median_low(numbers), min(numbers), max(numbers)))
+    middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
+    return f"{middle} [{least}, {most}]"
 
 
 LEARNED, WELL = metrics.LEARNED

@@ -278,6 +278,7 @@ def test_a_seed_that_never_learned_costs_more_than_any_other():
     found = results.of("left_turn", claims.PHIL)
     assert report.until(0.9, "steps")(found) == "1,520 [1,020, ∞] (2)"
     assert report.until(0.9, "steps")(found[2:]) == "–"
+    assert report.spread([-0.3, -3.0, np.inf]) == "0 [-3, ∞]"
 
 
 def test_the_page_says_in_what_and_where_the_trainings_were_computed():
