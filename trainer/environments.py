@@ -23,7 +23,7 @@ from bridge.episode import array_of, finite, outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason
-from trainer.learner.replay import FRAMES_LAYOUT, Layout
+from trainer.learner.replay import Layout
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.environment import Scene
 
@@ -86,11 +86,6 @@ def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]
 def task_of(env: Any) -> Task:
     """What the environment asks of a policy file."""
     return bridge.describe(env if env.scenario in SCENARIOS else env.env, env.control_period_s)
-
-
-def layout_of(env: Any) -> Layout:
-    """How the environment's observations lie in an array."""
-    return FRAMES_LAYOUT if env.scenario in SCENARIOS else env.layout
 
 
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:
@@ -177,15 +172,14 @@ class Adapted:
         self.action_space = Box(-1.0, 1.0, (len(task.action),), np.float32)
         self.key_rate_per_s = float(getattr(self.unwrapped, "key_rate_per_s", 5.0))
         self.expert = self._expert if hasattr(self.unwrapped, "expert") else None
-        self._limited = env.spec is not None and env.spec.max_episode_steps is not None
-        if not self._limited:
+        if env.spec is None or env.spec.max_episode_steps is None:
             most = f"an episode ends after {MOST_STEPS} steps at the latest"
             _say_once(f"{name} has no limit of its own: {most}")
+            self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)
         try:
             bridge.describe(env)
         except UserError:
             _say_once(f"{name} does not say how long a step is: {PERIOD_S} s is taken")
-        self._steps = 0
         self._last = np.zeros(len(task.action), np.float32)
 
     def reset(
@@ -193,20 +187,17 @@ class Adapted:
     ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._steps = 0
         return self._seen(observation), _said(info)
 
     def step(self, action: Action) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         """One control period."""
         self._last = np.asarray(action, np.float32)
         observation, reward, terminated, truncated, info = self.env.step(self._own(action))
-        self._steps += 1
-        truncated = bool(truncated) or (not self._limited and self._steps >= MOST_STEPS)
         info = _said(info)
         if terminated or truncated:
             info["outcome"] = outcome_of(info)
         reward = finite("reward", reward)
-        return self._seen(observation), reward, bool(terminated), truncated, info
+        return self._seen(observation), reward, bool(terminated), bool(truncated), info
 
     @property
     def brake_action(self) -> Action:
@@ -260,22 +251,15 @@ class Adapted:
         return _ScaledExpert(self, self.unwrapped.expert())
 
     def _seen(self, observation: Any) -> NDArray[Any]:
-        kind = self.layout.dtype
-        if kind.names is None:
-            return self._learnable(
-                {bridge.PLAIN: observation}, bridge.PLAIN, kind, self.layout.shape
-            )
-        seen = np.zeros((), kind)
-        for name in kind.names:
-            seen[name] = self._learnable(observation, name, kind[name].base, kind[name].shape)
+        """As one array; UserError for one that no network could learn from."""
+        seen = np.zeros(self.layout.shape, self.layout.dtype)
+        given = observation if seen.dtype.names else {bridge.PLAIN: observation}
+        for name, entry in entries_of(seen, bridge.PLAIN).items():
+            entry[...] = array_of(given, name, entry.dtype, entry.shape)
+            if entry.dtype.kind == "f" and not np.isfinite(entry).all():
+                what = "holds a number that is not finite"
+                raise UserError(f"an observation of {self.scenario} {what}")
         return seen
-
-    def _learnable(self, observation: Mapping[str, Any], name: str, *form: Any) -> NDArray[Any]:
-        """An entry; UserError for one that no network could learn from."""
-        array = array_of(observation, name, *form)
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise UserError(f"an observation of {self.scenario} holds a number that is not finite")
-        return array
 
 
 class _ScaledExpert(Expert):

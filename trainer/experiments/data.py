@@ -324,12 +324,13 @@ class Results:
         """
         if quantity == CHANGED:
             scenes = [place] if isinstance(place, Scene) else PAPER_SCENES
-            return self._changed(scenes, line)
+            ratios = self._ratios(scenes, line, RANDOM, kind)
+            return {seed: ratio - 1.0 for seed, ratio in ratios.items()}
         if isinstance(place, Scene):
             found = self.of(place.scenario, line)
             return {r.unit.seed: r.mean(place.condition, quantity) for r in found}
         if quantity == KEPT:
-            return self._kept(place, line, kind)
+            return self._ratios([place], line, ONE_FRAME, kind)
         if quantity == DROPPED:
             nominal, variant = (
                 self.numbers(Scene(place, condition), line, SUCCESS)
@@ -344,17 +345,12 @@ class Results:
         """Mean and interval of the seeds' numbers."""
         return mean_estimate(self.numbers(place, line, quantity, kind).values())
 
-    def _kept(self, scenario: str, line: Line, kind: str) -> BySeed:
-        """Each seed's part in the ratio of the final distances, one frame over two."""
-        lines = Line(line.algorithm, ONE_FRAME), line
-        return _ratio(*(self.numbers(scenario, each, DISTANCE, kind) for each in lines))
-
-    def _changed(self, scenes: Sequence[Scene], line: Line) -> BySeed:
-        """Each seed's part in the change of the distance by poor guidance, mean of the scenes."""
-        lines = Line(line.algorithm, RANDOM), line
-        found = [_ratio(*(self.numbers(one, each, DISTANCE) for each in lines)) for one in scenes]
+    def _ratios(self, at: Sequence[Place], line: Line, setting: str, kind: str) -> BySeed:
+        """Each seed's part in the ratio of the distances, that setting over the line's own."""
+        lines = Line(line.algorithm, setting), line
+        found = [_ratio(*(self.numbers(one, each, DISTANCE, kind) for each in lines)) for one in at]
         seeds = [seed for seed in found[0] if all(seed in one for one in found)]
-        return {seed: float(np.mean([one[seed] for one in found])) - 1.0 for seed in seeds}
+        return {seed: float(np.mean([one[seed] for one in found])) for seed in seeds}
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""

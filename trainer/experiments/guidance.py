@@ -21,7 +21,6 @@ from trainer.experiments.data import Line, Result, Results
 from trainer.experiments.report import COMMAND, LEARNED, Cell, colour, computed_in, spread, until
 from trainer.experiments.run import Store
 from trainer.learner.config import ALGORITHMS
-from trainer.pictures import write_figure
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
@@ -32,17 +31,8 @@ OTHER_HUMANS = (Line(plan.HUMAN_MODEL, plan.MODEL), Line(plan.EXPERT, "slower"))
 
 
 def write_guidance(store: Store, seeds: int) -> Path:
-    """Write the page and its figure; the page's path.
-
-    Raises UserError: there are no records at all.
-    """
-    results = data.load(store, seeds, plan.GUIDANCE)
-    if not results.found:
-        raise UserError(f"there are no results to report in {store.results}")
-    write_figure(draw(results), store.results / f"{plan.GUIDANCE}.png")
-    path = store.results / "README.md"
-    write_atomic(path, ("\n".join(_page(results, store)) + "\n").encode())
-    return path
+    """As ``report.write_report``: this page and its figure."""
+    return report.write_report(store, seeds, plan.GUIDANCE, {plan.GUIDANCE: draw}, _page)
 
 
 def write_typical(results: Path, humans: Path, seeds: int, path: Path) -> None:

@@ -59,21 +59,6 @@ Judged = tuple[Claim, Comparison, Comparison | None]
 """A claim with what was measured, and with the same of the policy alone."""
 
 
-def write_report(store: Store, seeds: int) -> Path:
-    """Draw all figures and write the page beside the records; returns its path.
-
-    Raises UserError: there are no records at all.
-    """
-    results = data.load(store, seeds)
-    if not results.found:
-        raise UserError(f"there are no results to report in {store.results}")
-    for name, draw in FIGURES.items():
-        write_figure(draw(results), store.results / f"{name}.png")
-    path = store.results / "README.md"
-    write_atomic(path, ("\n".join(_page(results, store)) + "\n").encode())
-    return path
-
-
 def _page(results: Results, store: Store) -> Iterator[str]:
     judged = [(claim, *judge_both(results, claim)) for claim in (*CLAIMS, *AS_PRINTED, *GOALS)]
     yield from _summary(results, store, judged)
@@ -490,3 +475,24 @@ FIGURES: Mapping[str, Callable[[Results], Figure]] = {
     },
 }
 """Name of the experiment, and of the PNG -> how it is drawn."""
+
+
+def write_report(
+    store: Store,
+    seeds: int,
+    name: str = "all",
+    figures: Mapping[str, Callable[[Results], Figure]] = FIGURES,
+    page: Callable[[Results, Store], Iterator[str]] = _page,
+) -> Path:
+    """Draw all figures and write the page beside the records; returns its path.
+
+    Raises UserError: there are no records at all.
+    """
+    results = data.load(store, seeds, name)
+    if not results.found:
+        raise UserError(f"there are no results to report in {store.results}")
+    for title, draw in figures.items():
+        write_figure(draw(results), store.results / f"{title}.png")
+    path = store.results / "README.md"
+    write_atomic(path, ("\n".join(page(results, store)) + "\n").encode())
+    return path

@@ -9,6 +9,7 @@ from trainer.human.guide import Expert, Reason
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
+from trainer.scenarios.traffic import footprint
 
 
 class CongestionHuman(Expert):
@@ -81,7 +82,7 @@ class CongestionHuman(Expert):
     def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
         """The ego car's footprints under a held steering angle, at its present speed."""
         env = self.env
-        shape, dt_s = env.ego.footprint, env.config.control_period_s
+        shape, dt_s = footprint(env.ego), env.config.control_period_s
         slip_rad = math.atan(0.5 * math.tan(angle_rad))
         move_m = env.ego.speed * dt_s
         shapes = []
@@ -104,7 +105,7 @@ class CongestionHuman(Expert):
         for car in self.env.traffic:
             if car.lane.start[1] == 0.0:
                 continue
-            shape = car.footprint
+            shape = footprint(car)
             if overlap(wider, shape._replace(x=shape.x + car.speed * ahead_s)):
                 return True
         return False

@@ -22,7 +22,7 @@ from bridge.report import DISCARDED, RESTARTED, STOPPED, failed
 from edge_runtime.cli import add_public_key, examples, positive, quit_on_signals
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
-from trainer.environments import Adapted, layout_of, make_environment, scenario_of
+from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.human.guide import Action, Driver, Observation
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
@@ -184,7 +184,7 @@ class Sitting:
         self._frames: Observation | None = None
         """What the policy sees; None before the first episode, when there is nothing to show."""
         self._policy_action: Amount | None = None
-        self._layout = layout_of(env)
+        self._layout = env.layout
         self._rest = amount(env.rest_action)
         self._info: dict[str, Any] = {}
         self._forget(0)

@@ -13,8 +13,9 @@ from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
+from trainer.learner.replay import FRAMES_LAYOUT
 from trainer.scenarios.picture import BODY, COLUMNS, ROWS, Rasteriser, Rectangle, draw_scene
-from trainer.scenarios.traffic import TrafficVehicle
+from trainer.scenarios.traffic import TrafficVehicle, footprint
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
@@ -53,13 +54,8 @@ class EgoVehicle(Vehicle):
     MAX_STEERING_RAD = math.pi / 4
     speed: float
     heading: float
-
-    def __init__(
-        self, road: Road, position: tuple[float, float], heading: float, speed: float
-    ) -> None:
-        super().__init__(road, position, heading, speed)
-        self.longitudinal_acceleration_mps2 = 0.0
-        self.lateral_acceleration_mps2 = 0.0
+    longitudinal_acceleration_mps2 = 0.0
+    lateral_acceleration_mps2 = 0.0
 
     def drive(
         self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float, dt_s: float
@@ -83,12 +79,6 @@ class EgoVehicle(Vehicle):
     def on_state_update(self) -> None:
         """No lane look-up: the planned path says where the car is."""
 
-    @property
-    def footprint(self) -> Rectangle:
-        """The car's rectangle on the ground."""
-        x, y = self.position.tolist()
-        return Rectangle(x, y, self.heading, self.LENGTH, self.WIDTH)
-
 
 class DrivingEnv(gymnasium.Env[Observation, Action]):
     """A scenario as a gymnasium environment.
@@ -104,6 +94,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
     scenario: str
     observation_name = "frames"
+    layout = FRAMES_LAYOUT
     observation_meanings: ClassVar = {"frames": "grey pictures from above, [t-1, t]"}
     action_names: tuple[str, ...]
     action_meanings: tuple[str, ...]
@@ -207,7 +198,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         return self.frames.copy(), self._reward(outcome), terminated, outcome == "timeout", info
 
     def _footprints(self) -> tuple[Rectangle, list[Rectangle]]:
-        return self.ego.footprint, [car.footprint for car in self.traffic]
+        return footprint(self.ego), [footprint(car) for car in self.traffic]
 
     def _ending_reward(self, outcome: str | None) -> float:
         """Goal and failure: the first two terms of eq. 31 and 32."""
@@ -219,7 +210,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """The scene's vehicles, the ego car first."""
         cars: list[EgoVehicle | TrafficVehicle] = [self.ego, *self.traffic]
         return [
-            dict(zip(BODY, car.footprint, strict=True))
+            dict(zip(BODY, footprint(car), strict=True))
             | {"id": number, "speed_mps": float(car.speed), "ego": number == 0}
             for number, car in enumerate(cars)
         ]

@@ -162,11 +162,11 @@ class TrafficVehicle(IDMVehicle):
         self.position[0] += self.speed * dt
         self.speed += acceleration * dt
 
-    @property
-    def footprint(self) -> Rectangle:
-        """The car's rectangle on the ground."""
-        x, y = self.position.tolist()
-        return Rectangle(x, y, float(self.heading), self.LENGTH, self.WIDTH)
+
+def footprint(car: Vehicle) -> Rectangle:
+    """The car's rectangle on the ground."""
+    x, y = car.position.tolist()
+    return Rectangle(x, y, float(car.heading), car.LENGTH, car.WIDTH)
 
 
 def straight_lanes(

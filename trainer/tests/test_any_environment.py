@@ -14,7 +14,7 @@ from gymnasium.spaces import Box, Dict
 
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from trainer import evaluate, export, train
+from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
 from trainer.environments import (
@@ -135,6 +135,17 @@ def test_what_no_network_could_learn_from_is_the_environments_fault(changed, wor
     monkeypatch.setattr(env.unwrapped, "step", lambda action: (*changed, False, False, {}))
     with pytest.raises(UserError, match=words):
         env.step(np.zeros(1, np.float32))
+
+
+def test_an_environment_without_a_limit_is_given_one(monkeypatch, capsys):
+    monkeypatch.setattr(environments, "MOST_STEPS", 5)
+    gymnasium.register("test/Endless-v0", f"{__name__}:Rover")
+    env = make_environment("test/Endless-v0")
+    for _ in range(2):
+        env.reset(seed=0)
+        ended = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(5)]
+        assert ended == [(False, False)] * 4 + [(False, True)]
+    assert "no limit of its own" in capsys.readouterr().err
 
 
 class Shared(Rover):

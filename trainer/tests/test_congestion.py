@@ -9,7 +9,7 @@ from trainer.environments import make_environment
 from trainer.human.congestion import CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
-from trainer.scenarios.traffic import CAR
+from trainer.scenarios.traffic import CAR, footprint
 from trainer.tests.humans import drive, episode
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
@@ -99,7 +99,7 @@ def test_touching_a_car_or_leaving_the_road_fails_and_time_runs_out(
     env = CongestionEnv(replace(CENTRED, **changes))
     rewards, info = drive(env, np.array([steering], np.float32))
     assert (info["outcome"], rewards[-1]) == (outcome, reward)
-    sides_m = corners(env.ego.footprint)[:, 1]
+    sides_m = corners(footprint(env.ego))[:, 1]
     assert (sides_m.min() < -5.25) == (outcome == "off_road")
     assert (env.ego.position[1] > 0.5) == (outcome == "collision")
 

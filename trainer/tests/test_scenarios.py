@@ -22,7 +22,7 @@ from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.scenarios.picture import overlap
-from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED, draw_types, idm_acceleration
+from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED, draw_types, footprint, idm_acceleration
 from trainer.tests.humans import episode
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
@@ -133,7 +133,7 @@ def test_cars_start_apart_and_never_touch_each_other(scenario, condition):
         env.reset(seed=seed)
         assert min(gaps_m(env, of_the_ego_lane=True)) > (3.0 if condition != "dense" else 0.0)
         for _ in episode(env, expert):
-            shapes = [car.footprint for car in env.traffic]
+            shapes = [footprint(car) for car in env.traffic]
             assert not any(overlap(a, b) for a, b in itertools.combinations(shapes, 2))
             assert all(0.0 <= car.speed <= fastest_mps for car in env.traffic)
 

@@ -316,16 +316,17 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
     run: Any = TrainingRun(config, tmp_path)
     with torch.no_grad():
         run.learning.learner.actor.head.output.bias.add_(0.5)  # now the two differ
-    asked, act = [], run.learning.act_together
+    judged, drive = [], run.validation.drive
 
-    def spy(frames, judged):
-        asked.append(judged)
-        return act(frames, judged)
+    def spy(driver):
+        judged.append(driver.act_together.args[0].__self__)
+        return drive(driver)
 
-    run.learning.act_together = spy
+    run.validation.drive = spy
     run.train()
-    assert set(asked) == {averaged}
-    wanted = getattr(run.learning.learner, name).state_dict()
+    network = getattr(run.learning.learner, name)
+    assert judged == [network]
+    wanted = network.state_dict()
     assert same_actors(wanted, load_actor(tmp_path)[0].state_dict())
     (tmp_path / BEST_FILE).unlink()  # then the checkpoint's
     assert same_actors(wanted, load_actor(tmp_path)[0].state_dict())

@@ -25,7 +25,6 @@ from bridge.network import LatencySpec, Link
 from bridge.virtual_link import COMMAND_WINDOW, ROUNDING_S, VirtualLink
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, Command
-from trainer.environments import layout_of
 from trainer.human.guide import Action, Observation
 from trainer.learner.replay import Layout
 
@@ -47,7 +46,7 @@ class DelayAware:
         self.ticks = ticks_late(spec, env.control_period_s, JITTER_WAITED_FOR)
         if not self.ticks:
             raise UserError(f"behind {spec} no command is a tick late: delay_known adds nothing")
-        own, layout = env.observation_space, layout_of(env)
+        own, layout = env.observation_space, env.layout
         numbers = Box(-1.0, 1.0, (self.ticks * env.action_space.shape[0],), np.float32)
         entries = own.spaces if isinstance(own, Dict) else {PLAIN: own}
         self.space = Dict([*entries.items(), (UNDER_WAY, numbers)])

@@ -92,12 +92,6 @@ class LearningThread:
         """How much the critics differ about an action; not while updating."""
         return self.in_thread(self.learner.doubt, observation, action)
 
-    def act_together(self, observations: Observation, averaged: bool) -> Action:
-        """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-        learner = self.learner
-        actor = learner.target_actor if averaged else learner.actor
-        return self.in_thread(actor.act, observations)
-
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""
         return self._thread.submit(work, *arguments).result()

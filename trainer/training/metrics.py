@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -262,10 +263,8 @@ class Validation(Trials):
         One that was not ``due``, since the run stops early, may be kept as the best so far, but a
         resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
         """
-        driver = TogetherDriver(
-            lambda seen: self.learning.act_together(seen, self.config.averaged_actor), self.aware
-        )
         actor = getattr(self.learning.learner, self.config.kept_actor)
+        driver = TogetherDriver(partial(self.learning.in_thread, actor.act), self.aware)
         self.take(self.drive(driver), actor, metrics, episode, due)
 
     def take(

@@ -16,7 +16,7 @@ from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
 from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
-from trainer.environments import check_foresight, expert_of, foresee, layout_of, make_environment
+from trainer.environments import check_foresight, expert_of, foresee, make_environment
 from trainer.human.guide import (
     ASKED,
     STUCK,
@@ -94,7 +94,7 @@ class TrainingRun:
         action_size = self.env.action_space.shape[0]
         self.network = parse_spec(config.latency)
         aware = DelayAware(self.env, self.network) if config.delay_known else None
-        seen = self.env.observation_space, layout_of(self.env)
+        seen = self.env.observation_space, self.env.layout
         if aware:
             seen = aware.space, aware.layout
         switches = config.learner, self.algorithm
