@@ -216,37 +216,6 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
         return seen, info
 
 
-class PolicyAnswers:
-    """A policy inside the edge runtime's decision logic, to which no state comes late.
-
-    Its commands carry plans of ``plan_periods`` (ride-through).
-    """
-
-    def __init__(self, policy: Policy, plan_periods: int = 0) -> None:
-        self._policy, self._now_s = policy, 0.0
-        self._period_s = policy.manifest.control_period_s
-        limits = shared_limits(policy.manifest.action, {})
-        self._controller = controller_of(policy, limits, plan_periods, needs_rearm=False)
-
-    def answer(self, state: State, known: Command | None = None) -> Command | None:
-        """The command for a state.
-
-        ``known`` is what was answered before the fork: limits and stops go on from there.
-        """
-        self._now_s += self._period_s
-        self._controller.begin(Received(state, self._now_s, state.sent_ns), self._now_s)
-        if known is not None and known.mode == DRIVE:
-            output: np.ndarray | None = np.array(known.action, np.float32)
-        else:
-            output, _ = infer(self._policy, self._policy.layout.arrays(state.observation))
-        order = self._controller.finish(output, 0, self._now_s)
-        return order and Command(
-            session=state.session, episode=state.episode, step=state.step, mode=order.mode,
-            action=order.action, policy_id=self._policy.policy_id, received_ns=state.sent_ns,
-            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason, plan=order.plan,
-        )  # fmt: skip
-
-
 class ForkedDrive(LockStepClock):
     """A recorded drive once more: as it was until step ``fork``, and then on.
 
@@ -272,7 +241,7 @@ class ForkedDrive(LockStepClock):
     ) -> None:
         self._drive, self._environment, self._fork, self._out = drive, environment, fork, out
         self._recorded, self._task, self._step = parse_spec(drive.origin.latency), drive.task, 0
-        self.network, self._answers = network or self._recorded, None
+        self.network, self._policy, self._now_s = network or self._recorded, policy, 0.0
         self.first_difference: int | None = None
         """The first step in which anything was, or was done, otherwise than recorded."""
         if policy is not None:
@@ -280,8 +249,9 @@ class ForkedDrive(LockStepClock):
                 theirs, ours = policy.manifest.text, drive.task.text
                 raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {ours!r}")
             self._task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
-            plans = (len(command.plan or ()) for command in drive.commands.values())
-            self._answers = PolicyAnswers(policy, max(plans, default=0))
+            plans = max((len(command.plan or ()) for command in drive.commands.values()), default=0)
+            limits = shared_limits(policy.manifest.action, {})
+            self._controller = controller_of(policy, limits, plans, needs_rearm=False)
         check = CommandCheck("", self._task)
         super().__init__(lambda payload: None, check, self._recorded, self._task)
 
@@ -336,8 +306,8 @@ class ForkedDrive(LockStepClock):
         sent_ns = self._at_ns(arrival.arrived_s)
         state = msgspec.structs.replace(arrival.message, sent_ns=sent_ns)
         command, given = self._drive.commands.get(arrival.step), self._step < self._fork
-        if self._answers is not None:
-            answer = self._answers.answer(state, command if given else None)
+        if self._policy is not None:
+            answer = self._answer(self._policy, state, command if given else None)
             command = command if given else answer
         elif not given and self.first_difference is not None:
             step = f"from step {self.first_difference} on it is another drive"
@@ -349,6 +319,24 @@ class ForkedDrive(LockStepClock):
             told = msgspec.structs.replace(command, **place, **stamps)
             self._write("command", told, arrival.arrived_s)
             self._link.answer(arrival, command)
+
+    def _answer(self, policy: Policy, state: State, known: Command | None) -> Command | None:
+        """The policy's command, in the edge runtime's decision logic, to which no state comes late.
+
+        ``known`` is what was answered before the fork: limits and stops go on from there.
+        """
+        self._now_s += policy.manifest.control_period_s
+        self._controller.begin(Received(state, self._now_s, state.sent_ns), self._now_s)
+        if known is not None and known.mode == DRIVE:
+            output: np.ndarray | None = np.array(known.action, np.float32)
+        else:
+            output, _ = infer(policy, policy.layout.arrays(state.observation))
+        order = self._controller.finish(output, 0, self._now_s)
+        return order and Command(
+            session=state.session, episode=state.episode, step=state.step, mode=order.mode,
+            action=order.action, policy_id=policy.policy_id, received_ns=state.sent_ns,
+            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason, plan=order.plan,
+        )  # fmt: skip
 
     def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:

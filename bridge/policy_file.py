@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -67,8 +68,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if key:
         read_signing_key(key)
     envelope = arguments.envelope and read_json(arguments.envelope, "envelope")
-    environment = make_environment(arguments.env)
-    try:
+    with closing(make_environment(arguments.env)) as environment:
         task = changed(describe(environment, arguments.period), arguments.changes)
         _ask_for_stops(environment, task, arguments.changes)
         model = read_bytes(arguments.model, "model", MAX_POLICY_MIB)
@@ -79,8 +79,6 @@ def _run(arguments: argparse.Namespace) -> int:
             low, high = _drive(policy, environment)
         except UserError as error:
             raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
-    finally:
-        environment.close()
     write_policy(data, out, key)
     signed = "signed" if key else "not signed"
     print(f"{out}: {len(data) / 1e6:.1f} MB, {signed}, policy_id {policy.policy_id}")
@@ -112,11 +110,6 @@ def add_envelope(parser: argparse.ArgumentParser) -> None:
 def network_of(model: onnx.ModelProto) -> str:
     """SHA-256 of the graph with its weights, in hex: the same whatever manifest is beside it."""
     return hashlib.sha256(model.graph.SerializeToString(deterministic=True)).hexdigest()
-
-
-def network_of_file(path: str) -> str:
-    """The same of a file."""
-    return network_of(onnx.load(path))
 
 
 def make_policy(

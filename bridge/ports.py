@@ -243,31 +243,24 @@ def open_listener(
     if vehicle_id != ANY_VEHICLE:
         check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s
-    with contextlib.closing(connect_client(connect, wait_s, tls)) as session:
-        listener = WireListener()
-        declared = [
+    with contextlib.ExitStack() as stack:
+        session = stack.enter_context(contextlib.closing(connect_client(connect, wait_s, tls)))
+        listener, keys = WireListener(), f"phil/{vehicle_id}"
+        for topic in DECODERS:
             # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
-            session.declare_subscriber(
-                f"phil/{vehicle_id}/{topic}",
-                zenoh.handlers.Callback(listener.hear, indirect=False),
-            )
-            for topic in DECODERS
-        ]
+            hear = zenoh.handlers.Callback(listener.hear, indirect=False)
+            stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
         for topic in TOKEN_TOPICS:
-            token, watch = f"phil/{vehicle_id}/{topic}", listener.watch
-            declared.append(session.liveliness().declare_subscriber(token, watch, history=True))
-        try:
-            # A listener to a vehicle that is not there would never see it go, nor end.
-            if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-                if vehicle_id == ANY_VEHICLE:
-                    which, hint = "", "start one: python -m bridge simulate"
-                else:
-                    which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
-                raise UserError(f"no simulator{which} at {connect}; {hint}")
-            yield listener
-        finally:
-            for subscriber in declared:
-                subscriber.undeclare()
+            declare, watch = session.liveliness().declare_subscriber, listener.watch
+            stack.enter_context(declare(f"{keys}/{topic}", watch, history=True))
+        # A listener to a vehicle that is not there would never see it go, nor end.
+        if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
+            if vehicle_id == ANY_VEHICLE:
+                which, hint = "", "start one: python -m bridge simulate"
+            else:
+                which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
+            raise UserError(f"no simulator{which} at {connect}; {hint}")
+        yield listener
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
@@ -280,12 +273,6 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
             if time.monotonic() >= give_up_s:
                 raise
             time.sleep(RETRY_S)
-
-
-def writable(path: str) -> str:
-    """The path itself; UserError where no report could be written there later."""
-    check_writable(path)
-    return path
 
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
@@ -305,7 +292,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": f"{_WAIT} an edge runtime, in seconds"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
     "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "of delays and losses"},
-    "--out": {"metavar": "R.json", "type": writable, "help": "write the report to this file"},
+    "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
 }
 """The options that several commands have; their types raise UserError for a bad value."""
 

@@ -80,12 +80,9 @@ def run(arguments: Namespace) -> int:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     arguments.standing |= arguments.loop == VEHICLE
     arguments.tls = tls_for(arguments.tls, arguments.connect or arguments.listen)
-    environment = make_environment(arguments.env, arguments.condition)
-    try:
-        with sigterm_as_interrupt():
-            report = _serve(arguments, environment)
-    finally:
-        environment.close()
+    made = contextlib.closing(make_environment(arguments.env, arguments.condition))
+    with made as environment, sigterm_as_interrupt():
+        report = _serve(arguments, environment)
     write_json_out(arguments.out, report)
     print(summary_line(report))
     return 0

@@ -46,19 +46,20 @@ def behind_link(path: PathLike) -> Path:
     return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
 
 
-def check_writable(path: Optional[PathLike]) -> None:
-    """Raise UserError now if `write_json_out(path)` would fail later, after the long work.
+def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
+    """The path; UserError now if `write_json_out(path)` would fail later, after the long work.
 
     It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
     """
     if path is None:
-        return
+        return None
     target = _checked(path)
     directory = next(place for place in target.absolute().parents if os.path.exists(place))
     if not directory.is_dir():
         raise UserError(f"cannot write {target}: {directory} is no directory")
     if not os.access(str(directory), os.W_OK | os.X_OK):
         raise UserError(f"cannot write {target}: the directory {directory} is read-only")
+    return path
 
 
 def make_directory(path: PathLike) -> None:

@@ -154,7 +154,7 @@ class VehicleWatch:
         self._asked: Deque[Tuple[float, Dict[str, float]]] = deque()
         self._reported_s: Optional[float] = None
         self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
-        self._deviates_since_s: Optional[float] = None
+        self._deviates_since_s = math.inf
         self._lies = False
 
     @property
@@ -179,10 +179,8 @@ class VehicleWatch:
         if not self._lies:
             self._believed = (now_s, report.speed_mps)
         self._reported_s = now_s
-        if not self._deviates(report, now_s):
-            self._deviates_since_s = None
-        elif self._deviates_since_s is None:
-            self._deviates_since_s = now_s
+        deviates = self._deviates(report, now_s)
+        self._deviates_since_s = min(self._deviates_since_s, now_s) if deviates else math.inf
 
     def fault(self, now_s: float) -> str:
         """SILENT, LYING, STUCK, or empty where nothing is wrong."""
@@ -190,8 +188,7 @@ class VehicleWatch:
             return SILENT
         if self._lies:
             return LYING
-        since_s = self._deviates_since_s
-        return STUCK if since_s is not None and now_s - since_s > DEVIATES_S else ""
+        return STUCK if now_s - self._deviates_since_s > DEVIATES_S else ""
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
         for name, value in report.action.items():

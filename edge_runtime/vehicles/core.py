@@ -141,7 +141,7 @@ class SpeedWatch:
     def __init__(self, max_speed_mps: float) -> None:
         self._tolerance_mps = DEVIATION * max_speed_mps
         self._asked: Deque[Tuple[float, float]] = deque()
-        self._deviates_since_s: Optional[float] = None
+        self._deviates_since_s = math.inf
 
     def is_stuck(self, asked_mps: float, measured_mps: float, now_s: float) -> bool:
         """Note what is asked and measured now, and judge."""
@@ -152,12 +152,9 @@ class SpeedWatch:
             return False  # it has had no time to follow
         speeds = [speed for _, speed in self._asked]
         low, high = min(speeds) - self._tolerance_mps, max(speeds) + self._tolerance_mps
-        if low <= measured_mps <= high:
-            self._deviates_since_s = None
-        elif self._deviates_since_s is None:
-            self._deviates_since_s = now_s
-        since_s = self._deviates_since_s
-        return since_s is not None and now_s - since_s > DEVIATES_S
+        follows = low <= measured_mps <= high
+        self._deviates_since_s = math.inf if follows else min(self._deviates_since_s, now_s)
+        return now_s - self._deviates_since_s > DEVIATES_S
 
 
 class StreamedCore(abc.ABC):
@@ -182,8 +179,6 @@ class StreamedCore(abc.ABC):
 
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
-        self._wish = None
-        self.set_point.speed_mps = 0.0
         self._speed_watch = SpeedWatch(self._spec.max_speed_mps)  # a new chance to follow
         self._apply(Finding(Event.ENABLE, ""), now_s)
         self._since_s = now_s
@@ -253,12 +248,9 @@ class StreamedCore(abc.ABC):
         after = LEADS_TO[finding.event].get(self.state, self.state)
         if after is self.state:
             return
-        self.cause, self.words = None, ""
-        if after is State.STOPPED:
-            self._wish = None
-            self.set_point.speed_mps = 0.0
-            self.cause, self.words = finding
-        self.state, self._since_s = after, now_s
+        self.state, self._since_s, self._wish = after, now_s, None
+        self.set_point.speed_mps = 0.0  # It drives on into no state.
+        self.cause, self.words = finding if after is State.STOPPED else (None, "")
 
     def _watch(self, now_s: float) -> None:
         """What time alone tells."""

@@ -42,12 +42,7 @@ class MockVehicle(Vehicle):
     name: ClassVar[str] = "mock"
     # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
     # another faster than its time. What the body does with it is the lag's business.
-    limits: Dict[str, ActionLimit] = {  # noqa: RUF012
-        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
-        "steering": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
-    }
-
-    _OF_THE_CAR = ("throttle_mps2", "brake_mps2", "max_speed_mps")
+    limits: Dict[str, ActionLimit] = dict.fromkeys(("pedal", "steering"), ActionLimit(-1.0, 1.0))
 
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
         self._parameters = parameters or MockParameters()
@@ -62,7 +57,7 @@ class MockVehicle(Vehicle):
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
         """As quick as the policy's car, where that is known and the settings say nothing else."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
-        known = {name: car[name] for name in cls._OF_THE_CAR if name in car}
+        known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
         parameters = convert({**known, **settings}, MockParameters, "vehicle.mock")
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):

@@ -156,7 +156,7 @@ class HunterCore(StreamedCore):
         super().__init__(similarity, self.reports)
         self._ask_s = math.inf  # when to ask the chassis for something next
         self._bus_words = ""  # empty while it works
-        self._bus_failed_s: Optional[float] = None  # when the failures began
+        self._bus_failed_s = math.inf  # when the failures began
 
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the chassis confirms it."""
@@ -167,7 +167,6 @@ class HunterCore(StreamedCore):
         """The last frames: stand, park, give control back. None where it was never taken."""
         if self.state is State.DISABLED:
             return []
-        self.set_point.speed_mps = 0.0
         self._apply(Finding(Event.CLOSE, ""), now_s)
         park = [] if self.reports.remote_drives else [_LOCK]
         return [self._motion(), *park, _GIVE_BACK]
@@ -191,15 +190,14 @@ class HunterCore(StreamedCore):
 
     def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:
         """The bus did not take a frame, or gave none; `fatal`: it says that it is off."""
-        if self._bus_failed_s is None:
-            self._bus_failed_s = now_s
+        self._bus_failed_s = min(self._bus_failed_s, now_s)
         if fatal or now_s - self._bus_failed_s > BUS_PATIENCE_S:
             self._bus_words = f"the CAN bus fails: {words}"
             self._apply(Finding(Event.BUS, self._bus_words), now_s)
 
     def bus_works(self) -> None:
         """The bus took a frame, or (while none is sent) gave one."""
-        self._bus_failed_s, self._bus_words = None, ""
+        self._bus_failed_s, self._bus_words = math.inf, ""
 
     def tick(self, now_s: float) -> List[Sent]:
         """The frames to send now; none while DISABLED."""

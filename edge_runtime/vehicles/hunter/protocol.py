@@ -142,11 +142,12 @@ def encode(frame: Frame, message: Any) -> bytes:
     Raises ValueError for a number that is not finite: no count stands for it.
     """
     counts = []
-    for code, worth, value in zip(filter(_RANGES.__contains__, frame.layout), frame.worth, message):
+    for code, worth, value in zip(filter("bBhHi".__contains__, frame.layout), frame.worth, message):
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for the bus")
-        low, high = _RANGES[code]
-        counts.append(round(min(max(value / worth, low), high)))
+        size = 2 ** (8 * struct.calcsize(f">{code}"))
+        low = -size // 2 if code.islower() else 0
+        counts.append(round(min(max(value / worth, low), low + size - 1)))
     return struct.pack(frame.layout, *counts)
 
 
@@ -164,15 +165,6 @@ def decode(can_id: int, data: bytes) -> Any:
         return None
     counts = struct.unpack(frame.layout, data)
     return frame.message(*(count * worth for count, worth in zip(counts, frame.worth)))
-
-
-_RANGES: Dict[str, Tuple[int, int]] = {
-    "b": (-(2**7), 2**7 - 1),
-    "B": (0, 2**8 - 1),
-    "h": (-(2**15), 2**15 - 1),
-    "H": (0, 2**16 - 1),
-    "i": (-(2**31), 2**31 - 1),
-}
 
 
 # While nobody streams, the chassis misses its upper computer: only a fault once we stream.
