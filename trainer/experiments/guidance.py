@@ -148,14 +148,14 @@ def _what_the_rows_are() -> Iterator[str]:
         "",
         "All share one learner; [what each learns from]"
         "(../../trainer/README.md#the-fair-table-of-human-guidance). A row has settings of its own "
-        "where ours would not fit what it learns from. The last column is what three trainings "
-        "each, on a seed that is not in the table, "
-        "[chose](../README.md#what-the-settings-of-the-experiments-were-chosen-by). `trainer train "
-        "--algorithm NAME` has the former; the latter want `--set`.",
+        "where ours would not fit what it learns from, or where three trainings of each row, on a "
+        "seed that is not in the table, [chose others](../README.md#what-the-settings-of-the-"
+        "experiments-were-chosen-by). `trainer train --algorithm NAME` has them. What was chosen "
+        "for a row of the paper's experiments is in this table alone, and wants `--set`.",
         "",
     )
     yield from markdown_table(
-        ("", "`NAME`", "settings of its own", "chosen"),
+        ("", "`NAME`", "settings of its own", "in this table alone"),
         [
             (Line(row).name, f"`{row}`", named(ALGORITHMS[row].settings),
              named(plan.TUNED.get(row, {})))
@@ -180,10 +180,12 @@ def _place(results: Results) -> Iterator[str]:
         "",
     )
     rivals = [row for row in plan.HELPED if row != PHIL]
-    places = product(TASKS, [Line(row, plan.GOOD) for row in rivals])
-    yield from report.table(results, places, place_columns(results))
+    lines = [Line(row, plan.GOOD) for row in rivals]
+    yield from report.table(results, product(TASKS, lines), place_columns(results))
     better = [Line(row).name for row in rivals if takes_its_place(results, row)]
-    yield f"By that rule {', '.join(better) or 'no row'} takes its place."
+    there = [len(results.of(*place)) for place in product(plan.SCENARIOS, lines)]
+    so_far = "" if min(there) == plan.DEFAULT_SEEDS else ", of what is there so far"
+    yield f"By that rule {', '.join(better) or 'no row'} takes its place{so_far}."
     yield ""
 
 
@@ -286,8 +288,12 @@ def draw(results: Results) -> Figure:
                 continue
             given = np.mean([result.given() for result in found], axis=0)
             success = np.mean([r.curve(data.ALONE, data.SUCCESS) for r in found], axis=0)
-            panel.plot(given, success, "-o", ms=3, color=colour(line, place), label=Line(row).name)
+            look = {"color": colour(line, place), "zorder": 3 + (row == PHIL)}
+            panel.plot(given, success, "-o", ms=3, lw=1.3, label=Line(row).name, **look)
         panel.grid(alpha=0.3)
+        # One row may need ten times as much as the others.
+        panel.set_xscale("symlog", linthresh=10.0, subs=range(2, 10))
+        panel.xaxis.set_major_formatter("{x:g}")
         panel.set_xlabel("seconds that the human has driven", fontsize=9)
     shown = [zip(*panel.get_legend_handles_labels(), strict=True) for panel in figure.axes]
     rows = {label: handle for handle, label in chain(*shown)}
