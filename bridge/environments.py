@@ -15,7 +15,6 @@ import json
 import math
 import re
 import traceback
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,9 +75,7 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
         modes = _metadata(environment_id).get("render_modes") or ()
         if RENDERED in modes:
             options["render_mode"] = RENDERED
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*WARN: ")  # Gymnasium's advice to its author
-            return _OneLine(gymnasium.make(environment_id, **options))
+        return _OneLine(_make_quietly(environment_id, **options))
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
         first_line = (str(error).splitlines() or [""])[0]
         what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
@@ -111,6 +108,15 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
             what = f"{type(error).__name__}: {error} ({where})"
             own = self.spec.id if self.spec else type(self.unwrapped).__name__
             raise UserError(f"environment {own} failed in {call.__name__}: {what}") from error
+
+
+def _make_quietly(environment_id: str, **options: Any) -> Environment:
+    """Make it without Gymnasium's advice to its author, which would stand before our one line."""
+    level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR
+    try:
+        return gymnasium.make(environment_id, **options)
+    finally:
+        gymnasium.logger.min_level = level
 
 
 def _metadata(environment_id: str) -> dict[str, Any]:

@@ -61,6 +61,12 @@ def test_what_is_not_finite_is_never_a_count(value):
         protocol.encode_motion(math.nan, 0.0, HUNTER_2)
 
 
+def test_what_a_field_cannot_hold_is_clamped_to_its_ends():
+    data = protocol.encode(protocol.MOTION_COMMAND, protocol.MotionCommand(1e6, -1e6))
+    counts = struct.unpack(protocol.MOTION_COMMAND.layout, data)
+    assert counts == (2**15 - 1, -(2**15))
+
+
 @pytest.mark.parametrize("frame", FRAMES.values(), ids=lambda frame: hex(frame.can_id))
 @given(data=st.data())
 def test_every_count_survives_decoding_and_encoding(frame, data):

@@ -249,7 +249,7 @@ class StreamedCore(abc.ABC):
         if after is self.state:
             return
         self.state, self._since_s, self._wish = after, now_s, None
-        self.set_point.speed_mps = 0.0  # It drives on into no state.
+        self.set_point.speed_mps = 0.0  # Whatever state comes next begins at a stand.
         self.cause, self.words = finding if after is State.STOPPED else (None, "")
 
     def _watch(self, now_s: float) -> None:

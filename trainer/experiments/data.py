@@ -137,10 +137,9 @@ class Line(NamedTuple):
     @property
     def name(self) -> str:
         """The algorithm in words, with its setting where that is not a usual one."""
-        setting = (
-            "" if self.setting in (NORMAL, plan.GOOD, plan.MODEL) else f" ({words(self.setting)})"
-        )
-        return plan.LABELS[self.algorithm] + setting
+        label = plan.LABELS[self.algorithm]
+        usual = self.setting in (NORMAL, plan.GOOD) or self.algorithm == plan.HUMAN_MODEL
+        return label if usual else f"{label} ({words(self.setting)})"
 
 
 class Scene(NamedTuple):

@@ -265,14 +265,14 @@ def table(
     results: Results,
     places: Iterable[tuple[str, Line]],
     columns: Mapping[str, Cell],
-    tested_only: bool = False,
+    with_tested_only: bool = False,
 ) -> Iterator[str]:
-    """A row for each task and line of which there is something; of what is ``tested_only``, too."""
+    """A row for each task and line of which there is something; untrained ones if asked."""
     found = ((*place, results.of(*place)) for place in places)
     rows = [
         (line.name, words(task), *(cell(its) for cell in columns.values()))
         for task, line, its in found
-        if its and (tested_only or its[0].unit.trained)
+        if its and (with_tested_only or its[0].unit.trained)
     ]
     return markdown_table(("", "scenario", *columns), rows)
 
@@ -286,7 +286,7 @@ def until(level: float, what: str) -> Cell:
     def cell(found: Sequence[Result]) -> str:
         costs = [getattr(cost, what) if (cost := one.until(level)) else np.inf for one in found]
         there = int(np.isfinite(costs).sum())
-        unguided = what in HUMANS and not ALGORITHMS[found[0].unit.algorithm].guided
+        unguided = what in HUMAN_COSTS and not ALGORITHMS[found[0].unit.algorithm].guided
         return f"{spread(costs)} ({there})" if there and not unguided else "–"
 
     return cell
@@ -298,8 +298,9 @@ def mean(number: Callable[[Result], float], digits: int = 0) -> Cell:
 
 
 def spread(numbers: Sequence[float]) -> str:
-    """Median, least and most, as in "12 [8, ∞]"; of five, 15 of 16 times the true median lies
-    between the least and the most.
+    """Median (of an even number the lower middle), least and most, as in "12 [8, ∞]".
+
+    Of five, 15 of 16 times the true median lies between the least and the most.
     """
     ends = (f"{number:,.0f}" for number in (median_low(numbers), min(numbers), max(numbers)))
     middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
@@ -308,11 +309,14 @@ def spread(numbers: Sequence[float]) -> str:
 
 LEARNED, WELL = metrics.LEARNED
 """Success of the policy alone at which it counts as learned, and as learned well."""
-HUMANS = ("human_s", "takeovers")  # Costs that are the human's
+HUMAN_COSTS = ("human_s", "takeovers")
+STEPS = f"steps to {LEARNED:.0%}"
+S_TO_LEARNED, S_TO_WELL = (f"human s to {level:.0%}" for level in (LEARNED, WELL))
 COSTS: Mapping[str, Cell] = {
     "seeds": lambda found: f"{len(found)}",
-    f"steps to {LEARNED:.0%}": until(LEARNED, "steps"),
-    **{f"human s to {level:.0%}": until(level, "human_s") for level in (LEARNED, WELL)},
+    STEPS: until(LEARNED, "steps"),
+    S_TO_LEARNED: until(LEARNED, "human_s"),
+    S_TO_WELL: until(WELL, "human_s"),
     "validation lost at the end, points": mean(lambda one: 100 * one.unlearned, 1),
     "by the worst seed": lambda found: f"{100 * max(one.unlearned for one in found):.1f}",
     "human steps": mean(lambda one: one.costs.human_steps),

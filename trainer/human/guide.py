@@ -180,7 +180,7 @@ class HumanGuide:
         if before is None and self.attention:
             trigger = self.attention.notices(trigger)
         if trigger is not None:
-            hold_steps = self.hold_steps // 3 if trigger == ASKED else self.hold_steps
+            hold_steps = max(self.hold_steps // 3, 1) if trigger == ASKED else self.hold_steps
             self._steps_left = max(self._steps_left, hold_steps)
         if self._steps_left == 0 and (before is None or self.trigger.may_return()):
             self._reason = None

@@ -1,4 +1,5 @@
 import re
+from itertools import product
 
 import numpy as np
 import pytest
@@ -7,10 +8,9 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data, report
-from trainer.experiments.guidance import place_columns, takes_its_place, typical_curves
+from trainer.experiments.guidance import best_by_rule, place_columns, typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
-from trainer.tests import experiments
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 from trainer.tests.test_commands import call
 
@@ -95,18 +95,32 @@ class TestData:
         assert (seconds, less) == ("∞ [∞, ∞]", "0 of 3")
         itself = [cell(phil) for cell in place_columns(results).values()]
         assert itself == ["0.0 [0.0, 0.0]", "0 [0, 0]", "0 of 3"]
+        alone = place_columns(results_of(units[3:], SEEDS)).values()
+        assert [cell(hi) for cell in alone] == ["–", "–", "0 of 0"]
 
-    def test_a_row_takes_its_place_that_costs_less_and_is_nowhere_behind(self, monkeypatch):
-        def judged(**skills):
-            monkeypatch.setattr(experiments, "SKILLS", skills)
-            units = [Unit(where, row, "good", seed)
-                     for where in ("left_turn", "congestion") for row in skills
-                     for seed in range(1, 6)]  # fmt: skip
-            return takes_its_place(results_of(units, 5), "hi_td3")
-
-        assert judged(phil_td3=0.95, hi_td3=1.0)
-        assert not judged(phil_td3=1.0, hi_td3=0.95)
-        assert not judged(phil_td3=0.95, hi_td3=0.95)
+    @pytest.mark.parametrize(
+        ("cheaper", "behind", "default"),
+        [(10, 0, "hi_td3"), (9, 0, "hi_td3"), (8, 0, "phil_td3"), (10, 1, "phil_td3")],
+    )
+    def test_a_row_becomes_the_default_that_costs_less_and_is_nowhere_behind(
+        self, cheaper, behind, default
+    ):
+        scenes = "left_turn", "congestion"
+        rows = "phil_td3", "hi_td3"
+        units = [
+            Unit(*each) for row in rows for each in product(scenes, [row], ["good"], range(1, 6))
+        ]
+        results = results_of(units, 5)
+        for place, unit in enumerate(units):
+            record = results.found[unit].record
+            record["validation"]["success"] = [0.0] + [1.0] * 11  # both reach it at once
+            ours = unit.algorithm == "hi_td3"
+            steps = 2 if ours and place - 10 < cheaper else 3  # the human's, in each episode
+            record["training"]["human_steps"] = [steps] * len(record["training"]["human_steps"])
+            for condition in ("nominal", "noise", "variant"):
+                fails = ours and behind and (condition, unit.scenario) == ("variant", "congestion")
+                record["tests"][condition]["outcome"] = ["collision" if fails else "goal"] * 60
+        assert best_by_rule(results, ["hi_td3"]) == default
 
     def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
         assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0

@@ -152,6 +152,7 @@ NO, YES = False, True
          [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
         # Where the robot only asks, for a third of that.
         ([ASKED] + [NONE] * 9, {}, [YES] * 5 + [NO] * 5, [YES] + [NO] * 4),
+        ([ASKED] + [NONE] * 3, {"hold_steps": 2}, [YES] + [NO] * 3, [YES]),
         # A reason that lasts prolongs the same intervention.
         (["stuck", "stuck", CRASH, NONE, NONE], {"hold_steps": 2},
          [YES] * 4 + [NO], [YES, NO, NO, NO]),
@@ -184,6 +185,10 @@ class Alarm:
 def noticed(attention, *periods, count):
     """What a human notices of a reason that is there in these periods."""
     return [attention.notices("collision" if n in periods else None) for n in range(count)]
+
+
+def test_the_wheel_is_held_for_as_long_whatever_a_control_period_lasts():
+    assert [steps_held(period_s) for period_s in (0.05, 0.1, 0.2, 1.0)] == [30, 15, 8, 2]
 
 
 def test_a_late_human_comes_some_steps_after_its_reason_and_an_inattentive_one_not_at_all():

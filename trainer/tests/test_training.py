@@ -316,16 +316,17 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
     run: Any = TrainingRun(config, tmp_path)
     with torch.no_grad():
         run.learning.learner.actor.head.output.bias.add_(0.5)  # now the two differ
-    judged, drive = [], run.validation.drive
+    judged: list[Any] = []
+    drive, pictures = run.validation.drive, np.zeros((1, 2, 45, 80), np.uint8)
 
     def spy(driver):
-        judged.append(driver.act_together.args[0].__self__)
+        judged.append(driver.act_together(pictures))
         return drive(driver)
 
     run.validation.drive = spy
     run.train()
     network = getattr(run.learning.learner, name)
-    assert judged == [network]
+    assert judged == [network.act(pictures)]
     wanted = network.state_dict()
     assert same_actors(wanted, load_actor(tmp_path)[0].state_dict())
     (tmp_path / BEST_FILE).unlink()  # then the checkpoint's

@@ -142,7 +142,8 @@ def encode(frame: Frame, message: Any) -> bytes:
     Raises ValueError for a number that is not finite: no count stands for it.
     """
     counts = []
-    for code, worth, value in zip(filter("bBhHi".__contains__, frame.layout), frame.worth, message):
+    numbers = filter("bBhHi".__contains__, frame.layout)  # The others are space between them.
+    for code, worth, value in zip(numbers, frame.worth, message):
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for the bus")
         size = 2 ** (8 * struct.calcsize(f">{code}"))
