@@ -271,8 +271,10 @@ class Sitting:
 
     def rest(self, outcome: str) -> str:
         """Show how the episode ended, which the person may still discard; how it really ended."""
-        end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.control_period_s
-        while not self.stop and time.monotonic() < end_s:
+        # Counted in periods: on a machine that stands still, too, the person is asked.
+        for _ in range(math.ceil(REST_S / self.env.control_period_s)):
+            if self.stop:
+                break
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
             if self._discard:
                 self._write_last_step()  # At once: no kill shall take that back.
