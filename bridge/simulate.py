@@ -80,8 +80,10 @@ def run(arguments: Namespace) -> int:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     arguments.standing |= arguments.loop == VEHICLE
     arguments.tls = tls_for(arguments.tls, arguments.connect or arguments.listen)
-    made = contextlib.closing(make_environment(arguments.env, arguments.condition))
-    with made as environment, sigterm_as_interrupt():
+    with (
+        contextlib.closing(make_environment(arguments.env, arguments.condition)) as environment,
+        sigterm_as_interrupt(),
+    ):
         report = _serve(arguments, environment)
     write_json_out(arguments.out, report)
     print(summary_line(report))
