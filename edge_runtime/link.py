@@ -168,10 +168,8 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
 
 def taken(vehicle_id: str) -> UserError:
     """The error of a runtime that must give way."""
-    return UserError(
-        f"another edge runtime is connected with vehicle id {vehicle_id};"
-        " end that one first, or name this one with another --vehicle-id"
-    )
+    first = "end that one first, or name this one with another --vehicle-id"
+    return UserError(f"another edge runtime is connected with vehicle id {vehicle_id}; {first}")
 
 
 class Presence:

@@ -46,8 +46,7 @@ def is_tls(endpoint: str) -> bool:
 def check_fits(endpoint: str, with_tls: bool) -> None:
     """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
     if with_tls and not is_tls(endpoint):
-        address = endpoint.split("/", 1)[1]
-        right = f"write tls/{address}"
+        right = f"write tls/{endpoint.split('/', 1)[1]}"
         raise UserError(f"endpoint {endpoint} would send plain text despite --tls: {right}")
     if not with_tls and is_tls(endpoint):
         where = "name a directory of `python -m deploy certs` with --tls"
@@ -122,6 +121,9 @@ def session_rows(
         # It would map 17 MB for messages of 7 KB, and share them with any local process.
         "transport/shared_memory/enabled": False,
     }
+    if mode == "router":
+        # Its most. At its 2 a recorder that gets no processor for a moment loses commands.
+        rows["transport/link/tx/queue/size/real_time"] = 16
     if tls is not None:
         rows["transport/link/tls"] = tls.zenoh_rows()
         # A port that speaks TLS only, whatever an endpoint's metadata may ask for.

@@ -1,11 +1,13 @@
 """Both ends: what each hears."""
 
 import contextlib
+import signal
 import subprocess
 import sys
 import time
 
 import pytest
+import zenoh
 
 from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
 from edge_runtime.reach import free_endpoint
@@ -98,3 +100,37 @@ def test_a_signal_that_another_thread_takes_ends_the_wait():
         finally:
             process.kill()
     assert process.returncode == 0
+
+
+_LISTENER = """
+import sys
+from contextlib import closing
+from edge_runtime.transport import open_session
+with closing(open_session(connect=sys.argv[1], mode="client")) as session:
+    session.declare_subscriber("phil/v1/command", lambda sample: print("command", flush=True))
+    session.declare_subscriber("phil/v1/state", lambda sample: None)
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_listener_without_a_processor_for_a_moment_loses_no_command(sessions):
+    endpoint, router, _ = sessions
+    command, pipe = [sys.executable, "-c", _LISTENER, endpoint], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as listener:
+        try:
+            assert listener.stdout is not None
+            assert listener.stdout.readline() == "ready\n"
+            time.sleep(HEARS_S)
+            listener.send_signal(signal.SIGSTOP)
+            for _ in range(300):  # As many as fill what the kernel keeps for it
+                router.put("phil/v1/state", bytes(60_000))
+            time.sleep(HEARS_S)
+            qos = {"priority": zenoh.Priority.REAL_TIME, "express": True}  # The edge runtime's
+            for _ in range(16):
+                router.put("phil/v1/command", b"own", **qos)
+            listener.send_signal(signal.SIGCONT)
+            time.sleep(HEARS_S)
+            assert listener.communicate(timeout=20)[0] == "command\n" * 16
+        finally:
+            listener.kill()
