@@ -12,6 +12,7 @@ import math
 import os
 import signal
 import sys
+import time
 from importlib import import_module
 from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
 
@@ -21,6 +22,7 @@ from edge_runtime.util import UserError, ending_signals, printable, take_signals
 BAD_INPUT = 2
 INTERRUPTED = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 0.3  # So soon after another it is the same signal: `timeout` tells process and group
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -219,8 +221,12 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
     So sessions are closed and files are finished. Outside of the main thread it does nothing.
     """
+
+    def interrupt(number: int, frame: Any) -> NoReturn:
+        raise KeyboardInterrupt
+
     with contextlib.ExitStack() as undo:
-        take_signals(ending_signals(), _interrupt, undo)
+        take_signals(ending_signals(), _once(interrupt), undo)
         yield
 
 
@@ -231,16 +237,27 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     A second one ends the process, and so does the first where ``ask`` returns False: then nothing
     is left that could end in order. Outside of the main thread it does nothing.
     """
+    asked: List[int] = []
 
     def stop(number: int, frame: Any) -> None:
-        undo.close()
-        if not ask():
+        asked.append(number)
+        if len(asked) > 1 or not ask():
+            undo.close()
             os.kill(os.getpid(), number)
 
     with contextlib.ExitStack() as undo:
-        take_signals(SIGNALS, stop, undo)
+        take_signals(SIGNALS, _once(stop), undo)
         yield
 
 
-def _interrupt(number: int, frame: Any) -> NoReturn:
-    raise KeyboardInterrupt
+def _once(handler: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
+    """The handler, but not for what comes within ``AGAIN_S`` of the signal that it had."""
+    had_s = -math.inf
+
+    def handle(number: int, frame: Any) -> None:
+        nonlocal had_s
+        if (now_s := time.monotonic()) - had_s > AGAIN_S:
+            had_s = now_s
+            handler(number, frame)
+
+    return handle

@@ -191,12 +191,13 @@ def all_at_default():
         signal.signal(number, handler)
 
 
-def test_all_that_end_a_process_are_interrupts(all_at_default):
+def test_all_that_end_a_process_are_interrupts(all_at_default, monkeypatch):
     ending = util.ending_signals()
     assert {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM} <= ending
     assert {signal.SIGUSR1, signal.SIGALRM, signal.SIGABRT, signal.SIGPIPE} <= ending
     assert signal.SIGRTMIN in ending
     assert not {signal.SIGCHLD, signal.SIGCONT, signal.SIGTSTP, signal.SIGSEGV} & ending
+    monkeypatch.setattr(cli, "AGAIN_S", -1.0)
     with sigterm_as_interrupt():
         for number in ending:
             with pytest.raises(KeyboardInterrupt):
@@ -207,7 +208,9 @@ def test_all_that_end_a_process_are_interrupts(all_at_default):
 
 @pytest.mark.parametrize("number", cli.SIGNALS)
 @pytest.mark.parametrize("heeded", [True, False])
-def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
+def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(
+    number, heeded, monkeypatch
+):
     before, asked = [signal.getsignal(each) for each in cli.SIGNALS], []
 
     def ask():
@@ -218,7 +221,9 @@ def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number,
         assert [signal.getsignal(each) for each in cli.SIGNALS] != before
         if heeded:
             signal.raise_signal(number)
+            signal.raise_signal(number)  # So soon it is the same: `timeout` tells twice.
             assert asked == [number]
+        monkeypatch.setattr(cli, "AGAIN_S", -1.0)
         if number == signal.SIGINT:
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(number)
