@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import torch
 
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.learner.td3 import Losses
@@ -104,6 +105,13 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
     assert thread.is_alive()
     learning.close()
     assert not thread.is_alive()
+
+
+def test_what_is_too_small_to_count_does_not_slow_the_updates_down(learning):
+    def halved():
+        return (torch.tensor(torch.finfo(torch.float32).tiny) / 2).item()
+
+    assert learning.in_thread(halved) == 0.0 < halved()
 
 
 def test_validation_acts_in_the_learners_thread(tmp_path):
