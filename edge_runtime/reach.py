@@ -10,7 +10,7 @@ import contextlib
 import errno
 import socket
 import ssl
-from typing import TYPE_CHECKING, Any, Optional, Tuple
+from typing import TYPE_CHECKING, Any, List, Optional, Tuple
 
 from edge_runtime.util import UserError
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _LOOK_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
 _ALERT_S = 0.3
+_KEPT: List[socket.socket] = []
 
 
 def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
@@ -114,10 +115,19 @@ def check_port_is_free(endpoint: str) -> None:
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
-    with socket.socket(type=_kind(protocol)) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests.
+
+    Until this process ends, no other one that asks the system for a TCP port is given the same.
+    """
+    probe = socket.socket(type=_kind(protocol))
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
+    probe.bind(("127.0.0.1", 0))
+    port = probe.getsockname()[1]
+    if probe.type == socket.SOCK_STREAM:
+        _KEPT.append(probe)
+    else:
+        probe.close()
+    return f"{protocol}/127.0.0.1:{port}"
 
 
 def _kind(protocol: str) -> int:

@@ -1,5 +1,7 @@
 """The edge's end of the wire without a network: a session that only notes what is asked of it."""
 
+import contextlib
+import socket
 import socketserver
 import threading
 import time
@@ -14,7 +16,7 @@ import zenoh
 from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.reach import look
+from edge_runtime.reach import free_endpoint, look
 from edge_runtime.run import say_what_is_missing
 from edge_runtime.tests.harness import HEALTH, wait_until
 from edge_runtime.transport import open_session
@@ -195,3 +197,11 @@ def test_one_that_is_linked_has_time_for_its_first_state(said):
     say_what_is_missing(lambda: False, lambda: "why", over, time.monotonic() + 5.0)
     over.wait.assert_called_once_with(pytest.approx(5.0, abs=0.5))
     assert said == []
+
+
+def test_a_free_endpoint_is_given_to_one_process_only():
+    endpoint = free_endpoint()
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
+    with contextlib.closing(open_session(listen=endpoint, mode="router")):
+        assert look(endpoint, None)[0]
