@@ -21,6 +21,7 @@ _LOOK_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
 _ALERT_S = 0.3
 _KEPT: List[socket.socket] = []
+_MOST_KEPT = 100
 
 
 def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
@@ -117,14 +118,17 @@ def check_port_is_free(endpoint: str) -> None:
 def free_endpoint(protocol: str = "tcp") -> str:
     """A Zenoh endpoint on loopback that nobody listens on, for demos and tests.
 
-    Until this process ends, no other one that asks the system for a TCP port is given the same.
+    While this process lives, or has asked for a hundred more, no other one that asks the system for
+    a TCP port is given the same.
     """
     probe = socket.socket(type=_kind(protocol))
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
     probe.bind(("127.0.0.1", 0))
     port = probe.getsockname()[1]
     if probe.type == socket.SOCK_STREAM:
-        _KEPT.append(probe)
+        _KEPT.append(probe)  # Not for ever: a long campaign would run out of open files.
+        if len(_KEPT) > _MOST_KEPT:
+            _KEPT.pop(0).close()
     else:
         probe.close()
     return f"{protocol}/127.0.0.1:{port}"

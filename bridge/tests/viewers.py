@@ -8,6 +8,8 @@ from pathlib import Path
 
 import rerun
 
+from bridge.rerun import free_port
+
 PROGRAM = Path(rerun.__file__).parents[1] / "rerun_cli" / "rerun"
 NO_GPU = "app creation error: The GPU/graphics driver is lacking some abilities"
 KINDS = {
@@ -33,11 +35,8 @@ def in_place(kind, folder, monkeypatch):
     monkeypatch.setattr("bridge.rerun.FLUSH_S", 1.0)
     if kind == "never listens":
         monkeypatch.setattr("bridge.rerun.START_S", 1.0)
-    with contextlib.ExitStack() as probes:
-        for name in ("GRPC_PORT", "WEB_PORT"):
-            probe = probes.enter_context(socket.socket())
-            probe.bind(("127.0.0.1", 0))
-            monkeypatch.setattr(f"bridge.rerun.{name}", probe.getsockname()[1])
+    for name in ("GRPC_PORT", "WEB_PORT"):
+        monkeypatch.setattr(f"bridge.rerun.{name}", free_port())
     yield
     for pid in pids.read_text().split():
         with contextlib.suppress(ProcessLookupError):  # Windows stay open.

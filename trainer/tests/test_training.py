@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import trainer
 from bridge.report import COLLISION
-from edge_runtime.cli import INTERRUPTED, run_cli
+from edge_runtime.cli import AGAIN_S, INTERRUPTED, run_cli
 from edge_runtime.util import UserError
 from trainer import drivers
 from trainer.__main__ import main
@@ -221,7 +221,7 @@ def test_a_watched_run_that_is_told_twice_ends_at_once_with_its_recording(tmp_pa
     process = begin(tmp_path / "run", "--rerun", str(shown), episodes=1)
     for _ in range(2):
         process.send_signal(signal.SIGTERM)
-        time.sleep(0.3)  # a signal that waits to be looked at is no second one
+        time.sleep(2 * AGAIN_S)
     process.communicate(timeout=60)
     # Where the first one met an episode's end, all is closed already when the second one comes.
     assert process.returncode in (INTERRUPTED, -signal.SIGTERM)
