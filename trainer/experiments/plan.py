@@ -226,10 +226,10 @@ QUICK = Plan(
 )
 """A look at everything in a minute or two; its numbers mean nothing."""
 GUIDANCE_PLAN = Plan(
-    steps={**dict.fromkeys(SCENARIOS, 4_000), "hill": 4_000, "racetrack": 3_000},
+    steps={**dict.fromkeys(SCENARIOS, 4_000), "hill": 4_000, "racetrack": 12_000},
     evaluate_every_steps=250,
     test_runs=100,
-    slow={"racetrack": {"evaluate_every_steps": 500, "evaluation_runs": 10, "test_runs": 20}},
+    slow={"racetrack": {"evaluate_every_steps": 1_000, "evaluation_runs": 20, "test_runs": 50}},
 )
 QUICK_GUIDANCE = replace(QUICK, steps=dict.fromkeys((*SCENARIOS, *FOREIGN), 250))
 UNLIMITED_EPISODES = 10**6  # So many that steps decide
