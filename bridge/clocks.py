@@ -13,7 +13,9 @@ latest T / 4 after the tick on the newest command that has arrived. With a vehic
 
 from __future__ import annotations
 
+import contextlib
 import queue
+import sched
 import threading
 import time
 from collections import Counter
@@ -24,7 +26,7 @@ from typing import Any
 import msgspec
 
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.network import Direction, EventHeap, LatencySpec, make_link
+from bridge.network import Direction, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
     COMMAND_WINDOW,
@@ -295,6 +297,7 @@ class VehicleClock(RealTimeClock):
         self._action_names = [row.name for row in task.action]
         self.feedback_check = FeedbackCheck(check, task)
         super().__init__(publish, check, spec, task)
+        self.tracking.end()  # No episode has begun.
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode now; the vehicle stands, or is counted as moving."""
@@ -378,9 +381,6 @@ class VehicleClock(RealTimeClock):
         return False
 
 
-Action = Callable[[], None]
-
-
 class DelayLine:
     """Runs actions at their time on the monotonic clock, on a thread of its own.
 
@@ -389,54 +389,43 @@ class DelayLine:
     """
 
     def __init__(self) -> None:
-        self._heap: EventHeap[Action] = EventHeap()
-        self._changed = threading.Condition()
+        self._actions = sched.scheduler(time.monotonic)  # Those of the same time keep their order
+        self._changed = threading.Event()
         self._closed = False
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="delay-line", daemon=True)
         self._thread.start()
 
-    def push(self, release_s: float, action: Action) -> None:
+    def push(self, release_s: float, action: Callable[[], None]) -> None:
         """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
-        with self._changed:
-            self._raise_failure()
-            self._heap.push(release_s, action)
-            self._changed.notify()
+        self._raise_failure()
+        self._actions.enterabs(release_s, 0, action)
+        self._changed.set()
 
     def clear(self) -> None:
         """Forget what is still under way."""
-        with self._changed:
-            self._heap.clear()
+        for event in self._actions.queue:
+            with contextlib.suppress(ValueError):  # It has just left the queue.
+                self._actions.cancel(event)
 
     def close(self) -> None:
         """Stop the thread and wait for it."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+        self._closed = True
+        self._changed.set()
         self._thread.join()
         self._raise_failure()
 
     def _run(self) -> None:
         try:
-            while (action := self._next_action()) is not None:
-                action()
+            while not self._closed:
+                self._changed.wait(self._actions.run(blocking=False))
+                self._changed.clear()
         except Exception as error:  # Handed to whoever uses the line.
             self._failure = error
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-    def _next_action(self) -> Action | None:
-        """Sleep until an action is due and return it; None once the line is closed."""
-        with self._changed:
-            while not self._closed:
-                due = self._heap.pop_due(time.monotonic())
-                if due is not None:
-                    return due[1]
-                next_s = self._heap.next_arrival_s()
-                self._changed.wait(None if next_s is None else next_s - time.monotonic())
-        return None
 
 
 Clock = LockStepClock | RealTimeClock

@@ -36,7 +36,10 @@ Point = list[float]
 
 
 class SeenCar(msgspec.Struct, frozen=True):
-    """One car as it is drawn; ``x``, ``y`` (m) are its centre and y grows downwards."""
+    """One car; ``x``, ``y`` (m) are its centre and y grows downwards.
+
+    ``id`` and ``speed_mps`` are not drawn: a viewer's copy of the scene shows them.
+    """
 
     x: float
     y: float
@@ -44,6 +47,8 @@ class SeenCar(msgspec.Struct, frozen=True):
     length_m: float
     width_m: float
     ego: bool = False
+    id: int = 0
+    speed_mps: float = 0.0
 
 
 class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,13 +60,6 @@ class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
     path: Sequence[Point] = ()
     goal: Point | None = None
     vehicles: Sequence[SeenCar] = ()
-
-
-class SceneVehicle(SeenCar, frozen=True, kw_only=True):
-    """One car on the wire."""
-
-    id: int
-    speed_mps: float
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,7 +87,6 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     its place in an earlier command's plan; 0: it is of none.
     """
 
-    vehicles: Sequence[SceneVehicle] = ()
     episode: int
     step: int
     sim_time_s: float

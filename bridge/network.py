@@ -422,11 +422,3 @@ class EventHeap(Generic[Message]):
             return None
         arrival_s, _, message = heapq.heappop(self._entries)
         return arrival_s, message
-
-    def next_arrival_s(self) -> float | None:
-        """Return when the earliest message arrives; None if nothing is under way."""
-        return self._entries[0][0] if self._entries else None
-
-    def clear(self) -> None:
-        """Forget everything under way (an episode has ended)."""
-        self._entries.clear()

@@ -267,6 +267,14 @@ def test_each_tick_ends_with_what_the_vehicle_did_in_it():
     assert rig.check.rejected == {}
 
 
+def test_what_a_vehicle_says_before_the_first_episode_is_in_no_report():
+    with contextlib.closing(VehicleRig()) as rig:
+        rig.report(0, session="", faults=["emergency stop pressed"])
+        rig.clock.wait_for_vehicle(5.0, "v")
+        report = rig.clock.report()
+    assert (report["faults"], report["samples"]) == ({}, 0)
+
+
 def test_a_vehicle_that_falls_silent_is_braked_for():
     # At once: on a busy machine a timer comes late, which would be silence, too.
     with contextlib.closing(VehicleRig(dead_s=0.0)) as rig:

@@ -296,7 +296,3 @@ def test_what_is_due_comes_out_in_order_of_time_then_of_arrival(arrivals, now_s)
         heap.push(arrival_s, number)
     expected = sorted((arrival_s, n) for n, arrival_s in enumerate(arrivals) if arrival_s <= now_s)
     assert list(iter(lambda: heap.pop_due(now_s), None)) == expected
-    rest = [arrival_s for arrival_s in arrivals if arrival_s > now_s]
-    assert heap.next_arrival_s() == (min(rest) if rest else None)
-    heap.clear()
-    assert heap.next_arrival_s() is None

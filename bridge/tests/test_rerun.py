@@ -68,7 +68,7 @@ def test_a_scene_is_read_without_what_is_not_drawn():
     }  # fmt: skip
     seen = messages.read_scene(scene)
     assert (seen.roads, seen.goal, seen.path) == ([[[0.0, 0.0], [9.0, 0.0]]], [9.0, 0.0], ())
-    assert seen.vehicles == [messages.SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, ego=True)]
+    assert seen.vehicles == [messages.SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, True, 7, 3.0)]
 
 
 @given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
@@ -357,5 +357,10 @@ def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is
     assert scene is not None
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
     assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
+    plain = messages.SeenCar(x=5.0, y=2.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
+    seen = {"vehicles": [{name: getattr(plain, name) for name in plain.__struct_fields__[:5]}]}
+    scene = messages.decode_scene(messages.encode_scene(seen, stamps))
+    assert scene is not None
+    assert scene.vehicles == [plain]
     for payload in (b"", b"\xc1", b"\x80", bytes(70_000)):
         assert messages.decode_scene(payload) is None
