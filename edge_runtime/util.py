@@ -52,6 +52,8 @@ def open_regular(path: PathLike) -> BinaryIO:
 
     A pipe would be waited for, and a device may have no end.
     """
+    if "\0" in os.fspath(path):
+        raise OSError(errno.EINVAL, "its name holds a NUL", str(path))
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -79,8 +81,6 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
         raise UserError(f"{what} {path} is a directory, not a file") from None
     except OSError as error:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
-    except ValueError as error:  # a NUL inside the name
-        raise UserError(f"{what} {path!r} is not a file name: {error}") from None
     if not is_small or len(data) > limit:
         raise UserError(f"{what} {path} is larger than {most_mib} MiB")
     return data

@@ -33,12 +33,10 @@ def started():
 
 
 def test_it_sends_fifty_times_a_second(started):
-    running, sent = started()
+    _, sent = started()
     wait_until(lambda: len(sent) > 50, "a second of sending")
     # A machine that pauses loses periods; nothing may make it send more often than asked.
     assert sent[50] - sent[0] > 0.9
-    assert set(running.gaps_ms()) >= {"gap_p50_ms", "gap_p99_ms", "gap_max_ms"}
-    assert running.gaps_ms()["gap_p50_ms"] < 30.0
 
 
 def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(started, monkeypatch):

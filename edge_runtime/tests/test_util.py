@@ -135,7 +135,7 @@ READERS = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path, special, reader):
-    for path in (*special, Path("/dev/zero"), tmp_path):
+    for path in (*special, Path("/dev/zero"), tmp_path, Path("a\0b")):
         with pytest.raises(UserError, match=r"cannot be read|is a directory"):
             READERS[reader](path)
 

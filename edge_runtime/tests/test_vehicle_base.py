@@ -51,6 +51,8 @@ class BrokenVehicle(MockVehicle):
     def feedback(self, now_s):
         if self.broken == "feedback":
             raise OSError("no such device")
+        if self.broken == "feedback exits":
+            raise SystemExit
         if self.broken == "hang":
             self.hanging.set()
             self.released.wait()
@@ -109,6 +111,7 @@ def runner(vehicle):
     ("name", "wrong", "right"),
     [
         ("broken", "feedback", ""),
+        ("broken", "feedback exits", ""),
         ("odd", {"speed_mps": None}, {}),
         ("odd", {"action": {"pedal": "full"}}, {}),
         ("odd", {"faults": 3}, {}),
@@ -185,11 +188,12 @@ def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(veh
     wait_until(lambda: vehicle.asked == ["brake"], "the brake alone")
 
 
-def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
+@pytest.mark.parametrize("broken", ["command", "exit"])
+def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner, broken):
     vehicle.hang()
     runner.close()
     assert vehicle.asked == []  # it may be in the middle of a call
-    vehicle.broken = "command"
+    vehicle.broken = broken
     vehicle.released.set()
     runner._thread.join(10.0)
     runner.close()
@@ -407,21 +411,3 @@ def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it():
         assert vehicle.feedback(0.09).action["pedal"] == -1.0
         assert (vehicle.feedback(0.19).action["pedal"] > -1.0) != brakes
         assert vehicle.feedback(1e6).speed_mps == 0.0  # a long gap is no long computation
-
-
-def test_it_moves_only_enabled_and_a_stop_latches_but_at_an_episodes_end():
-    vehicle = MockVehicle()
-
-    def moves_on_command(at_s):
-        vehicle.command(PEDAL, at_s)
-        return vehicle.feedback(at_s + 0.2).speed_mps > 0.0
-
-    assert not moves_on_command(0.0)
-    vehicle.enable(0.2)
-    vehicle.brake(0.2)
-    assert not moves_on_command(0.3)
-    vehicle.enable(0.5)
-    assert moves_on_command(0.5)
-    vehicle.brake(0.7, latch=False)
-    assert vehicle.feedback(5.0).speed_mps == 0.0
-    assert moves_on_command(5.0)

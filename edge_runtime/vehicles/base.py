@@ -223,6 +223,8 @@ class VehicleWatch:
 
 
 _JOIN_S = 0.5
+_RAISED = (Exception, SystemExit)
+"""A driver may raise anything; its thread must live on, whatever asks it to exit."""
 
 
 class _Task(NamedTuple):
@@ -293,7 +295,7 @@ class VehicleRunner:
         if armed:
             try:
                 self._vehicle.enable(now_s)
-            except Exception as error:  # a driver may raise anything
+            except _RAISED as error:
                 raise UserError(f"vehicle {self.name} cannot be enabled: {error}") from error
         self._watch.begin(now_s)
         self._thread.start()
@@ -333,7 +335,7 @@ class VehicleRunner:
         for end in (lambda: self._vehicle.brake(time.monotonic()), self._vehicle.close):
             try:
                 end()
-            except Exception as error:  # the rest of the runtime must still come to its end
+            except _RAISED as error:  # the rest of the runtime must still come to its end
                 log.event("error", "driver_not_closed", detail=error)
 
     def _run(self) -> None:
@@ -365,7 +367,7 @@ class VehicleRunner:
     def _enable(self) -> None:
         try:
             self._vehicle.enable(time.monotonic())
-        except Exception as error:  # as in _obey; its report goes on saying what is wrong
+        except _RAISED as error:  # its report goes on saying what is wrong
             log.event("error", "not_enabled", detail=error)
         else:
             self._ask()
@@ -385,8 +387,7 @@ class VehicleRunner:
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif now_s - task.given_s <= self._silence_s:  # One that hung must not obey the past.
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
-        # A driver may raise anything; its thread must live on, whatever asks it to exit.
-        except (Exception, SystemExit) as error:
+        except _RAISED as error:
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)
             self._refuses = True
@@ -428,7 +429,7 @@ class VehicleRunner:
         try:
             report = _plain(self._vehicle.feedback(time.monotonic()))
             self._watch.report(report, time.monotonic())
-        except Exception as error:  # as in _obey
+        except _RAISED as error:
             if not self._failing:
                 log.event("error", "no_feedback", detail=error)
             self._failing = True

@@ -11,13 +11,11 @@ from __future__ import annotations
 import abc
 import threading
 import time
-from collections import deque
-from typing import TYPE_CHECKING, Any, Callable, ClassVar, Deque, Dict, Mapping, Optional, Type
+from typing import TYPE_CHECKING, Any, Callable, ClassVar, Dict, Mapping, Optional, Type
 
 from edge_runtime import log
 from edge_runtime.config import convert
 from edge_runtime.controller import Limits
-from edge_runtime.service import WINDOW, quantiles_ms
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
 from edge_runtime.vehicles.mapping import RobotSettings
@@ -107,9 +105,6 @@ class StreamedVehicle(Vehicle):
         self.brake(time.monotonic())
         self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
         self._stream.stop()
-        gaps_ms = self._stream.gaps_ms()
-        if gaps_ms:
-            log.event("info", f"{self.name}_stream", **gaps_ms)
         self._leave()
 
     @abc.abstractmethod
@@ -140,8 +135,6 @@ class Stream:
         self._send, self._late_at_s = send, late_at_s
         self._wake = threading.Event()
         self._stopping = False
-        self._sent_s: Optional[float] = None
-        self._gaps_ns: Deque[int] = deque(maxlen=WINDOW)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
@@ -166,12 +159,6 @@ class Stream:
         if self._thread.ident is not None:
             self._thread.join(_JOIN_S)
 
-    def gaps_ms(self) -> Dict[str, float]:
-        """Quantiles of the times between two sendings, as words for the log; none, none."""
-        if self._sent_s is None:
-            return {}
-        return {f"gap_{name}_ms": round(ms, 2) for name, ms in quantiles_ms(self._gaps_ns).items()}
-
     def _run(self) -> None:
         next_s = time.monotonic()
         while not self._stopping:
@@ -179,14 +166,10 @@ class Stream:
             began_s = time.monotonic()
             sent = self._send()
             now_s = time.monotonic()
-            if sent:
-                if self._sent_s is not None:
-                    self._gaps_ns.append(int((now_s - self._sent_s) * 1e9))
-                self._sent_s = now_s
-                if now_s - began_s > PERIOD_S:
-                    # A process that was stopped in between has sent what was asked for before.
-                    # The vehicle cannot tell, and may have control again: the next does not wait.
-                    self._wake.set()
+            if sent and now_s - began_s > PERIOD_S:
+                # A process that was stopped in between has sent what was asked for before.
+                # The vehicle cannot tell, and may have control again: the next does not wait.
+                self._wake.set()
             if now_s >= next_s:
                 # After a pause one sending, not one for each missed period.
                 next_s += (int((now_s - next_s) / PERIOD_S) + 1) * PERIOD_S
