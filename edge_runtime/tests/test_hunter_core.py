@@ -298,17 +298,6 @@ def test_frames_that_go_round_and_round_are_silence(rig, count):
     assert rig.words == [FROZEN]
 
 
-def test_a_counter_may_run_over_lose_two_frames_and_after_a_silence_start_again(driving):
-    for turn in range(600):
-        driving.counter += (turn % 5) // 4 * 2
-        driving.step(5, PEDAL)
-        assert driving.core.state is State.ENABLED, driving.words
-    driving.talks = False  # the chassis is switched off
-    driving.step(30)
-    driving.talks, driving.counter = True, 0
-    driving.step(12).enabled()
-
-
 @pytest.mark.parametrize("before", [False, True])
 def test_feedback_that_could_not_be_confirms_nothing(rig, before):
     lie = (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))

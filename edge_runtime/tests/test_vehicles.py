@@ -85,6 +85,14 @@ WHOLE = msgspec.structs.asdict(CAR)
         ("hunter", {"car": {**WHOLE, "full_steering_rad": 2.0}}, "2.0 is not valid: .*below 1.5"),
         ("ros2", {"topic": 1}, "vehicle.ros2: .*unknown field `topic`; known are .*listen,"),
         ("ros2", {"connect": "tls/h:1"}, "plain text"),
+        ("ros2", {"listen": "tcp/h:1", "connect": "tcp/h:1"}, "give one of them"),
+        ("ros2", {"connect": "nowhere"}, "endpoint 'nowhere'"),
+        ("ros2", {"twist_topic": ""}, "no topic to command by"),
+        ("ros2", {"odometry_topic": ""}, "no odometry_topic"),
+        ("ros2", {"odometry_topic": "/cmd_vel"}, "a topic twice: cmd_vel, cmd_vel"),
+        ("ros2", {"twist_topic": "a b"}, "topic 'a b'"),
+        ("ros2", {"namespace": "9"}, "namespace '9'"),
+        ("ros2", {"twist_angular": "degrees"}, "yaw_rate, steering"),
     ],
 )
 def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words):

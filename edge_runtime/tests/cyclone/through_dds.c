@@ -19,7 +19,6 @@ static const struct {
     {"Twist", &geometry_msgs_msg_dds__Twist__desc},
     {"Odometry", &nav_msgs_msg_dds__Odometry__desc},
     {"AckermannDriveStamped", &ackermann_msgs_msg_dds__AckermannDriveStamped__desc},
-    {"Image", &sensor_msgs_msg_dds__Image__desc},
 };
 
 static void check(dds_return_t status, const char *what) {
