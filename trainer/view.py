@@ -300,7 +300,10 @@ class Shown:
         first, scenes = episode[0], []
         if first.step != 0:
             return []  # Its beginning was in another file, which is gone.
-        env = self._environment(first.scenario)
+        try:
+            env = self._environment(first.scenario)
+        except UserError:  # It is not installed here.
+            return []
         observation, _ = env.reset(seed=first.seed)
         for step in episode:
             if not np.array_equal(observation, step.observation):

@@ -24,6 +24,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 import segno
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
@@ -33,7 +34,7 @@ from bridge.messages import plain
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.controls import controls_of, keyboard_of
-from trainer.person.interface import WISH_HELP, Moving, Reading, View, distance
+from trainer.person.interface import WISH_HELP, Moving, Reading, View
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
@@ -252,9 +253,9 @@ class Cockpit:
                 return WSCloseCode.UNSUPPORTED_DATA
             try:
                 said = INPUT.decode(message.data)
-                if said.action is not None:
-                    distance(said.action, self.controls.rest)
-            except (msgspec.MsgspecError, ValueError):  # or as many numbers as it has not
+            except msgspec.MsgspecError:
+                return WSCloseCode.POLICY_VIOLATION
+            if said.action is not None and np.shape(said.action) != np.shape(self.controls.rest):
                 return WSCloseCode.POLICY_VIOLATION
             counts = self.seat.hear(page, said, time.monotonic())
             page.seen = min(max(page.seen, said.seen), page.sent)

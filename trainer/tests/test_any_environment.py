@@ -12,6 +12,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict
 
+from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import environments, evaluate, export, train
@@ -38,6 +39,7 @@ from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
+from trainer.training.delayed import VehicleEnd
 from trainer.view import Shown, Steps
 
 ROVER = f"{__name__}:test/Rover-v0"
@@ -271,10 +273,22 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
 
 def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
     """In Python, too, where no option's choices stand before it."""
+    (tmp_path / "config.toml").write_text("learner = 3\n")
+    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
+    with pytest.raises(UserError, match="learner"):
+        main(["train", *words])
     for wrong in ({"device": "gpu"}, {"threads": -1}, {"seed": -1}, {"preset": "mine"}):
         with pytest.raises(UserError, match=f"{next(iter(wrong))} (must be one of|= -1 is out of)"):
             train(ROVER, out=tmp_path / "run", **wrong)
     assert not (tmp_path / "run").exists()
+
+
+def test_before_its_first_command_a_car_behind_a_network_has_hands_off():
+    env = make_environment(ROVER)
+    seen, _ = env.reset(seed=0)
+    end = VehicleEnd(env, parse_spec("300ms"), 0, seen)
+    action = end.tick(seen, lambda _: np.ones(2, np.float32))
+    assert outer(env.action_range, action).tolist() == [0.0, 0.0]
 
 
 def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):

@@ -22,8 +22,9 @@ def write(run_dir, lines):
 
 
 def row(episode, names=NAMES, **changes):
-    known = {"episode": str(episode), "outcome": "goal", "human_steps": "3", "interventions": "1"}
-    values = {**dict.fromkeys(names, "1.5"), "total_steps": "75", **known, **changes}
+    whole = {"total_steps": "75", "updates": "75", "human_steps": "3", "interventions": "1"}
+    known = {"episode": str(episode), "outcome": "goal", **whole}
+    values = {**dict.fromkeys(names, "1.5"), **known, **changes}
     return ",".join(values[name] for name in names)
 
 
@@ -70,6 +71,7 @@ def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
         f"{HEAD}{row(0)},9\r\n",
         f"{HEAD}{row(0, steps='')}\r\n",
         f"{HEAD}{row(0, steps='many')}\r\n",
+        f"{HEAD}{row(0, human_steps='3.0')}\r\n",
         f'{HEAD}"""{row(0)}\r\n',
     ],
 )

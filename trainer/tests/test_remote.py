@@ -37,7 +37,7 @@ def answer(observation):
 class Car:
     """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
 
-    brake_action = np.array([-1.0], np.float32)
+    brake_action, rest_action = np.array([[-1.0], [0.0]], np.float32)
     control_period_s = 0.1
     action_space = SimpleNamespace(shape=(1,))
 
@@ -131,15 +131,6 @@ def test_every_tick_is_stored_with_what_was_carried_out(spec):
     assert [row[1] for row in rows] == pytest.approx(actions[late:])
     answers = np.arange(60 - late) / 100.0
     assert not np.allclose(actions[late:], answers)  # The network really spoils some of them.
-
-
-def test_a_car_that_hears_nothing_brakes_by_itself():
-    end = VehicleEnd(Car(), parse_spec("up.loss=100%"), 0, frames(0))
-    braked = []
-    for tick in range(4):
-        end.tick(frames(tick), answer)
-        braked.append(end.braking)
-    assert braked == [False, False, True, True]
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ class ScriptedEnv:
     config = SimpleNamespace(control_period_s=0.1)
     observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-    brake_action = np.array([0.0], np.float32)
+    brake_action = rest_action = np.array([0.0], np.float32)
     control_period_s = 0.1
     biased_action = LeftTurnEnv.biased_action
 

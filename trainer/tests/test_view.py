@@ -253,9 +253,11 @@ def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
     assert sorted(drawn) == [0, 12]
 
 
-def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
+@pytest.mark.parametrize("change", [{"frames": bytes(7200)}, {"scenario": "mine/Dock-v0"}])
+def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_path, change):
     steps = list(read_steps(drive(tmp_path)))
-    steps[7] = msgspec.structs.replace(steps[7], frames=bytes(7200))
+    for number in range(7 if "frames" in change else 0, 15):
+        steps[number] = msgspec.structs.replace(steps[number], **change)
     shown = view.Shown()
     entries = list(shown.entries([record(tmp_path, steps)]))
     scenes = [entry.scene is not None for entry in entries if isinstance(entry, Steps)]

@@ -398,8 +398,9 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
     """A config's settings by their names, those of the learner among them."""
     learner = values.get("learner")
-    own = {name: value for name, value in values.items() if name != "learner"}
-    return {**own, **learner} if isinstance(learner, dict) else own
+    if not isinstance(learner, dict):
+        return values
+    return {name: value for name, value in values.items() if name != "learner"} | learner
 
 
 def _typed(name: str, values: dict[str, Any]) -> str:

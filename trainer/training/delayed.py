@@ -81,7 +81,7 @@ class VehicleEnd:
         aware: DelayAware | None = None,
     ) -> None:
         self.env, self._aware = env, aware
-        self._rest: Action = np.zeros(env.action_space.shape, np.float32)  # Hands off
+        self._rest: Action = env.rest_action
         self._answers: dict[int, Action] = {}  # The policy's, by the step that they answer
         self._received: dict[int, Action] = {}  # Those of them that have come to the vehicle
         self._link: VirtualLink[Observation] = VirtualLink(

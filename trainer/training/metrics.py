@@ -45,6 +45,7 @@ ALWAYS = (
 )
 """Columns that every row has a number in; the others may be empty, as those that a run began
 without."""
+WHOLE = ("episode", "total_steps", "updates", "interventions", "human_steps")  # What is counted
 
 
 @dataclass
@@ -160,10 +161,9 @@ def _rows(text: str) -> list[dict[str, str]]:
     rows = list(reader)
     for number, row in enumerate(rows, start=1):
         try:
-            int(row["episode"])
             for name, value in row.items():  # None stands for a column too few or too many.
                 if name in ALWAYS or (value != "" and name != "outcome"):
-                    float(value)
+                    (int if name in WHOLE else float)(value)
         except (ValueError, TypeError):
             raise ValueError(f"row {number} is broken") from None
     return rows
@@ -212,7 +212,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
-        "updates": int(rows[-1]["updates"]),
+        "updates": int(rows[-1]["updates"] or 0),
         **spent(rows, period_s),
         "validation": validation,
         "until": until,

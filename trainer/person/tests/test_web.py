@@ -216,7 +216,7 @@ async def test_another_sites_page_gets_no_socket(cockpit):
         "[]",
         "{}",
         *(f'{{"at_ms": 1, "engaged": true, "action": {wrong}}}' for wrong in (
-            "1.5", "NaN", "1e999", '"1"', '1, "wishes": ["fly"]', '1, "admin": 1',
+            "1.5", "NaN", "1e999", "[0.5, 0.9]", '"1"', '1, "wishes": ["fly"]', '1, "admin": 1',
         )),
         "[" * MAX_INPUT_BYTES,
         "x" * (MAX_INPUT_BYTES + 1),
@@ -230,6 +230,7 @@ async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
         await (link.send_bytes if isinstance(text, bytes) else link.send_str)(text)
         while not (await link.receive(timeout=WAIT_S)).type.name.startswith("CLOS"):
             pass
+        assert link.close_code != aiohttp.WSCloseCode.GOING_AWAY, "it was its silence"
     await reads(cockpit, lambda reading: not reading.engaged)
     async with page(cockpit) as link:
         assert (await say(link))["driving"], "and it serves on"
