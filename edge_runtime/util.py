@@ -86,9 +86,12 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
     return data
 
 
-def read_json(path: PathLike, what: str) -> Any:
-    """The value in a JSON file. Raises UserError where there is none."""
-    return parse_json(read_bytes(path, what), f"{what} {path}")
+def read_json(path: PathLike, what: str) -> Dict[str, Any]:
+    """The object in a JSON file. Raises UserError where there is none."""
+    value = parse_json(read_bytes(path, what), f"{what} {path}")
+    if not isinstance(value, dict):
+        raise UserError(f"{what} {path} holds no JSON object")
+    return value
 
 
 def parse_json(data: bytes, what: str) -> Any:

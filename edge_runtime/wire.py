@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from enum import Enum
+from functools import partial
 from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, TypeVar, Union
 
 import msgspec
@@ -250,16 +251,6 @@ def decode_command(payload: bytes) -> Union[Command, Rejection]:
     return command
 
 
-def decode_feedback(payload: bytes) -> Union[Feedback, Rejection]:
-    """A Feedback with finite numbers, or why not."""
-    return _decode(payload, Feedback)
-
-
-def decode_health(payload: bytes) -> Union[Health, Rejection]:
-    """A Health with finite numbers, or why not."""
-    return _decode(payload, Health)
-
-
 def _decode(
     payload: bytes, kind: type[_M], max_bytes: int = MAX_PAYLOAD_BYTES
 ) -> Union[_M, Rejection]:
@@ -280,6 +271,10 @@ def _decode(
         if refusal is not None:
             return refusal
     return message
+
+
+decode_feedback = partial(_decode, kind=Feedback)
+decode_health = partial(_decode, kind=Health)
 
 
 def _refusal(name: str, value: Any, least: int) -> Optional[Rejection]:

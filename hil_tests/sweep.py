@@ -21,7 +21,7 @@ from bridge.progress import ProgressBar
 from bridge.report import COLLISION, GOAL
 from edge_runtime.files import make_directory, write_json
 from edge_runtime.reach import free_endpoint
-from edge_runtime.util import UserError, read_json
+from edge_runtime.util import UserError, parse_json, read_bytes, read_json
 from hil_tests.processes import CommandTimeoutError, Process, in_parallel, trusting
 from trainer.environments import make_environment
 from trainer.experiments.data import Estimate, mean_estimate, success_estimate
@@ -182,7 +182,7 @@ def drive_all(
     parts = [one for point in points for one in Part(point, task.seed, task.runs).split(size)]
     paths = {one: keep / f"{digest({**deciding, **one._asdict()})}.json" for one in parts}
     found: dict[Part, list[dict[str, Any]]] = {
-        one: read_json(path, "kept result (remove it)")
+        one: parse_json(read_bytes(path, "kept result"), f"kept result {path} (remove it)")
         for one, path in paths.items()
         if path.is_file()
     }

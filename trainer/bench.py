@@ -80,8 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print; returns the exit status."""
-    if arguments.out:
-        check_writable(arguments.out)
+    check_writable(arguments.out)
     set_threads(arguments.threads)
     effort = QUICK if arguments.quick else FULL
     with ProgressBar("bench", effort.ticks) as bar:

@@ -18,11 +18,11 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError, counted
+from edge_runtime.util import UserError, counted, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
-from trainer.options import add_latency, add_scenario, add_seed, read_json, set_threads
+from trainer.options import add_latency, add_scenario, add_seed, set_threads
 from trainer.training.delayed import VehicleEnd
 
 EXAMPLE = examples(
@@ -66,8 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; returns the exit status."""
-    if arguments.out:
-        check_writable(arguments.out)
+    check_writable(arguments.out)
     found = evaluate(
         arguments.policy,
         arguments.scenario,

@@ -9,11 +9,9 @@ import textwrap
 import time
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 from bridge.network import GRAMMAR
-from edge_runtime import util
 from edge_runtime.cli import not_negative, positive_number, whole_number
 from edge_runtime.util import UserError
 from trainer.scenarios import SCENARIOS
@@ -126,14 +124,3 @@ def set_threads(count: int) -> None:
         import torch  # takes two seconds, which --help need not wait
 
         torch.set_num_threads(count)
-
-
-def read_json(path: Path, what: str) -> dict[str, Any]:
-    """A JSON object from a file.
-
-    Raises UserError: no file, or something else in it.
-    """
-    value = util.read_json(path, what)
-    if not isinstance(value, dict):
-        raise UserError(f"{what} {path} holds no JSON object")
-    return value

@@ -110,10 +110,8 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 def moving_average(values: Values, window: int) -> Values:
     """The mean of the last ``window`` values (fewer at the start), same length."""
-    sums = np.cumsum(np.concatenate([[0.0], values]))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - window, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+    sums = np.convolve(values, np.ones(window))[: len(values)]
+    return sums / np.minimum(np.arange(1, len(values) + 1), window)
 
 
 def _columns(run_dir: Path) -> dict[str, Values]:

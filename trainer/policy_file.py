@@ -21,11 +21,10 @@ from edge_runtime.cli import examples
 from edge_runtime.files import check_writable
 from edge_runtime.policy import policy_id_of
 from edge_runtime.tls import read_signing_key
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, read_json
 from trainer.drivers import load_actor
 from trainer.environments import entries_of, make_environment, task_of
 from trainer.learner.networks import Actor
-from trainer.options import read_json
 from trainer.training.config import CONFIG_FILE
 
 EXAMPLE = examples(

@@ -45,6 +45,10 @@ BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 )
 
+GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
+PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
+"""Of the road from above, as people see it; the other cars have APPLIED's colour."""
+
 LOOPBACK = "127.0.0.1"
 START_S = 30.0  # How long it may take until it listens
 LOOK_S = 0.05

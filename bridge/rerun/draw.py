@@ -14,17 +14,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bridge.messages import SeenCar, SeenScene
-from bridge.rerun import Colour
+from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colour
 
-ROAD = (92, 97, 105)
-PATH = (120, 190, 255)
-GOAL = (84, 200, 120)
-TRAFFIC = (235, 140, 40)
-MARKING = (235, 235, 235)
-GLASS = (30, 34, 40)
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
-GROUND = [222, 229, 216]
 MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
 NEAR_M = 20.0  # From the path; whoever is farther away comes into the picture when it matters
 ALL_OF_IT = rrb.TimeRange(
@@ -50,7 +43,7 @@ def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
 def draw_cars(recording: rr.RecordingStream, scene: SeenScene, ego_colour: Colour) -> None:
     """Draw the cars; the ego car's colour may say what it does, or by whose will."""
     for name, ego in (("traffic", False), ("ego", True)):
-        path, colour = f"road/{name}", ego_colour if ego else TRAFFIC
+        path, colour = f"road/{name}", ego_colour if ego else APPLIED
         cars = [car for car in scene.vehicles if car.ego == ego]
         half_m = [car.width_m / 2 for car in cars]
         _lines(recording, f"{path}/body", [body(car) for car in cars], colour, half_m, order=3.0)
@@ -112,7 +105,9 @@ def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
     if scene is not None:
         x_range, y_range = view_bounds(scene)
         bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(origin="road", name=name, background=GROUND, visual_bounds=bounds)
+    return rrb.Spatial2DView(
+        origin="road", name=name, background=list(GROUND), visual_bounds=bounds
+    )
 
 
 def frames_view() -> rrb.Horizontal:

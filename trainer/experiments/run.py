@@ -29,7 +29,7 @@ import torch
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.util import UserError, read_bytes, read_json
 from trainer import drivers, util
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
 from trainer.environments import make_environment
@@ -39,7 +39,6 @@ from trainer.experiments.plan import Plan, Unit
 from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
-from trainer.options import read_json
 from trainer.training.config import CONFIG_FILE
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun

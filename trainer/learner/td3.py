@@ -262,11 +262,8 @@ class TD3Learner:
         seen = tensors(self._shift(foreseen.next_frames), self.device)
         with self._precision():
             picture = self.actor.picture(*seen)
-        actions, pair = (
-            torch.tanh(self.actor.head(picture)),
-            (foreseen.actions, foreseen.overruled),
-        )
-        preferred, overruled = map(self._tensor, pair)
+        actions = torch.tanh(self.actor.head(picture))
+        preferred, overruled = map(self._tensor, (foreseen.actions, foreseen.overruled))
         return equations.preference_loss(actions, preferred, overruled, self.config.preference_beta)
 
     @torch.no_grad()
@@ -292,15 +289,8 @@ class TD3Learner:
                 critic.value(picture, own_actions[looked_at]),
                 c.advantage_bound,
             )
-        return equations.priority(
-            errors,
-            advantage,
-            human,
-            c.priority_offset,
-            row.td_weight,
-            row.human_td_weight,
-            row.advantage_weight,
-        )
+        scheme = row.td_weight, row.human_td_weight, row.advantage_weight
+        return equations.priority(errors, advantage, human, c.priority_offset, *scheme)
 
     @torch.no_grad()
     def _update_targets(self) -> None:

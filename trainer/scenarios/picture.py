@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from bridge import rerun as shown
 from bridge.rerun import POLICY, Colour
 
 
@@ -149,17 +150,6 @@ VIEW = (-30.0, -7.0)
 GOAL_HALF_M = 2.0
 BODY = ("x", "y", "heading_rad", "length_m", "width_m")
 """A scene's vehicle in the order of a ``Rectangle``."""
-COLOURS = {
-    "ground": (222, 229, 216),
-    "road": (92, 97, 105),
-    "marking": (235, 235, 235),
-    "path": (120, 190, 255),
-    "goal": (84, 200, 120),
-    "ego": POLICY,
-    "traffic": (235, 140, 40),
-    "glass": (30, 34, 40),
-    "text": (30, 34, 40),
-}
 
 
 def draw_scene(
@@ -174,7 +164,7 @@ def draw_scene(
     drives it.
     """
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
-    image = Image.new("RGB", size, COLOURS["ground"])
+    image = Image.new("RGB", size, shown.GROUND)
     pen, corner = ImageDraw.Draw(image), scene.get("view", VIEW)
 
     def pixels(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
@@ -183,34 +173,34 @@ def draw_scene(
             for x, y in points
         ]
 
-    def line(points: Iterable[Sequence[float]], colour: str, width_pixels: int) -> None:
-        pen.line(pixels(points), fill=COLOURS[colour], width=width_pixels)
+    def line(points: Iterable[Sequence[float]], colour: Colour, width_pixels: int) -> None:
+        pen.line(pixels(points), fill=colour, width=width_pixels)
 
     for road in scene["roads"]:
-        line(road, "road", int(scene["road_width_m"] * PIXELS_PER_METRE))
+        line(road, shown.ROAD, int(scene["road_width_m"] * PIXELS_PER_METRE))
     # Lane lines of their own, or the centre line of every road outside their crossing.
     lines, skip_m = scene.get("lane_lines"), 0.0
     if lines is None:
         lines, skip_m = scene["roads"], 0.5 * scene["road_width_m"]
     for each in lines:
         for dash in _dashes(each, skip_m):
-            line(dash, "marking", 2)
-    line(scene["path"], "path", 4)
+            line(dash, shown.MARKING, 2)
+    line(scene["path"], shown.PATH, 4)
     x, y = scene["goal"]
-    line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], "goal", 8)
+    line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], shown.GOAL, 8)
     for vehicle in scene["vehicles"]:
         body = Rectangle(*(vehicle[name] for name in BODY))
         ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
         glass = Rectangle(
             body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
         )
-        colour = ego if vehicle["ego"] else COLOURS["traffic"]
-        pen.polygon(pixels(corners(body)), fill=colour, outline=COLOURS["glass"], width=2)
-        pen.polygon(pixels(corners(glass)), fill=COLOURS["glass"])
+        colour = ego if vehicle["ego"] else shown.APPLIED
+        pen.polygon(pixels(corners(body)), fill=colour, outline=shown.GLASS, width=2)
+        pen.polygon(pixels(corners(glass)), fill=shown.GLASS)
     if frames is not None:
         _inset_frames(image, frames)
     end = (size[0] - 12, size[1] - 12)
-    pen.multiline_text(end, caption, COLOURS["text"], anchor="rd", font_size=15)
+    pen.multiline_text(end, caption, shown.GLASS, anchor="rd", font_size=15)
     return np.asarray(image)
 
 
@@ -235,4 +225,4 @@ def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:
         left = margin + place * (size[0] + margin)
         image.paste(inset, (left, top))
         text = f"the policy sees, {when}"
-        pen.text((left, top - 20), text, fill=COLOURS["text"], font_size=14)
+        pen.text((left, top - 20), text, fill=shown.GLASS, font_size=14)

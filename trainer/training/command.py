@@ -23,7 +23,7 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, examples, quit_on_signals
-from edge_runtime.util import UserError, counted, read_toml
+from edge_runtime.util import UserError, counted, read_json, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
 from trainer.environments import scenario_of
@@ -379,7 +379,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved, wanted = _flat(options.read_json(path, "run config")), _flat(asdict(config))
+    saved, wanted = _flat(read_json(path, "run config")), _flat(asdict(config))
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []
