@@ -225,6 +225,7 @@ def _drivers_in(path: Path) -> set[str]:
             names = wheel.namelist()
             read = [wheel.read(one) for one in names if one.endswith(".dist-info/entry_points.txt")]
         points = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+        points.optionxform = str  # type: ignore[assignment,method-assign]  # Else in small letters
         points.read_string("\n".join(text.decode() for text in read))
     except (OSError, *NO_ZIP, configparser.Error, ValueError) as error:
         raise UserError(f"wheel {path} cannot be read: {error}") from None

@@ -116,8 +116,8 @@ class Layout:
 
     def tidy(self) -> None:
         """Remove what a run that was cut off has left."""
-        for name in ("current", "previous"):
-            (self.root / f".{name}").unlink(missing_ok=True)
+        for name in (".current", ".previous", f".{self.trusted.name}.new"):
+            (self.root / name).unlink(missing_ok=True)
         if self.releases.is_dir():
             for path in self.releases.glob(f"{_MAKING}*"):
                 remove_tree(path)

@@ -24,6 +24,7 @@ from deploy.bundle import (
     TARGETS,
     Inputs,
     Pin,
+    _drivers_in,
     _pack,
     _sign,
     build_edge_wheel,
@@ -193,6 +194,15 @@ def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(workshop, 
         assert (ended.returncode, said in ended.stderr) == (2, True), ended.stderr
     with pytest.raises(UserError, match="the bundle has another my_vehicle"):
         workshop.make(wheels=[*inputs, wheel])
+
+
+def test_a_drivers_name_keeps_its_capital_letters(tmp_path):
+    path = tmp_path / "rover-1-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as made:
+        made.writestr(
+            "rover-1.dist-info/entry_points.txt", "[phil.vehicles]\nMyRover = rover:Rover"
+        )
+    assert "MyRover" in _drivers_in(path)
 
 
 def test_a_bundle_of_somebody_elses_policy_or_key_or_a_long_name_is_refused(workshop, tmp_path):

@@ -253,6 +253,7 @@ def test_one_installer_at_a_time_to_its_end_and_uninstall_takes_only_ours(board,
         refused(board.run("rollback"), "another installer is at work")
     assert [row[0] for row in board.fingerprint()] == [row[0] for row in before]
     (board.root / "diary.txt").write_text("not ours")
+    (board.root / ".trusted.pub.new").touch()  # Of a first install that was cut off.
     done = board.run("uninstall")
     assert (done.returncode, "stays" in done.stdout) == (0, True)
     assert [p.name for p in board.root.iterdir()] == ["diary.txt"]
