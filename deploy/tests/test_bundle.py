@@ -200,7 +200,7 @@ def test_a_drivers_name_keeps_its_capital_letters(tmp_path):
     path = tmp_path / "rover-1-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as made:
         made.writestr(
-            "rover-1.dist-info/entry_points.txt", "[phil.vehicles]\nMyRover = rover:Rover"
+            "rover-1.dist-info/entry_points.txt", "[phil.vehicles]\nMyRover=rover:Rover"
         )
     assert "MyRover" in _drivers_in(path)
 
