@@ -199,9 +199,7 @@ def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(workshop, 
 def test_a_drivers_name_keeps_its_capital_letters(tmp_path):
     path = tmp_path / "rover-1-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr(
-            "rover-1.dist-info/entry_points.txt", "[phil.vehicles]\nMyRover=rover:Rover"
-        )
+        made.writestr("rover-1.dist-info/entry_points.txt", "[phil.vehicles]\nMyRover=rover:Rover")
     assert "MyRover" in _drivers_in(path)
 
 
