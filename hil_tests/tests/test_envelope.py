@@ -253,7 +253,6 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(rig, tmp
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        ([], "`object`, got `array`"),
         ({}, "missing required field `policy_id`"),
         ({"edges": {}}, "of length >= 1 - at `$.edges`"),
         ({"edges": {"delay_ms": {"inside": "none"}}}, "missing required field `outside`"),
