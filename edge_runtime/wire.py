@@ -275,6 +275,7 @@ def _decode(
 
 decode_feedback = partial(_decode, kind=Feedback)
 decode_health = partial(_decode, kind=Health)
+"""A Feedback or a Health with finite numbers, or why not."""
 
 
 def _refusal(name: str, value: Any, least: int) -> Optional[Rejection]:

@@ -42,6 +42,19 @@ def test_what_an_action_raises_reaches_the_caller():
         line.close()
 
 
+def test_a_line_runs_what_is_due_in_order_of_time_then_of_arrival_and_forgets_the_rest():
+    ran: list[int] = []
+    with contextlib.closing(DelayLine()) as line:
+        line.push(time.monotonic() + 0.6, lambda: ran.append(-1))
+        line.clear()
+        due_s = time.monotonic() + 0.2
+        line.push(due_s + 0.6, lambda: ran.append(50))
+        for number in range(50):
+            line.push(due_s, lambda number=number: ran.append(number))
+        wait_until(lambda: len(ran) == 51, "all but what was forgotten")
+    assert ran == list(range(51))
+
+
 def obedient(step):
     return make_command(step, action=[step / 1000])
 

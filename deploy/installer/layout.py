@@ -116,8 +116,8 @@ class Layout:
 
     def tidy(self) -> None:
         """Remove what a run that was cut off has left."""
-        for name in (".current", ".previous", f".{self.trusted.name}.new"):
-            (self.root / name).unlink(missing_ok=True)
+        for path in (self.root / ".current", self.root / ".previous", _draft_of(self.trusted)):
+            path.unlink(missing_ok=True)
         if self.releases.is_dir():
             for path in self.releases.glob(f"{_MAKING}*"):
                 remove_tree(path)
@@ -173,9 +173,13 @@ class Layout:
         return stream
 
 
+def _draft_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.new")
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that a power cut leaves the old one or the new one."""
-    draft = path.with_name(f".{path.name}.new")
+    draft = _draft_of(path)
     draft.unlink(missing_ok=True)
     with open(os.open(str(draft), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as stream:
         stream.write(data)

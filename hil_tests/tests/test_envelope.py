@@ -253,6 +253,7 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(rig, tmp
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
+        ([], "holds no JSON object"),
         ({}, "missing required field `policy_id`"),
         ({"edges": {}}, "of length >= 1 - at `$.edges`"),
         ({"edges": {"delay_ms": {"inside": "none"}}}, "missing required field `outside`"),
@@ -268,7 +269,8 @@ def test_a_damaged_envelope_cannot_be_confirmed_and_is_one_line(tmp_path, capsys
     words = ["envelope", "--confirm", str(given_), "--out", str(out)]
     assert exit_status(main, words) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "given.json is no envelope of hil_tests envelope, with edges to confirm: " in line
+    what = "given.json is no envelope of hil_tests envelope, with edges to confirm: "
+    assert (what in line) == isinstance(damage, dict)
     assert says in line
     assert not out.exists()
 

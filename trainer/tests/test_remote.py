@@ -39,7 +39,6 @@ class Car:
 
     brake_action, rest_action = np.array([[-1.0], [0.0]], np.float32)
     control_period_s = 0.1
-    action_space = SimpleNamespace(shape=(1,))
 
 
 class Driven:

@@ -124,7 +124,7 @@ class VehicleEnd:
         return self._aware.see(observation, [self._newest(self._answers, one) for one in before])
 
     def _newest(self, actions: dict[int, Action], step: int) -> Action:
-        """The action that answers this step, or the newest one before; zeros before the first."""
+        """The action that answers this step, or the newest one before; else hands off."""
         known = [one for one in actions if one <= step]
         return actions[max(known)] if known else self._rest
 
