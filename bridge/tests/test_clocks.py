@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+from functools import partial
 from typing import Any
 
 import pytest
@@ -50,7 +51,7 @@ def test_a_line_runs_what_is_due_in_order_of_time_then_of_arrival_and_forgets_th
         due_s = time.monotonic() + 0.2
         line.push(due_s + 0.6, lambda: ran.append(50))
         for number in range(50):
-            line.push(due_s, lambda number=number: ran.append(number))
+            line.push(due_s, partial(ran.append, number))
         wait_until(lambda: len(ran) == 51, "all but what was forgotten")
     assert ran == list(range(51))
 
