@@ -1,11 +1,10 @@
 """Reads MCAP recordings: whole ones, ones that a kill or a full disk has cut off, and damaged ones.
 
-`Records` walks any MCAP file record by record, and over the places in it that are broken.
-`Recording` reads the messages of the wire from it. A chunk has a checksum, so one that is read is
-as it was written; of the rest, the header and the index of each chunk included, the checksum at the
-end of the data says so. Behind a broken record the next one is where the record's length says;
-where no record begins there, the length is broken, too, and the next whole chunk is looked for byte
-by byte.
+`Recording` walks any MCAP file record by record, and over the places in it that are broken. A chunk
+has a checksum, so one that is read is as it was written; of the rest, the header and the index of
+each chunk included, the checksum at the end of the data says so. Behind a broken record the next
+one is where the record's length says; where no record begins there, the length is broken, too, and
+the next whole chunk is looked for byte by byte.
 
 Anybody may have made the file. What a chunk announces is looked at before it is unpacked, and the
 whole work is limited by the length of the file.
@@ -21,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -56,7 +55,7 @@ LANDMARK = re.compile(
     rb"|\x02(?=\x14\x00{7})",  # the footer
     re.DOTALL,
 )
-"""How what can be found by itself begins."""
+"""First bytes of records that can be recognised without knowing where the one before ends."""
 LANDMARK_BYTES = 45
 BLOCK_BYTES = 1 << 16
 _HEAD = struct.Struct("<BQ")
@@ -110,7 +109,7 @@ class Condition:
 
 
 class Recording(Condition):
-    """The messages of one file; its condition is known when ``messages`` has come to the end."""
+    """One MCAP file; its condition is known when ``messages`` or ``records`` came to the end."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -120,32 +119,20 @@ class Recording(Condition):
     def messages(self) -> Iterator[Stored]:
         """Yield the messages as they stand in the file, which is the order of their arrival.
 
-        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
-        work than its size accounts for.
+        UserError as ``records``.
         """
-        vars(self).update(asdict(Condition(cut_off=True)), metadata={})
-        try:
-            with open_regular(self.path) as stream:
-                size = os.fstat(stream.fileno()).st_size
-                yield from self._read(Records(stream, size, str(self.path)))
-        except OSError as error:
-            raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
-
-    def _read(self, records: Records) -> Iterator[Stored]:
-        if not records.is_mcap():
-            raise UserError(f"{self.path} is no MCAP recording")
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
 
         def learn(record: McapRecord) -> None:
-            # Of two the first, which is from a chunk with a checksum.
+            # The first definition of an id counts: it is from a chunk, which has a checksum.
             if isinstance(record, Schema):
                 schemas.setdefault(record.id, record)
             elif isinstance(record, Channel):
                 channels.setdefault(record.id, record)
 
         has_looked = False
-        for record in records.walk():
+        for record in self.records():
             learn(record)
             if isinstance(record, Metadata):
                 self.metadata |= record.metadata
@@ -154,34 +141,34 @@ class Recording(Condition):
                 if not has_looked and (channel is None or channel.schema_id not in (0, *schemas)):
                     # The chunk that named it is broken; the index at the end repeats all names.
                     has_looked = True
-                    for other in records.again().walk():
+                    for other in Recording(self.path).records():
                         learn(other)
                     channel = channels.get(record.channel_id)
                 if channel is None:
-                    records.nameless_messages += 1
+                    self.nameless_messages += 1
                 else:
                     yield Stored(channel, schemas.get(channel.schema_id), record)
-        vars(self).update(asdict(records))
 
+    def records(self) -> Iterator[McapRecord]:
+        """Yield every record that can be read, a chunk as what it holds.
 
-class Records(Condition):
-    """The records of a file of ``size`` bytes; its condition is known after ``walk``."""
+        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
+        work than its size accounts for.
+        """
+        vars(self).update(asdict(Condition()), metadata={})
+        self._has_ended, self._spent_bytes = False, 0
+        try:
+            with open_regular(self.path) as self._stream:
+                self._size = self._stream.seek(0, os.SEEK_END)
+                last = self._size - MAGIC_SIZE
+                ends = (self._bytes(0, MAGIC_SIZE), self._bytes(last, MAGIC_SIZE))
+                if MCAP0_MAGIC not in ends or last <= 0:
+                    raise UserError(f"{self.path} is no MCAP recording")
+                yield from self._walk()
+        except OSError as error:
+            raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
 
-    def __init__(self, stream: IO[bytes], size: int, name: str = "") -> None:
-        super().__init__()
-        self._stream = stream
-        self._size = size
-        self._name = name or stream.name
-        self._has_ended = False
-        self._spent_bytes = 0
-
-    def is_mcap(self) -> bool:
-        """Whether it begins or ends like an MCAP file, and has more than that."""
-        ends = (self._bytes(0, MAGIC_SIZE), self._bytes(self._size - MAGIC_SIZE, MAGIC_SIZE))
-        return MCAP0_MAGIC in ends and self._size > MAGIC_SIZE
-
-    def walk(self) -> Iterator[McapRecord]:
-        """Yield every record that can be read, a chunk as what it holds."""
+    def _walk(self) -> Iterator[McapRecord]:
         at = MAGIC_SIZE
         while at < self._size and not self._has_ended:
             found = self._read(at)
@@ -189,15 +176,11 @@ class Records(Condition):
                 at = self._pass_over(at)
                 continue
             parts, end = found
-            for part in parts[:1]:  # Neither end is within a chunk.
+            for part in parts[:1]:  # DataEnd and Footer never stand inside a chunk.
                 self._note_end(part, at)
             at = end
             self.cut_off = at >= self._size and not self._has_ended
             yield from parts
-
-    def again(self) -> Records:
-        """The same file from its beginning."""
-        return Records(self._stream, self._size, self._name)
 
     def _note_end(self, record: McapRecord, at: int) -> None:
         """Note the end of the data, with its checksum, and that of the file."""
@@ -298,7 +281,7 @@ class Records(Condition):
         self._spent_bytes += count
         if self._spent_bytes > MAX_CHUNK_BYTES + MAX_WORK * at:
             raise UserError(
-                f"recording {self._name} is refused: reading it takes more than"
+                f"recording {self.path} is refused: reading it takes more than"
                 f" {MAX_WORK} times its size"
             )
 

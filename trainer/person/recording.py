@@ -7,36 +7,32 @@ episode's last, which says whether the person discarded it. 30 minutes are about
 ever overwritten: sittings add up.
 """
 
-import ast
+import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from mcap.records import Channel, Message
-from mcap.writer import MCAP0_MAGIC
+from mcap.stream_reader import MAGIC_SIZE
 from numpy.typing import NDArray
 
 from bridge.record import close_torn, new_recording_at
-from bridge.recording import Records
+from bridge.recording import Recording
 from bridge.report import DISCARDED
-from edge_runtime.util import UserError, open_regular
+from edge_runtime.util import UserError
 from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
-from trainer.learner.replay import Layout
 from trainer.person.interface import Amount, Control, vector
 from trainer.training.delayed import Store
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")
-"""Begin the topics of a recording of the wire, and their copies for viewers."""
+"""Prefixes of the topics in a recording of the wire."""
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
-FRAME, FRAMES = "('|u1', (45, 80))", "('|u1', (2, 45, 80))"  # Layouts, as in ``Step.layout``
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
 
@@ -51,9 +47,8 @@ class Step(msgspec.Struct, frozen=True):
     step: int  # In the episode, from 0
     time_ns: int  # When the hands were asked: wall time, ns since 1970
     time_s: float  # Simulated, since the episode's start
-    frames: bytes  # s: what the policy saw, uint8 [2, 45, 80], or as ``layout`` says
-    next_frame: bytes
-    """The newer frame of s', uint8 [45, 80]; the older is the newer of s. With ``layout``: s'."""
+    seen: bytes  # s: what the policy saw, as an .npy file
+    seen_next: bytes  # s', likewise
     policy_action: Amount | None
     human_action: Amount  # What the device said
     action: Amount  # What was applied
@@ -65,37 +60,28 @@ class Step(msgspec.Struct, frozen=True):
     truncated: bool
     speed_mps: float
     outcome: str = ""  # How the episode ended here, if it did
-    layout: str = ""  # NumPy's description of an observation and its shape; empty for two frames
 
     @property
     def observation(self) -> NDArray[Any]:
-        """s, uint8 [2, 45, 80], or as ``layout`` says."""
-        return _array(self.frames, self.layout or FRAMES)
+        """s; of our scenarios uint8 [2, 45, 80]."""
+        return _unpacked(self.seen)
 
     @property
     def next_observation(self) -> NDArray[Any]:
         """s', likewise."""
-        if self.layout:
-            return _array(self.next_frame, self.layout)
-        return np.stack([self.observation[1], _array(self.next_frame, FRAME)])
+        return _unpacked(self.seen_next)
 
 
-def layout_text(layout: Layout) -> str:
-    """An observation's layout as ``Step.layout`` has it."""
-    if layout.stacked:
-        return ""
-    return repr((np.lib.format.dtype_to_descr(layout.dtype), tuple(layout.shape)))
+def packed(array: NDArray[Any]) -> bytes:
+    """An array as an .npy file, as a ``Step`` has it."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
 
 
-@cache
-def _read_layout(text: str) -> tuple[Any, tuple[int, ...]]:
-    descr, shape = ast.literal_eval(text)
-    return np.lib.format.descr_to_dtype(descr), shape
-
-
-def _array(data: bytes, layout: str) -> NDArray[Any]:
-    dtype, shape = _read_layout(layout)
-    return np.frombuffer(data, dtype).reshape(shape)
+def _unpacked(data: bytes) -> NDArray[Any]:
+    array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    return array
 
 
 class Recorder:
@@ -167,27 +153,20 @@ def read_steps(path: Path) -> Iterator[Step]:
 
     Raises UserError: no such file, or not one of ours.
     """
-    try:
-        with open_regular(path) as stream:
-            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise UserError(f"{path} is no recording of a sitting")
-            records = Records(stream, path.stat().st_size, str(path))
-            for record in records.walk():
-                if records.damaged_places:
-                    return
-                if isinstance(record, Channel) and record.topic != TOPIC:
-                    what = f"no recording of a sitting: it holds {record.topic}"
-                    if record.topic.startswith(WIRE):
-                        what = "a recording of the wire, as `bridge record` makes them: "
-                        what += f"`python -m bridge view {path}` shows it"
-                    raise UserError(f"{path} is {what}")
-                if isinstance(record, Message):
-                    yield msgspec.msgpack.decode(record.data, type=Step)
-    except OSError as error:
-        raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    # The chunk's checksum is right: no kill does that.
-    except msgspec.DecodeError as error:
-        raise UserError(f"{path} was recorded by another version: {error}") from None
+    recording = Recording(path)
+    for channel, _, message in recording.messages():
+        if recording.damaged_places:
+            return
+        if channel.topic != TOPIC:
+            what = f"no recording of a sitting: it holds {channel.topic}"
+            if channel.topic.startswith(WIRE):
+                what = "a recording of the wire, as `bridge record` makes them: "
+                what += f"`python -m bridge view {path}` shows it"
+            raise UserError(f"{path} is {what}")
+        try:
+            yield msgspec.msgpack.decode(message.data, type=Step)
+        except msgspec.DecodeError as error:  # The chunk's checksum is right: no kill does that.
+            raise UserError(f"{path} was recorded by another version: {error}") from None
 
 
 def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
@@ -200,7 +179,8 @@ def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
 
 def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Step]:
     """The recorded steps from ``position``, a sitting and an index, on, over all sittings."""
-    for path in sittings(directory):
+    # Of a file that was just begun a power cut may leave nothing.
+    for path in (path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
 
 

@@ -49,8 +49,8 @@ from trainer.training.run import TrainingRun, divergence_said
 from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_blocked
 
 NICENESS = 10
-"""Of the validations' process and of the updates' thread, and those that torch starts from it: the
-person's loop goes first."""
+"""Of the validation process, and of the update thread with torch's own: the person's loop goes
+first."""
 LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
 PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share")
 """What makes a scripted human imperfect."""
@@ -70,22 +70,7 @@ def training_with_person(
             back = f"{steps} recorded steps after the checkpoint, {human} of them yours, are back"
             print(back, file=sys.stderr)
         yield training
-        print(summary(training), file=sys.stderr)
-
-
-def summary(training: PersonRun) -> str:
-    """What the sitting amounts to, in a line."""
-    sitting = training.sitting
-    if not sitting.recorder.index:
-        return "nothing was driven, and nothing recorded"
-    discarded = f"{counted(sitting.discarded, 'episode')} discarded, " * bool(sitting.discarded)
-    return (
-        f"{counted(sitting.episodes, 'episode')}, {discarded}"
-        f"{counted(sitting.interventions, 'intervention')}, "
-        f"{counted(sitting.human_steps, 'step')} yours; "
-        f"{counted(sitting.pacer.late, 'control period')} late, "
-        f"checkpoints in {training.longest_save_s:.2f} s at most: {sitting.recorder.path}"
-    )
+        print(training.sitting.summary(), file=sys.stderr)
 
 
 class UnhurriedLearning(LearningThread):
@@ -179,8 +164,6 @@ class PersonRun(TrainingRun):
         self, config: RunConfig, run_dir: Path, person: Person, resume: bool, speed: float
     ) -> None:
         self._resumed = resume
-        self.longest_save_s = 0.0
-        """The longest that a checkpoint has kept the person between two episodes."""
         self.recovered = (0, 0)
         """Steps, and the person's among them, that a kill had kept from the checkpoint."""
         super().__init__(config, run_dir, resume)
@@ -234,10 +217,8 @@ class PersonRun(TrainingRun):
     def save(self) -> None:
         """Write the checkpoint, which the person sees."""
         self.sitting.show("saving")
-        began_s = time.perf_counter()
         with divergence_said(self.episode):  # The update under way may be the one.
             super().save()
-        self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
 
     def _learned(self, critic_loss: float) -> str:
         """What the learner did in an episode: nothing before its warm-up is over."""
@@ -322,11 +303,11 @@ def check_settings(config: RunConfig) -> None:
     if config.delay_known:
         raise UserError("a person's recordings hold no actions under way: no delay_known")
     if config.guided_share != 1 or config.guided_until_episode or config.guided_until_step:
-        always = "guided_share is 1, guided_until_episode and guided_until_step are 0"
-        raise UserError(f"a person watches every episode: {always}")
+        wanted = "guided_share must be 1, guided_until_episode and guided_until_step 0"
+        raise UserError(f"a person watches every episode: {wanted}")
     for name in PRETENDED:
         if getattr(config, name):
-            raise UserError(f"a person's actions are not replaced: {name} is 0")
+            raise UserError(f"a person's actions are not replaced: {name} must be 0")
 
 
 class PersonGuide:
@@ -366,7 +347,7 @@ class Check(NamedTuple):
 
 
 class BehindTheScenes:
-    """The parent's end: nothing that it does waits for the process."""
+    """The parent's side of the validation process; only ``close`` waits for it, and kills it."""
 
     def __init__(self, config: RunConfig) -> None:
         self._config = config

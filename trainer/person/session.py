@@ -37,7 +37,7 @@ from trainer.person.interface import (
     open_person,
     vector,
 )
-from trainer.person.recording import Recorder, Step, layout_text
+from trainer.person.recording import Recorder, Step, packed
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed
@@ -50,7 +50,8 @@ EXAMPLE = examples(
 )
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 LATE_S = 0.02
-"""A period that begins later than this is counted: a fifth of it is about what a person feels."""
+"""A control period that begins later than this counts as late: a fifth of a period, about what a
+person notices."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,14 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         with closing(made) as sitting, quit_on_signals(sitting.quit):
             outcomes = drive(sitting, policy, seed_of, arguments.episodes)
-    print(
-        f"episodes: {_listed(outcomes) or 'none'}; {counted(recorder.index, 'step')}, "
-        f"{sitting.human_steps} of them yours in "
-        f"{counted(sitting.interventions, 'intervention')}; "
-        f"{counted(sitting.pacer.late, 'control period')} late"
-    )
-    if recorder.index:
-        print(recorder.path)
+    print(f"episodes: {_listed(outcomes) or 'none'}; {sitting.summary()}")
     return 0
 
 
@@ -172,7 +166,7 @@ class Sitting:
         self.episode = 0  # The number of the episode, or of the next one; the loop counts
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = self.discarded = 0
-        """The last counts what the others leave out."""
+        """Discarded episodes are counted in `discarded` alone."""
         self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
         and the episodes that missed the goal. A run that goes on adds what it had."""
@@ -241,13 +235,12 @@ class Sitting:
         applied = self._applied
         step = Step(
             **now,
-            layout=layout_text(self._layout),
             sitting=self.recorder.sitting,
             index=self.recorder.index,
             seed=self._seed,
             time_ns=self._read_ns,
-            frames=self._frames.tobytes(),
-            next_frame=(observation[1] if self._layout.stacked else observation).tobytes(),
+            seen=packed(self._frames),
+            seen_next=packed(observation),
             action=applied.action,
             human=applied.human,
             first=applied.first,
@@ -327,6 +320,18 @@ class Sitting:
             "control": self._applied.control,
             "speed_mps": float(self._info["speed_mps"]),
         }
+
+    def summary(self) -> str:
+        """What it amounts to, in a line."""
+        if not self.recorder.index:
+            return "nothing was driven, and nothing recorded"
+        discarded = f"{counted(self.discarded, 'episode')} discarded, " * bool(self.discarded)
+        return (
+            f"{counted(self.episodes, 'episode')}, {discarded}"
+            f"{counted(self.interventions, 'intervention')}, "
+            f"{counted(self.human_steps, 'step')} yours, "
+            f"{counted(self.pacer.late, 'control period')} late: {self.recorder.path}"
+        )
 
     def quit(self) -> bool:
         """Ask for the end of the sitting; False where it is over already."""

@@ -22,7 +22,7 @@ from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
-from trainer.person.recording import Recorder, read_steps
+from trainer.person.recording import Recorder, packed, read_steps
 from trainer.person.tests.people import record, recorded_step
 from trainer.pictures import CURVE_FILE
 from trainer.tests.test_commands import refusal
@@ -205,6 +205,7 @@ def test_the_command_writes_a_recording(tmp_path, one_thread):
     assert [path.name for path in tmp_path.glob("*.rrd*")] == ["run.rrd"]
 
 
+BLACK = packed(np.zeros((2, 45, 80), np.uint8))
 BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
 
@@ -218,7 +219,7 @@ def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", policy: float
             observation, reward, *_ = env.step(np.array([action], np.float32))
             recorder.write(recorded_step(
                 recorder.sitting, recorder.index, scenario=scenario, seed=seed, episode=episode,
-                step=number, frames=frames.tobytes(), next_frame=observation[1].tobytes(),
+                step=number, seen=packed(frames), seen_next=packed(observation),
                 policy_action=policy, action=action, human=5 <= number < 10, first=number == 5,
                 reward=float(reward), speed_mps=env.ego.speed,
                 outcome="restarted" if number == steps - 1 else "",
@@ -253,10 +254,10 @@ def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
     assert sorted(drawn) == [0, 12]
 
 
-@pytest.mark.parametrize("change", [{"frames": bytes(7200)}, {"scenario": "mine/Dock-v0"}])
+@pytest.mark.parametrize("change", [{"seen": BLACK}, {"scenario": "mine/Dock-v0"}])
 def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_path, change):
     steps = list(read_steps(drive(tmp_path)))
-    for number in range(7 if "frames" in change else 0, 15):
+    for number in range(7 if "seen" in change else 0, 15):
         steps[number] = msgspec.structs.replace(steps[number], **change)
     shown = view.Shown()
     entries = list(shown.entries([record(tmp_path, steps)]))

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from trainer.environments import make_environment
 from trainer.person.interface import Moving, Reading, View, Wish
-from trainer.person.recording import Recorder, Step
+from trainer.person.recording import Recorder, Step, packed
 from trainer.person.session import Sitting
 
 LET_GO = Reading()
@@ -80,9 +80,11 @@ def record(directory: Path, steps: Iterable[Step]) -> Path:
     return recorder.path
 
 
-def picture(value: int) -> bytes:
-    """A frame that is hard to compress, a different one for each value."""
-    return np.random.default_rng(value).integers(0, 255, (45, 80), np.uint8).tobytes()
+def pictures(value: int) -> bytes:
+    """Two frames that are hard to compress, others for each value, as a step has them."""
+    frames = [np.random.default_rng(each).integers(0, 255, (45, 80), np.uint8)
+              for each in (value, value + 1)]  # fmt: skip
+    return packed(np.stack(frames))
 
 
 def recorded_step(sitting: int, index: int, **changes: Any) -> Step:
@@ -90,7 +92,7 @@ def recorded_step(sitting: int, index: int, **changes: Any) -> Step:
     step = Step(
         sitting=sitting, index=index, scenario="left_turn", seed=1, episode=0, step=index,
         time_ns=10**9 + index * 10**8, time_s=0.1 * index,
-        frames=picture(index) + picture(index + 1), next_frame=picture(index + 2),
+        seen=pictures(index), seen_next=pictures(index + 1),
         policy_action=0.25, human_action=-0.5, action=0.25, control="policy",
         human=False, first=False, reward=float(index), terminated=False, truncated=False,
         speed_mps=3.0,

@@ -11,7 +11,7 @@ from bridge.report import STOPPED
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
 from trainer.environments import make_environment
 from trainer.person.interface import Reading
-from trainer.person.recording import find_recordings, read_steps
+from trainer.person.recording import find_recordings, packed, read_steps
 from trainer.person.tests.people import (
     LET_GO,
     QUIT,
@@ -60,7 +60,7 @@ WRONG = [
     (TRAIN, ("--speed", "2"), "--speed means nothing with --human expert"),
     (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
     (HUMAN, ("{tmp}",), "no recording in"),
-    (HUMAN, ("{tmp}/file",), "no recording of a sitting"),
+    (HUMAN, ("{tmp}/file",), "is no MCAP recording"),
     (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows it"),
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
@@ -158,7 +158,8 @@ def demonstrated(index: int):
     """Bright pictures are answered with throttle, dark ones with brake."""
     bright = index % 2 == 0
     return recorded_step(
-        1, index, frames=bytes([200 if bright else 20]) * 7200, control="human", human=True,
+        1, index, seen=packed(np.full((2, 45, 80), 200 if bright else 20, np.uint8)),
+        control="human", human=True,
         first=index == 0, human_action=0.8 if bright else -0.8, action=0.0,
     )  # fmt: skip
 
