@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Type, TypeVar
 
 import msgspec
@@ -63,10 +62,10 @@ _FLAGS: Dict[str, Tuple[str, str]] = {
     "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
     "tls": ("DIR", "this party's ca.pem, cert.pem, key.pem (deploy certs); endpoint tls/..."),
     "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
-    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to move besides"),
+    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to drive as well"),
     "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
-    "log_level": ("|".join(log.LEVELS), "least level that goes to stderr"),
-    "log_format": ("|".join(log.FORMATS), "a line of words, or a JSON object a line"),
+    "log_level": ("|".join(log.LEVELS), "lowest level that is logged to stderr"),
+    "log_format": ("|".join(log.FORMATS), "each event as a line of text, or as a JSON object"),
 }
 
 
@@ -98,18 +97,16 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     from_file = Config()
     if path is not None:
         try:
-            tables = _split_vehicle(read_toml(path, "config file"))
-            from_file = convert(tables, Config)
+            from_file = convert(_split_vehicle(read_toml(path, "config file")), Config)
+            _check(from_file)
         except UserError as error:
             raise UserError(f"config file {path}: {error}") from None
     bus = given.pop("bus", None)
     config = convert({**msgspec.structs.asdict(from_file), **given}, Config)
-    try:
-        _check(config)
-    except UserError as error:
-        if path is None or _is_valid(from_file):
-            raise  # the flag is wrong, not the file
-        raise UserError(f"config file {path}: {error}") from None
+    _check(config)
+    if not config.policy:
+        raise UserError("no policy to drive: name it with --policy, or as policy in --config")
+    check_fits(check_endpoint(config.connect), config.tls is not None)
     if bus is None:
         return config
     if config.vehicle != "hunter":
@@ -146,17 +143,8 @@ def convert(settings: Mapping[str, Any], kind: Type[_S], table: str = "") -> _S:
         raise UserError(f"{where}: {sentence}" if where else sentence) from None
 
 
-def _is_valid(config: Config) -> bool:
-    with contextlib.suppress(UserError):
-        _check(msgspec.structs.replace(config, policy=config.policy or "any"))
-        return True
-    return False
-
-
 def _check(config: Config) -> None:
-    if not config.policy:
-        raise UserError("no policy to drive: name it with --policy, or as policy in --config")
-    check_fits(check_endpoint(config.connect), config.tls is not None)
+    check_endpoint(config.connect)
     check_vehicle_id(config.vehicle_id)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)

@@ -26,7 +26,7 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """
     target = _checked(path)
     make_directory(target.parent)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    temporary = target.with_name(f".{secrets.token_hex(8)}")
     try:
         with temporary.open("xb") as stream:
             stream.write(data)

@@ -8,18 +8,14 @@ as is one from further ahead than any simulator can have come, unless the next s
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from typing import Dict, NamedTuple, Optional, Set, Tuple
+from typing import Dict, NamedTuple, Optional, Tuple
 
 from edge_runtime.wire import Reason, Rejection, State
 
 TAKEOVER_PERIODS = 2
-# So many past sessions are remembered with their position: they may come back with newer states.
-# All sessions before them are known to be over, by a hash of 8 bytes.
-_REMEMBERED_SESSIONS = 16
-MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after the other
-# One message from far ahead would make all that follow it old. So much may be lost on the way,
-# and besides as many as a quick simulator counts while nothing arrives.
+MAX_SESSIONS = 10_000  # Some 6 MB, and half an hour of one take-over after the other
+# One message from far ahead would make all that follow it old. So many may be lost on the way; the
+# two rates below add what a fast simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
 MAX_SKIPPED_STEPS = 10_000
 MAX_LOST_STEPS = 10  # From one state to the next that is heard
@@ -46,8 +42,7 @@ class LatestState:
         self._session: Optional[str] = None
         self._heard_s = -math.inf
         # Where each session stood: a delayed message of an earlier one never goes back either.
-        self._lasts: OrderedDict[str, _Last] = OrderedDict()
-        self._forgotten: Set[int] = set()
+        self._lasts: Dict[str, _Last] = {}
         # Session, episode and step of the newest that was too far ahead, since the last accepted
         self._leap: Optional[Tuple[str, int, int]] = None
 
@@ -58,9 +53,6 @@ class LatestState:
             return self.reject(rejection)
         self._session, self._heard_s, self._leap = state.session, now_s, None
         self._lasts[state.session] = _Last((state.episode, state.step), now_s)
-        self._lasts.move_to_end(state.session)
-        while len(self._lasts) > _REMEMBERED_SESSIONS:
-            self._forgotten.add(hash(self._lasts.popitem(last=False)[0]))
         self.accepted += 1
         return None
 
@@ -79,21 +71,19 @@ class LatestState:
             words = f"session {session!r} while {self._session!r} is not silent"
             return Rejection(Reason.FOREIGN_SESSION, words)
         last = self._lasts.get(session)
-        if last is not None:
-            refusal = _judge_position((state.episode, state.step), last, now_s, self._period_s)
-            if refusal is None or refusal.reason is not Reason.FUTURE:
-                return refusal
-            leap, self._leap = self._leap, (session, state.episode, state.step)
-            if leap is not None and leap[:2] == (session, state.episode):
-                # A simulator that counts in leaps goes on from where it came to.
-                return None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
-            return refusal
-        if hash(session) in self._forgotten:
-            return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
-        if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over
-            words = f"there were {len(self._forgotten)} simulators before; start the runtime again"
+        if last is None:
+            if len(self._lasts) < MAX_SESSIONS:
+                return None
+            words = f"there were {MAX_SESSIONS} simulators before; start the runtime again"
             return Rejection(Reason.FOREIGN_SESSION, words)
-        return None
+        refusal = _judge_position((state.episode, state.step), last, now_s, self._period_s)
+        if refusal is None or refusal.reason is not Reason.FUTURE:
+            return refusal
+        leap, self._leap = self._leap, (session, state.episode, state.step)
+        if leap is not None and leap[:2] == (session, state.episode):
+            # A simulator that counts in leaps goes on from where it came to.
+            return None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
+        return refusal
 
 
 def _judge_position(

@@ -142,12 +142,12 @@ def open_network(data: bytes) -> onnxruntime.InferenceSession:
 def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
     """What every policy must answer before it drives: zeros, middling values, seeded noise.
 
-    Bytes over their range, other numbers from 0 to 1.
+    Bytes over their range, floats from 0 to 1, integers 0 and 1.
     """
     random = np.random.RandomState(0)
     for make in (np.zeros, lambda shape: np.full(shape, 0.5), random.random_sample):
         yield {
-            name: np.asarray(make(shape) * (256 if dtype.kind == "u" else 1)).astype(dtype)
+            name: np.asarray(make(shape) * {"u": 256, "i": 2}.get(dtype.kind, 1)).astype(dtype)
             for name, dtype, shape, _ in layout.parts
         }
 

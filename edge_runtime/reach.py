@@ -73,8 +73,11 @@ def _why_not_plain(plain: socket.socket) -> str:
 
 
 def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
-    context = ssl.create_default_context(cafile=files.ca)
-    context.load_cert_chain(files.certificate, files.key)
+    try:
+        context = ssl.create_default_context(cafile=files.ca)
+        context.load_cert_chain(files.certificate, files.key)
+    except OSError as error:  # They may be replaced at this moment.
+        return f"cannot be asked with the certificate of {files.name}: {error.strerror or error}"
     shaken = False
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:

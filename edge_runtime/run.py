@@ -101,7 +101,7 @@ def drive(
         check_driver(driver)
     flags = {"policy": policy and str(policy), "connect": connect, **settings}
     try:
-        loaded = load_config(config, {**flags, "vehicle": NONE if driver else vehicle})
+        loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
         log.configure(loaded.log_level, loaded.log_format)
         with contextlib.ExitStack() as undo:
             undo.callback(log.close)
@@ -143,10 +143,12 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         period_s = policy.manifest.control_period_s
         if config.vehicle != NONE:
             vehicle = make_vehicle(config.vehicle, config.vehicle_settings, policy.manifest)
+        name, its_limits = NONE, {}
         if vehicle is not None:
             undo.callback(vehicle.close)
             vehicle.control_period_s = period_s
-        limits = shared_limits(policy.manifest.action, vehicle.limits if vehicle else {})
+            name, its_limits = vehicle.name, vehicle.limits
+        limits = shared_limits(policy.manifest.action, its_limits)
         ride, quality, armed = None, None, config.armed_at_start
         if config.ride_through.max_s:
             from edge_runtime.ride import Ride
@@ -191,7 +193,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         if policy.trust != VERIFIED:
             log.event("warning", "policy_not_verified", trust=policy.trust)
         print(
-            f"ready vehicle_id={config.vehicle_id} vehicle={vehicle.name if vehicle else NONE}"
+            f"ready vehicle_id={config.vehicle_id} vehicle={name}"
             f" connect={config.connect} policy_id={policy.policy_id}",
             flush=True,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import queue
 import subprocess
@@ -17,7 +18,7 @@ import zenoh
 from edge_runtime import wire
 from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
-from edge_runtime.tests.policies import SIZE
+from edge_runtime.tests.policies import SIZE, T
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 
@@ -102,6 +103,7 @@ class Simulator:
         self.commands: queue.Queue[Command] = queue.Queue()
         self.health: List[Health] = []
         self.feedback: List[Feedback] = []
+        self.steps = itertools.count()
         self._session = open_session(listen=endpoint, mode="router")
         self.alive = threading.Event()
         alive, tokens = wire.key(vehicle_id, "alive"), self._session.liveliness()
@@ -134,6 +136,20 @@ class Simulator:
             place = (command.session, command.episode, command.step)
             if place == (state.session, state.episode, state.step):
                 return command
+
+    def drive_until(
+        self, holds: Callable[[], Any], what: str, rearms: bool = False, **changes: Any
+    ) -> None:
+        """Answered states at 10 Hz; an operator beside it re-arms where that is asked."""
+
+        def does_after_a_state() -> Any:
+            self.ask(make_state(next(self.steps), **changes))
+            if rearms and self.health[-1].needs_rearm:
+                self.query("rearm")
+            time.sleep(T)
+            return holds()
+
+        wait_until(does_after_a_state, what)
 
     def next_command(self) -> Command:
         return self.commands.get(timeout=PATIENCE_S)

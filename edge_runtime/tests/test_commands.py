@@ -138,9 +138,10 @@ def test_wrong_config_files(settings, text):
 
 
 @pytest.mark.parametrize("flags", [{"log_level": "loud", "policy": "p.onnx"}, {}])
-def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags):
+@pytest.mark.parametrize("text", ["log_level = 'debug'", "tls = 'certs/edge-hunter01'"])
+def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags, text):
     with pytest.raises(UserError, match=r"^((?!edge\.toml).)*$"):
-        load_config(settings("log_level = 'debug'"), flags)
+        load_config(settings(text), {"connect": "tls/10.0.0.2:7447", **flags})
 
 
 def test_flags_win_over_the_file(settings):

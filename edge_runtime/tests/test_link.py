@@ -5,6 +5,7 @@ import socket
 import socketserver
 import threading
 import time
+from datetime import datetime, timezone
 from itertools import count
 from types import SimpleNamespace
 from typing import Any, List
@@ -19,6 +20,7 @@ from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.reach import free_endpoint, look
 from edge_runtime.run import say_what_is_missing
 from edge_runtime.tests.harness import HEALTH, wait_until
+from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 
@@ -163,6 +165,16 @@ def test_a_server_that_speaks_tls_and_one_that_speaks_something_else(answer, wor
     with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
         threading.Thread(target=listening.handle_request, daemon=True).start()
         assert words in look(f"tcp/127.0.0.1:{listening.server_address[1]}", None)[1]
+
+
+def test_certificates_that_are_gone_are_a_reason_and_no_traceback(tmp_path):
+    """Somebody may replace them while a runtime looks for others, once a second."""
+    ca, certificate, key = (str(tmp_path / name) for name in ("ca.pem", "cert.pem", "key.pem"))
+    gone = TlsFiles(ca, certificate, key, "edge-hunter01", datetime.now(timezone.utc))
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        answers, why = look(f"tls/127.0.0.1:{listening.getsockname()[1]}", gone)
+    assert answers
+    assert f"{gone.name}: No such file or directory" in why
 
 
 @pytest.fixture

@@ -16,14 +16,15 @@ from msgspec.structs import replace
 from onnx import TensorProto, helper
 
 from edge_runtime import policy as module
-from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, decode_manifest
-from edge_runtime.policy import check_graph, infer, load_policy, verify
+from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, Layout, decode_manifest
+from edge_runtime.policy import check_graph, infer, load_policy, probes, verify
 from edge_runtime.tests.policies import (
     PEDAL,
     ROVER,
     ROVER_INPUTS,
     SHAPE,
     STEERING,
+    TASK,
     WHEELS,
     public_pem,
     write_policy,
@@ -58,6 +59,12 @@ def test_a_signed_policy_drives(make_policy, actions):
         action = policy.act({"frames": np.full(SHAPE, level, np.uint8)})
         assert action.dtype == np.float32
         np.testing.assert_allclose(action, [level / 127.5 - 1] * len(actions), atol=1e-6)
+
+
+def test_a_probe_of_integers_is_not_all_zeros():
+    gear = {"gear": Entry(dtype="int64", shape=[100])}
+    seen = [probe["gear"] for probe in probes(Layout(replace(TASK, observation=gear)))]
+    assert [set(gears.tolist()) for gears in seen] == [{0}, {1}, {0, 1}]
 
 
 ONE_AT_A_TIME = {**ROVER_INPUTS, "camera": "uint8[1, 4, 6, 3]"}

@@ -20,9 +20,10 @@ from hypothesis import strategies as st
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests import ros2_side as second
 from edge_runtime.tests.harness import wait_until
+from edge_runtime.tests.rigs import a_manifest
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import ros2
+from edge_runtime.vehicles import make_vehicle, ros2
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.wire import Reason
@@ -227,3 +228,5 @@ def test_without_pycdr2_one_line_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, ros.__name__)
     with pytest.raises(UserError, match="pip install pycdr2"):
         importlib.import_module(ros.__name__)
+    with pytest.raises(UserError, match="no topic to command by"):  # That is known without it.
+        make_vehicle("ros2", {"ros2": {"twist_topic": ""}}, a_manifest())

@@ -1,15 +1,13 @@
 """The ROS 2 driver: first in made-up time, then on real Zenoh sessions, against rosbags."""
 
 import contextlib
-import itertools
 import math
 import time
 
 import pytest
 
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, wait_until
-from edge_runtime.tests.policies import T
+from edge_runtime.tests.harness import EdgeProcess, Simulator, wait_until
 from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from edge_runtime.tests.ros2_side import RosHunter
 from edge_runtime.util import UserError
@@ -162,37 +160,27 @@ def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(make_
     with Simulator(endpoint) as simulator, EdgeProcess(*flags) as edge, RosHunter(
         connect=ros_endpoint
     ) as hunter:
-        steps = itertools.count()
-
-        def drive_until(condition, what, rearms=False):
-            """Answered states at 10 Hz; an operator beside it re-arms where that is asked."""
-
-            def holds():
-                simulator.ask(make_state(next(steps)))
-                if rearms and simulator.health[-1].needs_rearm:
-                    simulator.query("rearm")
-                time.sleep(T)
-                return condition()
-
-            wait_until(holds, what)
-
         simulator.wait_for_edge()
         wait_until(lambda: len(hunter.twists) > 10, "zeros")
         assert hunter.asked_mps == 0.0
         # Nobody may have been there for the first enabling.
-        drive_until(lambda: hunter.speed_mps > 0.5, "the Hunter to drive", rearms=True)
+        simulator.drive_until(lambda: hunter.speed_mps > 0.5, "the Hunter to drive", rearms=True)
         wait_until(lambda: simulator.feedback[-1].speed_mps > 0.3, "its feedback")
         feedback = simulator.feedback[-1]
         assert feedback.vehicle == "ros2"
         assert feedback.scenario_speed_mps == pytest.approx(4 * feedback.speed_mps)
         wait_until(lambda: hunter.speed_mps < 0.02, "the stop without states")
-        count = next(steps)
-        drive_until(lambda: next(steps) > count + 20, "a second of states again")
+        count = next(simulator.steps)
+        simulator.drive_until(
+            lambda: next(simulator.steps) > count + 20, "a second of states again"
+        )
         assert hunter.asked_mps == 0.0
-        drive_until(lambda: hunter.speed_mps > 0.3, "it to drive again", rearms=True)
+        simulator.drive_until(lambda: hunter.speed_mps > 0.3, "it to drive again", rearms=True)
         hunter.silent = True
         silence = "no fresh odometry on /odom"
-        drive_until(lambda: silence in simulator.feedback[-1].faults, "the fault in words")
+        simulator.drive_until(
+            lambda: silence in simulator.feedback[-1].faults, "the fault in words"
+        )
         assert hunter.asked_mps == 0.0
         assert not simulator.query("rearm")["accepted"]
         assert edge.end() == 0

@@ -191,26 +191,16 @@ def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
     assert not simulator.query("rearm")["accepted"]  # the link is not back
     assert {c.mode for c in drive(simulator, range(20, 40))} == {"safe_stop"}
     assert last_health(simulator, lambda h: h.needs_rearm)
-    steps = itertools.count(40)
-
-    def is_taken():  # an operator's query, made between two states
-        simulator.ask(make_state(next(steps)))
-        return simulator.query("rearm")["accepted"]
-
-    wait_until(is_taken, "the re-arm")
-    assert "drive" in [c.mode for c in drive(simulator, itertools.islice(steps, 10))]
+    simulator.steps = itertools.count(40)
 
     def moves():
-        drive(simulator, [next(steps)])
         return simulator.feedback[-1].speed_mps > 0.1
 
-    wait_until(moves, "the mock moves again")
-    simulator.send(make_state(next(steps), final=True))
+    simulator.drive_until(moves, "the mock moves again", rearms=True)
+    simulator.send(make_state(next(simulator.steps), final=True))
     wait_until(lambda: simulator.feedback[-1].speed_mps == 0.0, "it stands between two episodes")
-    in_the_next = (make_state(step, episode=1) for step in itertools.count())
     # No operator is needed for another episode.
-    wait_until(lambda: simulator.ask(next(in_the_next)) and simulator.feedback[-1].speed_mps > 0.1,
-               "the next drive")  # fmt: skip
+    simulator.drive_until(moves, "the next drive", episode=1)
 
 
 def test_a_stop_that_came_before_there_was_a_loop_counts(make_policy):

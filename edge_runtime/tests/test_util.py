@@ -36,6 +36,9 @@ def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path, m
     assert json.loads(path.read_text()) == {"a": 2}
     assert os.listdir(path.parent) == ["out.json"]
     write_json_out(None, {"a": 3})
+    longest = path.with_name("a" * 250 + ".json")  # as a file system has it
+    write_json_out(longest, {"a": 4})
+    assert json.loads(longest.read_text()) == {"a": 4}
 
 
 def refused(path, match=None):

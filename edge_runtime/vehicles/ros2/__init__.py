@@ -190,9 +190,9 @@ class Ros2Vehicle(StreamedVehicle):
     settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings
 
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
+        check_settings(settings)
         from edge_runtime.vehicles.ros2 import node as ros
 
-        check_settings(settings)
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
         self._failing = False
