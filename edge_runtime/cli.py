@@ -22,7 +22,7 @@ from edge_runtime.util import UserError, ending_signals, printable, take_signals
 BAD_INPUT = 2
 INTERRUPTED = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-AGAIN_S = 0.3  # So soon after another it is the same signal: `timeout` tells process and group
+AGAIN_S = 0.3  # A second signal so soon is the same one: `timeout` signals process and group
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 

@@ -95,7 +95,7 @@ class Received(NamedTuple):
 
 
 class Order(NamedTuple):
-    """A command to send, but for the sender's stamps; a `ridden` one to this end's vehicle only."""
+    """A command without the sender's stamps. `ridden`: of a plan, for this end's vehicle only."""
 
     answers: Received
     mode: str
@@ -134,10 +134,10 @@ class Controller:
         self._limits = limits
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(limits)
-        self._ordered_s = -math.inf  # when that was said
+        self._ordered_s = -math.inf  # when that was ordered
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
-        self._next_stop_s = math.inf  # the first safe stop is an answer
+        self._next_stop_s = math.inf  # nothing is repeated before a first safe stop
         if needs_rearm and not armed_at_start:
             self._apply(Event.NOT_ARMED)
 

@@ -147,7 +147,7 @@ class Hold:
             fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
-        except OSError:  # No locks here, so nobody can hold one; or but for now: it asks again.
+        except OSError:  # No locks on this file system; if only for now, the next call asks.
             return False
         self._stream.close()
         self._stream = None

@@ -154,7 +154,7 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
     """Whether a router answers. Raises UserError where another runtime has this vehicle id.
 
     Two peers do not hear each other through a router, so a client asks it. The token of a process
-    that was just killed may stay for a lease: one that is found must outlast it.
+    that was just killed may stay for a lease, so one that is found counts only if it outlasts that.
     """
     selector = f"{key(vehicle_id, 'alive')}/**"
     found = _ask(open_client, selector)
@@ -260,7 +260,7 @@ class Presence:
 
 
 def wait_for_router(session: zenoh.Session) -> None:
-    """Wait 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
+    """Wait up to 0.2 s for the router that answered: before it is linked tokens go out twice."""
     end_s = time.monotonic() + _CONNECT_S
     while not session.info.routers_zid() and time.monotonic() < end_s:
         time.sleep(0.002)

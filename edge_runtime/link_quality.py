@@ -13,9 +13,9 @@ With the edge's own stamps these are NTP's four (RFC 5905, section 8):
 -min(down) and min(up); its middle is wrong by at most half the least round trip (the clock filter
 of section 10; each way has its own least time, for a command is paired with no one state).
 
-Half the mean round trip needs no offset: that meets the envelope, whose networks are the same each
-way. Of two ways that differ, the same that harms as much counts: delays add up, so do variances,
-and two losses in a row come with the square of their share.
+Half the mean round trip needs no offset. It is what the envelope was measured with: the same delay
+each way. Two ways that differ count as the equal pair that does the same harm: delays add up, so do
+variances, and two losses in a row come with the square of their share.
 """
 
 from __future__ import annotations
@@ -90,19 +90,19 @@ def read_envelope(value: Any, task: Task) -> LinkEnvelope:
 # Windows in messages. A deviation of 300 is good to 4 %, and follows a change in 15 s at 10 Hz.
 # A share of 5 % needs 1,200 each way to be good to half a point.
 TIMES, MESSAGES = 300, 1200
-KNOWN, TO_ARM = 20, 200  # Fewer messages of either way say nothing, and arm no vehicle
-OUTAGE_EVERY_S = 3.0  # Of the envelope's outages: what is lost in runs counts as lost so
+KNOWN, TO_ARM = 20, 200  # Messages each way before anything is said; before a vehicle may be armed
+OUTAGE_EVERY_S = 3.0  # The envelope's outages come so often: it turns a share into their length
 LEAST = 600  # No drive stops for a share of fewer: one loss in 20 would be 5 %
 EVERY = 5  # So many commands from one look to the next: a look takes a quarter of a millisecond
 UNSEEN = 3  # So many losses may have been missed (rule of three): to arm, they count
-FLOOR = 0.05  # The part of the times below their floor: one alone is a matter of luck
+FLOOR = 0.05  # The quantile that is the floor of the times: the least alone is luck
 STOP_ABOVE, ARM_BELOW = 0.9, 0.8
 """Loads; 1 is the envelope's edge. What is known of a link lags behind it, so that one that gets
 worse stops the vehicle before the edge. Below the lower one it is inside again."""
 ACCURACY = {
     "delay_ms": 5.0, "jitter_ms": 5.0, "loss_percent": 1.0, "burst_messages": 1.0, "outage_s": 0.1
 }  # fmt: skip
-"""The axes. No limit counts as lower: so far reaches what the machine itself disturbs."""
+"""The axes. A smaller limit counts as this much: the machine itself disturbs as much."""
 
 
 class _Way:

@@ -2,8 +2,8 @@
 
 The signature is Ed25519 over the whole file: `POLICY.onnx.sig`, 64 raw bytes; keys are PEM. Before
 onnxruntime loads the file it is walked field by field, without the onnx package: whatever could
-keep weights where nobody looks, or take a time that hangs on the picture, is refused. The manifest
-(manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
+keep weights where nobody looks, or make the run time depend on the picture, is refused. The
+manifest (manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
 """
 
 from __future__ import annotations
@@ -278,7 +278,7 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
 
 
 def check_graph(data: bytes) -> dict[str, str]:
-    """The metadata of a whole ONNX file that the board can run; onnxruntime does not tell it.
+    """Check a whole ONNX file, which onnxruntime does not, and return its metadata.
 
     Raises UserError for truncated or foreign bytes, for weights anywhere but in plain tensors
     inside the file, and for another IR version or operator set.

@@ -121,8 +121,7 @@ def check_port_is_free(endpoint: str) -> None:
 def free_endpoint(protocol: str = "tcp") -> str:
     """A Zenoh endpoint on loopback that nobody listens on, for demos and tests.
 
-    While this process lives, or has asked for a hundred more, no other one that asks the system for
-    a TCP port is given the same.
+    A TCP port stays reserved until this process ends or has asked for a hundred more.
     """
     probe = socket.socket(type=_kind(protocol))
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same

@@ -55,7 +55,7 @@ class Ride:
         return self._lag_s > SILENCE_PERIODS * self._period_s
 
     def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
-        """The plan of the command `action`, of which the policy `wanted` more; it counts from now.
+        """The actions after the command `action`, on towards what the policy `wanted`, from now on.
 
         Each action is limited like the command's own.
         """

@@ -97,12 +97,12 @@ class Safety(NamedTuple):
 
     @property
     def answer_s(self) -> float:
-        """So long the newest state may be answered: 2 T, and a fifth of T as grace."""
+        """How long the newest state may be answered: 2 T, and a fifth of T as grace."""
         return SILENCE_PERIODS * self.control_period_s
 
     @property
     def silence_s(self) -> float:
-        """So long no state need come. What drives has its last plan for `ride_s` more."""
+        """How long silence is no fault. What drives has its last plan for `ride_s` more."""
         return SILENCE_PERIODS * self.control_period_s + self.ride_s * (self.mode is Mode.DRIVE)
 
 

@@ -73,7 +73,7 @@ def open_session(
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
     if listens:
-        from edge_runtime.reach import check_port_is_free  # Here: a board never listens.
+        from edge_runtime.reach import check_port_is_free  # Here: most sessions only connect.
 
         for endpoint in listens:
             check_port_is_free(endpoint)

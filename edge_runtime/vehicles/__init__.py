@@ -91,9 +91,9 @@ def find_vehicle(name: str) -> Type[Vehicle]:
 
 
 def installed_as(own_name: str) -> str:
-    """The name by which an installed driver is chosen, of one that calls itself `own_name`.
+    """The installed name of the driver that calls itself `own_name`, as a recording has it.
 
-    A recording knows the latter. Where none does, it is returned as it is.
+    Where none is installed it is `own_name` itself.
     """
     for point in _others():
         with contextlib.suppress(UserError):

@@ -128,7 +128,7 @@ class Reports(Speeds):
     def _count(self, counter: int, now_s: float) -> None:
         """A status is a sign of life where its counter is ahead of all before, or it was silent.
 
-        Half of the circle is ahead: frames that go round and round are behind their newest one.
+        Up to 127 ahead is newer: frames that are replayed lie behind, and do not count.
         """
         was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
         if was_silent or 0 < (counter - self._counter) % COUNTERS < COUNTERS // 2:
