@@ -17,54 +17,6 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 
 
-class SumTree:
-    """Non-negative weights of ``capacity`` leaves, with their sums in a binary tree.
-
-    All operations take arrays, so that a minibatch costs a few numpy calls a level and not a
-    Python loop. Node 1 is the root; the children of node k are 2k and 2k + 1.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self._leaves = 1 << max(capacity - 1, 1).bit_length()
-        self._nodes = np.zeros(2 * self._leaves)
-
-    @property
-    def total(self) -> float:
-        """The sum of all weights."""
-        return float(self._nodes[1])
-
-    def __getitem__(self, indices: Indices) -> NDArray[np.float64]:
-        return self._nodes[self._leaves + indices]
-
-    def __setitem__(self, indices: Indices, weights: NDArray[np.float64]) -> None:
-        """Set weights, shape [n]; of an index named twice, the last one counts."""
-        nodes = self._leaves + np.asarray(indices, dtype=np.int64)
-        self._nodes[nodes] = weights
-        while nodes[0] > 1:
-            # Parents are summed anew from both children: repeated updates cannot drift.
-            nodes = np.unique(nodes >> 1)
-            self._nodes[nodes] = self._nodes[2 * nodes] + self._nodes[2 * nodes + 1]
-
-    def find(self, masses: NDArray[np.float64]) -> Indices:
-        """The leaves in whose share of the total the given cumulative masses fall, shape [n]."""
-        nodes = np.ones(len(masses), dtype=np.int64)
-        left_over = np.array(masses, dtype=np.float64)
-        while nodes[0] < self._leaves:
-            nodes *= 2
-            left = self._nodes[nodes]
-            # An empty right side is never entered, however rounding turned out.
-            right = (left_over >= left) & (self._nodes[nodes + 1] > 0.0)
-            left_over -= np.where(right, left, 0.0)
-            nodes += right
-        return nodes - self._leaves
-
-    def sample(self, count: int, random: np.random.Generator) -> Indices:
-        """``count`` leaves, stratified: one from each of ``count`` equal parts of the total."""
-        masses = (np.arange(count) + random.random(count)) * (self.total / count)
-        return self.find(masses)
-
-
 class Layout(NamedTuple):
     """How an observation lies in an array."""
 
@@ -81,7 +33,7 @@ COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
 """What is kept of a transition beside its pictures."""
-AHEAD = "foreseen_"  # What the names of the foreseen ones' state begin with
+AHEAD = "foreseen_"  # Prefix of the foreseen buffer's keys in a checkpoint
 
 
 @dataclass(frozen=True)
@@ -104,7 +56,7 @@ class Batch:
     """What the policy would have done where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_]  # Whether the overruled action is (eq. 17), [n]
     foreseen: Batch | None = None
-    """Others, whose ``next_frames`` are what an overruled action would have led to, or None."""
+    """A second batch, whose ``next_frames`` are what overruled actions would have led to."""
 
 
 class ReplayBuffer:
@@ -159,7 +111,8 @@ class ReplayBuffer:
         self._overruled = np.zeros((capacity, action_size), np.float32)
         self._penalised = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
-        self._trees = [SumTree(capacity) for _ in range(2 if separate or human_share else 1)]
+        self._weights = np.zeros(capacity)  # priority ** alpha; 0 where forgotten
+        self._apart = separate or human_share > 0.0
         self._foreseen: ReplayBuffer | None = None
         if foresees:
             self._foreseen = ReplayBuffer(capacity, action_size, alpha=0.0, layout=layout)
@@ -223,7 +176,7 @@ class ReplayBuffer:
         """
         assert self._current is not None  # An episode has begun.
         others = self._priorities[: self._used]
-        if len(self._trees) > 1:  # It enters one of two buffers, each with priorities of its own
+        if self._apart:  # It enters one of two buffers, each with priorities of its own
             others = others[self._human[: self._used] == human]
         priority = float(others.max(initial=0.0)) or 1.0
         newest = self._add_picture(next_frames[1] if self._stacked else next_frames)
@@ -252,19 +205,18 @@ class ReplayBuffer:
         return batch
 
     def _draw(self, count: int, random: np.random.Generator) -> Indices:
-        if len(self._trees) == 1:
-            return self._trees[0].sample(count, random)
-        # Stratified over both: each kind gets its share of the samples, to one.
+        # Stratified: one from each of `count` equal parts.
         strata = (np.arange(count) + random.random(count)) / count
+        weights, human = self._weights[: self._used], self._human[: self._used]
+        if not self._apart:
+            return _find(weights, strata)
+        # Over both kinds: each gets its share of the samples, to one.
         policys_share = 1.0 - self._humans_share()
         policys = strata[strata < policys_share] / policys_share
         humans = (strata[strata >= policys_share] - policys_share) / (1.0 - policys_share)
+        parts = (~human, policys), (human, humans)
         return np.concatenate(
-            [
-                tree.find(share * tree.total)
-                for tree, share in zip(self._trees, (policys, humans), strict=True)
-                if len(share)
-            ]
+            [_find(weights * own, shares) for own, shares in parts if len(shares)]
         )
 
     def update_priorities(self, indices: Indices, priorities: NDArray[np.float64]) -> None:
@@ -272,7 +224,7 @@ class ReplayBuffer:
         if not np.all(np.isfinite(priorities)) or np.any(priorities < 0):
             raise ValueError("a priority must be finite and not negative")
         self._priorities[indices] = priorities
-        self._set_weights(indices, priorities**self.alpha)
+        self._weights[indices] = priorities**self.alpha
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
@@ -300,10 +252,8 @@ class ReplayBuffer:
         for name in COLUMNS:
             getattr(self, f"_{name}")[: self._used] = state[name]
         # What was here before must not be drawn any more.
-        self._trees = [SumTree(self.capacity) for _ in self._trees]
-        alive = self.alive
-        if len(alive):
-            self._set_weights(alive, self._priorities[alive] ** self.alpha)
+        self._weights[:] = 0.0
+        self._weights[self.alive] = self._priorities[self.alive] ** self.alpha
         if self._foreseen is not None:
             own = {n.removeprefix(AHEAD): v for n, v in state.items() if n.startswith(AHEAD)}
             self._foreseen.load_state_dict(own)
@@ -359,24 +309,18 @@ class ReplayBuffer:
         return sums.astype(np.float32), lasts, terminals, spans
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
-        if len(self._trees) == 1:
-            return self._trees[0][indices] / self._trees[0].total
-        human, share = self._human[indices], self._humans_share()
-        policys, humans = (tree[indices] / max(tree.total, 1e-300) for tree in self._trees)
-        return np.where(human, share * humans, (1.0 - share) * policys)
+        weights, human = self._weights[: self._used], self._human[: self._used]
+        if not self._apart:
+            return weights[indices] / weights.sum()
+        share = self._humans_share()
+        sums = (max(weights[own].sum(), 1e-300) for own in (~human, human))
+        policys, humans = (weights[indices] / total for total in sums)
+        return np.where(human[indices], share * humans, (1.0 - share) * policys)
 
     def _humans_share(self) -> float:
         """Of what is drawn, where the two kinds are drawn apart."""
         there = self.human_count / len(self)
         return self.human_share if self.human_share and 0.0 < there < 1.0 else there
-
-    def _set_weights(self, indices: Indices, weights: NDArray[np.float64]) -> None:
-        if len(self._trees) == 1:
-            self._trees[0][indices] = weights
-            return
-        human = self._human[indices]
-        for tree, own in zip(self._trees, (~human, human), strict=True):
-            tree[indices] = weights * own
 
     def _frames(self, slots: Indices, first: int) -> NDArray[Any]:
         """What each transition began with (``first`` is 0) or led to (1), [n, 2, 45, 80]."""
@@ -400,10 +344,16 @@ class ReplayBuffer:
             lost.append(self._oldest % self.capacity)
             self._oldest += 1
         if lost:
-            # Weights of 0, not 0 ** alpha, which is 1 where alpha is 0.
-            self._priorities[lost] = 0.0
-            self._set_weights(np.array(lost), np.zeros(len(lost)))
+            # A weight of 0, not 0 ** alpha, which is 1 where alpha is 0.
+            self._priorities[lost] = self._weights[lost] = 0.0
         return number
+
+
+def _find(weights: NDArray[np.float64], shares: NDArray[np.float64]) -> Indices:
+    """The indices in whose part of the sum of all weights the shares (0 to below 1) fall."""
+    sums = np.cumsum(weights)
+    found = np.searchsorted(sums, shares * sums[-1], side="right")
+    return np.minimum(found, np.flatnonzero(weights)[-1])  # Rounding may lead beyond the last.
 
 
 def _mean(values: NDArray[np.float64]) -> float:
