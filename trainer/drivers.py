@@ -90,8 +90,8 @@ def load_driver(
 ) -> tuple[Driver, str]:
     """The driver that the word or path ``policy`` names, and its policy id.
 
-    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`. Whoever
-    shows it what is on its way may have one that ``knows_delay``.
+    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
+    ``knows_delay``: the caller shows the driver the actions under way.
 
     Raises UserError: nothing there that drives.
     """

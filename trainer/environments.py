@@ -91,7 +91,7 @@ def task_of(env: Any) -> Task:
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:
     """The observation, and those that the action held for so many steps would lead to.
 
-    A copy of the environment takes them; an episode that ends there has fewer.
+    A copy of the environment takes the steps; fewer where the episode ends.
     """
     seen, ahead = [observation], copy.deepcopy(env)
     for _ in range(steps):

@@ -18,11 +18,14 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError, counted, read_json
+from edge_runtime.manifest import MANIFEST_KEY, decode_manifest
+from edge_runtime.policy import MAX_POLICY_MIB, check_graph
+from edge_runtime.util import UserError, counted, read_bytes, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, set_threads
+from trainer.scenarios import SCENARIOS
 from trainer.training.delayed import VehicleEnd
 
 EXAMPLE = examples(
@@ -153,10 +156,15 @@ def evaluate(
 
 
 def _trained_in(policy: str) -> str:
-    """The scenario of a run or a human model; of anything else the left turn."""
+    """The scenario of a run, a human model or a policy file; of anything else the left turn."""
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
             return str(read_json(Path(policy) / name, "config").get("scenario"))
+    if policy.endswith(".onnx"):
+        metadata = check_graph(read_bytes(policy, "policy file", MAX_POLICY_MIB))
+        task = decode_manifest(metadata[MANIFEST_KEY]).task if MANIFEST_KEY in metadata else ""
+        if task in SCENARIOS:
+            return task
     return "left_turn"
 
 

@@ -44,7 +44,7 @@ def add_threads(parser: Group) -> None:
         type=whole_number(0, MOST_THREADS),
         default=0,
         metavar="N",
-        help="processor threads of the learner; 0: all cores",
+        help="processor threads of the learner; 0: torch's own default",
     )
 
 

@@ -118,9 +118,10 @@ def export_policy(
     graph = _to_onnx(network, entries)
     model = make_policy(graph, task, label["algorithm"], about, envelope)
     difference = parity(network, model, entries)
-    if not difference < PARITY_TOLERANCE * max(1.0, float(network.reach.max())):
+    allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
+    if not difference < allowed:
         raise UserError(
-            f"onnxruntime and torch differ by {difference:.1e} (allowed: {PARITY_TOLERANCE:.0e}); "
+            f"onnxruntime and torch differ by {difference:.1e} (allowed: {allowed:.0e}); "
             "nothing was written"
         )
     return Export(model, policy_id_of(model), difference)

@@ -75,8 +75,8 @@ EPISODES = (
 SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
 """The plots of recorded sittings, which hold nothing of a learner."""
 RECENT = (
-    Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
-    Plot("speed", "Speed, m/s, the last 20 s"),
+    Plot("action", f"Action in [-1, 1], the last {RECENT_STEPS} steps", (-1.1, 1.1)),
+    Plot("speed", f"Speed, m/s, the last {RECENT_STEPS} steps"),
 )
 MEASURED = {
     "success/validation": (draw.ORANGE, "validation_success"),
@@ -193,7 +193,7 @@ class Watcher:
     def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put = run, put
         self._pace = Pace(draw.PICTURE_INTERVAL_S)
-        self._step = run.learning.added
+        self._step = run.steps
         self._entries: list[StepEntry] = []
 
     def on_step(self, seen: Seen) -> None:
@@ -432,7 +432,8 @@ def _status(metrics: EpisodeMetrics) -> rr.TextDocument:
         f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
         f"{counted(metrics.interventions, 'intervention')}, "
         f"{counted(metrics.human_steps, 'step')} the human's",
-        f"{metrics.distance_m:.1f} m, return {metrics.episode_return:.1f}",
+        f"{metrics.distance_m:.1f} m, " * math.isfinite(metrics.distance_m)
+        + f"return {metrics.episode_return:.1f}",
     ]
     if not math.isnan(metrics.validation_success):
         lines.append(f"validation: success {metrics.validation_success:.0%}")

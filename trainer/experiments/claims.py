@@ -180,7 +180,7 @@ def sooner(
     best: bool = False,
     level: float | None = None,
 ) -> Iterator[Comparison]:
-    """Whether each of ours gets more than so many times as soon where each of the others ends.
+    """Whether each of ours reaches the other's final level more than ``bar`` times as soon.
 
     The claim's bar is the times, and its others must be named. ``common``: the level is the lower
     end of the two, so that both can reach it; ``best``: only the best of the others counts;
@@ -270,7 +270,7 @@ class Bounds(NamedTuple):
 def first_reached(grid: Numbers, curve: Numbers, least: float, looked: float = 0.0) -> Bounds:
     """Steps until a curve first reaches a level, between two points on a straight line.
 
-    Its first point may stand for what was first looked at later, after ``looked`` steps.
+    ``looked``: the step of the first measurement, which may lie after the first grid point.
     """
     places = np.flatnonzero(curve >= least - 1e-9)
     if not len(places):

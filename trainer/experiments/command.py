@@ -78,9 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     where = parser.add_argument_group("where it is kept")
     for option, default, text in (
-        ("--results", None, f"records, figures and report (default: results/paper, or {GUIDANCE}; "
-         f"{TYPICAL}: the directory of both, results)"),
-        ("--runs", None, f"checkpoints and actors (default: runs/paper, or {GUIDANCE})"),
+        ("--results", None, f"records, figures and report (default: results/paper, or "
+         f"results/{GUIDANCE}; {TYPICAL}: the directory of both, results)"),
+        ("--runs", None, f"checkpoints and actors (default: runs/paper, or runs/{GUIDANCE})"),
         ("--humans", "results/humans/paper",
          "holds the human model of each scenario: DIR/left_turn, DIR/congestion"),
     ):  # fmt: skip
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
     if STATUS in names:
         counted = GUIDANCE if GUIDANCE in names else ALL
-        print("\n".join(store.status_lines(counted, arguments.seeds)))
+        print("\n".join(store.status_lines(counted, arguments.seeds, arguments.scenario)))
         return 0
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")

@@ -268,8 +268,8 @@ class Result:
         return np.array([outcome == GOAL for outcome in self.record["tests"][condition]["outcome"]])
 
     def drives(self, condition: str, quantity: str) -> Numbers:
-        """A quantity of each test drive; distances without what lies beyond the goal, which is at
-        most one step and a matter of the speed there.
+        """A quantity of each test drive; distances end at the goal, as how far the last step goes
+        beyond it only shows the speed.
         """
         if quantity == SUCCESS:
             return self.reached(condition).astype(float)
@@ -308,7 +308,7 @@ class Results:
         return [self.found[unit] for unit in units if unit in self.found]
 
     def complete(self, place: Place, line: Line, quantity: str) -> bool:
-        """Whether no seed of what such a number is made of is missing."""
+        """Whether all trainings that this number needs are there."""
         scenario = place.scenario if isinstance(place, Scene) else place
         scenarios = SCENARIOS if scenario == EVERYWHERE else (scenario,)
         other = {KEPT: ONE_FRAME, CHANGED: RANDOM}.get(quantity, line.setting)

@@ -31,7 +31,7 @@ FOREIGN = {
 """Word of a task that is none of our scenarios -> its environment and its scripted expert."""
 EXPERT, HUMAN_MODEL, CONSTANT = "expert", "human_model", "constant"
 """In an algorithm's place: the scripted expert or the human model alone, or the best constant
-action. They are tested only, once in each scenario."""
+action. They are tested, not trained."""
 TESTED_ONLY = (HUMAN_MODEL, CONSTANT)  # Those in the paper's experiments
 
 
@@ -339,8 +339,8 @@ LATER = (
     "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
     "foresight", "preference_beta",
 )  # fmt: skip
-"""Fields of a run's config and of an algorithm's row that came after the first records. They decide
-only where they differ from their default: what they leave alone is what it was before them."""
+"""Fields of a run's config and of an algorithm's row that came after the first records. At their
+default they are left out of the id, so that older records keep theirs."""
 
 
 def decided(values: Mapping[str, Any], default: Any, left_out: Collection[str]) -> dict[str, Any]:
@@ -399,8 +399,8 @@ def behaviour(
 ) -> str:
     """Hash of what a scene does: pictures, rewards and the human's take-overs in three drives.
 
-    It sees what a list of numbers from configs would miss, a changed line of code, and leaves
-    alone what changes nothing. Numbers are rounded, since libraries differ in their last bits.
+    It notices a changed line of code, which a hash of configs would miss, and ignores what changes
+    nothing. Numbers are rounded, since libraries differ in their last bits.
     """
     env = make_environment(scenario, condition, printed_reward)
     held = steps_held(env.control_period_s)

@@ -47,7 +47,7 @@ FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; with a checkpoint, for lack of time; at once, since
 another process has it; with an error."""
 WRITING_PATIENCE_S = 60.0
-"""How long one waits for a file of records, into which another process writes a megabyte."""
+"""Longest wait for another process to finish writing the records."""
 TRAINING_COLUMNS = {
     "end_step": "total_steps",
     "return": "episode_return",
@@ -170,9 +170,9 @@ class Store:
         (self.run_dir(unit) / CHECKPOINT_FILE).unlink(missing_ok=True)
         return FINISHED
 
-    def status_lines(self, name: str, seeds: int) -> Iterator[str]:
+    def status_lines(self, name: str, seeds: int, scenario: str | None) -> Iterator[str]:
         """A line for each algorithm and setting of an experiment: how many units are done."""
-        units = plan.units_of([name], seeds)
+        units = plan.units_of([name], seeds, scenario)
         found, stale = self.find(units)
         done = Counter(unit[:3] for unit in found)
         for line, count in Counter(unit[:3] for unit in units).items():

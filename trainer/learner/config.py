@@ -116,12 +116,12 @@ ALGORITHMS: dict[str, Algorithm] = {
         },
     ),
     # The robot asks, with a budget, as in ThriftyDAgger (2109.08273), where the critics disagree;
-    # AIM (2506.09176) has a critic of its own for that. Until they know what doubt is the human
-    # watches, and only what it objected to then is penalised.
+    # AIM (2506.09176) has a critic of its own for that. The human watches until 500 doubts are
+    # known, and only what it objected to then is penalised.
     "phil_gated": replace(PHIL, asks=0.05, settings={"cloning_weight": 10.0}),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
-and the others are what came after it."""
+and the others are other authors' methods and our own."""
 PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
 
 

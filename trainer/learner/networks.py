@@ -170,8 +170,8 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
 class Picture(nn.Module):
     """What is seen, as features, and its share of the first connected layer.
 
-    ``frames`` is how many of the newest frames the network sees. The input is always the
-    observation [batch, 2, 45, 80], so that every network is run and exported alike.
+    ``frames`` is how many of the newest frames the network sees. The input is always the whole
+    observation, so that every network is run and exported alike.
     ``more_inputs`` of that layer, beside the features, count in its initial weights.
     """
 

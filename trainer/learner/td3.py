@@ -79,7 +79,7 @@ class TD3Learner:
                 group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
-        # Numbers lose by it what a picture does not have.
+        # bfloat16 has 8 bits: enough for pixels, too few for numbers.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
@@ -228,7 +228,7 @@ class TD3Learner:
                 for value in overruled
             )
             loss = loss + first + second
-            # A row is drawn again as often as the worse known of its two actions deserves.
+            # The larger of the two actions' errors sets the row's priority.
             missed = (c.intervention_penalty - overruled[0].detach()) * penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
         if self.algorithm.proxy_values and batch.human.any():
@@ -258,7 +258,7 @@ class TD3Learner:
         return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
-        """The human's action before the overruled one, where the latter would have led to."""
+        """Loss that prefers the human's action where the overruled one would have led to."""
         seen = tensors(self._shift(foreseen.next_frames), self.device)
         with self._precision():
             picture = self.actor.picture(*seen)

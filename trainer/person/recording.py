@@ -26,8 +26,9 @@ from bridge.report import DISCARDED
 from edge_runtime.util import UserError
 from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
+from trainer.learner.replay import ReplayBuffer
 from trainer.person.interface import Amount, Control, vector
-from trainer.training.delayed import Store
+from trainer.training.learning import LearningThread
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")
@@ -185,7 +186,7 @@ def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Step]:
 
 
 def store_again(
-    store: Store,
+    store: LearningThread | ReplayBuffer,
     steps: Iterable[Step],
     shape: Callable[[float, Intervention | None], float],
     penalises: Callable[[Intervention | None], bool],

@@ -4,6 +4,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium
@@ -271,6 +272,9 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     assert len(run.metrics) == 5
 
 
+MISSPELT = replace(PHIL, settings={"bach_size": 4})
+
+
 def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
     """In Python, too, where no option's choices stand before it."""
     (tmp_path / "config.toml").write_text("learner = 3\n")
@@ -280,6 +284,8 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
     for wrong in ({"device": "gpu"}, {"threads": -1}, {"seed": -1}, {"preset": "mine"}):
         with pytest.raises(UserError, match=f"{next(iter(wrong))} (must be one of|= -1 is out of)"):
             train(ROVER, out=tmp_path / "run", **wrong)
+    with pytest.raises(UserError, match=r"settings of .*:MISSPELT: .*'bach_size'"):
+        train(ROVER, out=tmp_path / "run", algorithm=f"{__name__}:MISSPELT")
     assert not (tmp_path / "run").exists()
 
 

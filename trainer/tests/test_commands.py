@@ -21,6 +21,7 @@ from trainer.training.config import RunConfig
 from trainer.util import save_torch
 
 POLICY = str(Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx")
+CONGESTION = POLICY.replace("left_turn", "congestion")
 
 
 def call(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -144,15 +145,16 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
     small = "--set batch_size=4 --set evaluation_runs=1"
     for words in (
         human, f"{train} 2 {small}", f"{train} 3 {small} --resume", "export run --out policy.onnx",
-        "evaluate policy.onnx --runs 1", "evaluate run --runs 1", "evaluate human --runs 1",
-        "plot run", "picture policy.onnx --time 1 --out scene.png",
+        "evaluate policy.onnx --runs 1", f"evaluate {CONGESTION} --runs 1",
+        "evaluate run --runs 1", "evaluate human --runs 1", "plot run",
+        "picture policy.onnx --time 1 --out scene.png",
     ):  # fmt: skip
         status, _, err = call(capsys, *words.split())
         assert status == 0, err
     changed = "--seed 0 (now 8), --set evaluation_runs=1 (now 30), --set batch_size=4 (now 128)"
     for words, said in (
         (f"{train} 2", "--resume"),
-        (f"{train} 2 {small} --resume", "not fewer"),
+        (f"{train} 2 {small} --resume", "is a run of --episodes 3: repeat that, or more"),
         (f"{train} 4 --seed 8 --resume", changed),
         (human, "holds a human model"),
     ):

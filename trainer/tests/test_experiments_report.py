@@ -353,6 +353,8 @@ def test_status_counts_the_units(capsys, store):
     assert "; 10 records of other settings" in last
     status, out, _ = said(capsys, "status", "guidance", *places)
     assert (status, "0 of 482 units done" in out, "pvp_td3" in out) == (0, True, True)
+    status, out, _ = said(capsys, "status", "guidance", "--scenario", "hill", *places)
+    assert (status, "0 of 34 units done" in out, "left_turn" in out) == (0, True, False)
 
 
 def test_without_its_human_a_unit_is_left_out(capsys, tmp_path):

@@ -126,13 +126,19 @@ def test_a_unit_is_not_trained_again_but_tests_that_change_are_driven_with_its_a
     assert {len(ours["tests"][condition]["outcome"]) for condition in CONDITIONS} == {5}
 
 
-def test_the_records_that_are_kept_are_of_todays_settings_and_each_is_there_once(tmp_path):
-    humans = ROOT / "results/humans/paper"
-    store = running.Store(planned.PLAN, ROOT / "results/paper", tmp_path, humans)
-    done, others = store.find(planned.units_of(["all"], 5, None))
+@pytest.mark.parametrize(
+    ("place", "plan", "name"),
+    [("paper", planned.PLAN, "all"), ("guidance", planned.GUIDANCE_PLAN, planned.GUIDANCE)],
+)
+def test_the_records_that_are_kept_are_of_todays_settings_and_each_is_there_once(
+    tmp_path, place, plan, name
+):
+    results, humans = ROOT / "results" / place, ROOT / "results/humans/paper"
+    store = running.Store(plan, results, tmp_path, humans)
+    done, others = store.find(planned.units_of([name], 5, None))
     assert done
     assert not others
-    for scenario in planned.SCENARIOS:  # In its scenario's file.
+    for scenario in (path.stem for path in results.glob("*.jsonl")):  # In its scenario's file.
         found = store.records(scenario)
         assert {unit.scenario for unit in found} == {scenario}
         assert len(found) == len(store.records_file(scenario).read_text().splitlines())

@@ -37,11 +37,12 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
 def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
     writer = MetricsWriter(tmp_path, 2, period_s=0.2)
-    told = EpisodeMetrics(2, distance_m=2.5, outcome="timeout", human_steps=5, interventions=2)
+    outcome = "stuck\u2028on a kerb"  # A line's end to Python, not to csv
+    told = EpisodeMetrics(2, distance_m=2.5, outcome=outcome, human_steps=5, interventions=2)
     writer.add(told)
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
-    assert rows[2]["distance_m"] == "2.5"
+    assert (rows[2]["distance_m"], rows[2]["outcome"]) == ("2.5", outcome)
     # The totals go on from the rows before: 3 human steps and a take-over in each.
     totals_so_far = told.total_human_s, told.total_takeovers, told.total_failures
     assert totals_so_far == (pytest.approx(2 * 3 * 0.2 + 5 * 0.2), 2 * 1 + 2, 1)

@@ -52,7 +52,8 @@ class Driven:
         self.spec, self.env = parse_spec(spec), make_environment("left_turn") if aware else Car()
         self.aware: Any = DelayAware(self.env, self.spec) if aware else None
         self.asked, self.carried, self.stored, self.rows = [], [], [], list[Any]()
-        self.delayed = DelayedPolicy(self, self.env, self.spec, self.aware)
+        learner: Any = self  # as far as it is asked
+        self.delayed = DelayedPolicy(learner, self.env, self.spec, self.aware)
         self.delayed.start(frames(0), seed)
 
     def start_episode(self, observation):

@@ -159,6 +159,13 @@ def resume_and_compare(directory: Path, whole: Path, *extra: str) -> None:
     assert same_actors(*(each["learning"]["learner"]["actor"] for each in (a, b)))
 
 
+def test_a_run_of_so_many_steps_goes_on_as_one(tmp_path):
+    """By episodes it would explore as if it had hardly begun."""
+    train(replace(TINY, episodes=1, steps=1, evaluate_every_steps=0), tmp_path)
+    with pytest.raises(UserError, match="is a run of --steps 1: repeat that, or more"):
+        check_directory(tmp_path, replace(TINY, episodes=1, evaluate_every_steps=0), resume=True)
+
+
 def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
     process = begin(tmp_path, episodes=3)
     process.kill()

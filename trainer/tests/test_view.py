@@ -113,8 +113,7 @@ def test_interventions_are_on_the_time_line_with_their_reasons(shown):
 
 
 def looking_on(kept):
-    learning = SimpleNamespace(added=40)
-    run: Any = SimpleNamespace(learning=learning, env=SimpleNamespace(scene=lambda: {"roads": []}))
+    run: Any = SimpleNamespace(steps=40, env=SimpleNamespace(scene=lambda: {"roads": []}))
     return Watcher(run, kept.append)
 
 

@@ -79,8 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--config",
         metavar="F.toml",
-        help="take options and settings from this file, as a run's own config.toml; what is given "
-        "here goes before",
+        help="take options and settings from this file, as a run's own config.toml; options on "
+        "the command line win",
     )
     what.add_argument(
         "--set",
@@ -178,6 +178,10 @@ def train(
     if preset not in PRESETS:
         raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
     start = PRESETS[preset]
+    try:
+        learner = replace(start.learner, **find_algorithm(algorithm).settings)
+    except TypeError as error:  # The row is a plug-in's.
+        raise UserError(f"settings of {algorithm}: {error}") from None
     config = replace(
         start,
         scenario=scenario_of(scenario),
@@ -189,7 +193,7 @@ def train(
         latency=str(parse_spec(latency)),
         device=device,
         threads=threads,
-        learner=replace(start.learner, **find_algorithm(algorithm).settings),
+        learner=learner,
     )
     options.set_threads(threads)
     if isinstance(settings, Mapping):
@@ -235,7 +239,7 @@ def _train(
             from trainer.view import watched  # rerun takes a second to load
 
             watch = stack.enter_context(watched(training, sink))
-        # The last: behind the first signal is what a viewer makes of them.
+        # Entered last: the first signal is ours, and the second the viewer's.
         stack.enter_context(quit_on_signals(partial(_quit, training)))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)
         validation = "-"
@@ -391,8 +395,9 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
     if changed:
         raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
     for name in EXTENT:
-        if 0 < wanted[name] < saved[name]:
-            raise UserError(f"{run_dir} is a run of {saved[name]} {name}, not fewer")
+        # Steps left out are 0: the run would go by episodes, and begin to explore anew.
+        if wanted[name] < saved[name]:
+            raise UserError(f"{run_dir} is a run of --{name} {saved[name]}: repeat that, or more")
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

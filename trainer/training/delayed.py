@@ -16,7 +16,7 @@ delay constant by waiting.
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Dict
@@ -27,6 +27,7 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Action, Observation
 from trainer.learner.replay import Layout
+from trainer.training.learning import LearningThread
 
 Policy = Callable[[Observation], Action]
 UNDER_WAY, PLAIN = "under_way", "observation"
@@ -144,16 +145,6 @@ def _command(step: int, action: Action) -> Command:
     )  # fmt: skip
 
 
-class Store(Protocol):
-    """What takes transitions, with the arguments of ``ReplayBuffer.add``: a learner."""
-
-    def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
-
-    def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition that led to an observation."""
-
-
 class DelayedPolicy:
     """The policy as the training loop has it: behind a network, in virtual time, or ``none``.
 
@@ -161,7 +152,7 @@ class DelayedPolicy:
     """
 
     def __init__(
-        self, store: Store, env: Any, spec: LatencySpec, aware: DelayAware | None = None
+        self, store: LearningThread, env: Any, spec: LatencySpec, aware: DelayAware | None = None
     ) -> None:
         self._store, self._env, self._spec, self._aware = store, env, spec, aware
         late = aware.ticks if aware else ticks_late(spec, env.control_period_s)

@@ -145,17 +145,16 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
     if not path.exists():
         return []
     try:
-        return _rows(read_bytes(path, "metrics").decode())
+        # As csv ends lines: an outcome may hold what `str.splitlines` takes for another end.
+        whole, end, _ = read_bytes(path, "metrics").rpartition(b"\n")
+        return _rows((whole + end).decode())
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path} is no metrics of a training, or damaged: {error}") from None
 
 
 def _rows(text: str) -> list[dict[str, str]]:
     """The rows of the whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
-    lines = text.splitlines(keepends=True)
-    if lines and not lines[-1].endswith(("\r", "\n")):
-        lines.pop()
-    reader = csv.DictReader(lines, strict=True)
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
         raise ValueError("its columns are others")
     rows = list(reader)

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.episode import finite
 from bridge.network import parse_spec
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
@@ -90,7 +91,7 @@ class TrainingRun:
         self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
         if self.algorithm.foresight:
             check_foresight(self.env)
-        self._copied = self.env  # with nobody around it
+        self._copied = self.env  # the bare environment: a person's run wraps `self.env` later
         action_size = self.env.action_space.shape[0]
         self.network = parse_spec(config.latency)
         aware = DelayAware(self.env, self.network) if config.delay_known else None
@@ -250,7 +251,7 @@ class TrainingRun:
             total_steps=self.steps + metrics.steps,
             updates=self.learning.learner.updates,
             episode_return=float(metrics.episode_return),
-            distance_m=float(info["distance_m"]),
+            distance_m=finite("distance_m", info["distance_m"]),
             outcome=info["outcome"],
             exploration_std=self._exploration_std(),
             **learned,
