@@ -16,68 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.environments import CONDITIONS
-from trainer.experiments.data import (
-    ALONE,
-    CHANGED,
-    DISTANCE,
-    DROPPED,
-    EVERYWHERE,
-    KEPT,
-    LATERAL,
-    LONGITUDINAL,
-    NOTHING,
-    PAPER_SCENES,
-    REWARD,
-    SCENES,
-    SECONDS,
-    SPREAD,
-    SUCCESS,
-    TIME_S,
-    TRAINING,
-    UNLEARNED,
-    Estimate,
-    Holds,
-    Line,
-    Numbers,
-    Place,
-    Result,
-    Results,
-    above,
-    bootstrap,
-    enough_of,
-    mean_estimate,
-    within,
-    words,
-)
-from trainer.experiments.plan import (
-    BIASED,
-    CONSTANT,
-    FOUR,
-    GUIDED,
-    HUMAN_MODEL,
-    ONE_FRAME,
-    PRINTED,
-    RANDOM,
-    SCENARIOS,
-)
+from trainer.experiments import data, plan
+from trainer.experiments.data import Estimate, Holds, Line, Numbers, Place, Result, Results
 from trainer.training.metrics import LEARNED
 
 UNITS = {
-    SUCCESS: (100.0, 1, " points"),
-    DISTANCE: (1.0, 2, " m"),
-    SPREAD: (1.0, 2, " m"),
-    REWARD: (1.0, 2, ""),
-    TIME_S: (1.0, 2, " s"),
-    SECONDS: (1.0, 1, " s"),
-    LATERAL: (1.0, 3, " m/s²"),
-    LONGITUDINAL: (1.0, 3, " m/s²"),
-    KEPT: (100.0, 1, " % of the distance kept"),
-    DROPPED: (100.0, 1, " points less than in the nominal scene"),
-    CHANGED: (100.0, 1, " % further than after good guidance"),
-    UNLEARNED: (100.0, 1, " points below the best validation"),
+    data.SUCCESS: (100.0, 1, " points"),
+    data.DISTANCE: (1.0, 2, " m"),
+    data.SPREAD: (1.0, 2, " m"),
+    data.REWARD: (1.0, 2, ""),
+    data.TIME_S: (1.0, 2, " s"),
+    data.SECONDS: (1.0, 1, " s"),
+    data.LATERAL: (1.0, 3, " m/s²"),
+    data.LONGITUDINAL: (1.0, 3, " m/s²"),
+    data.KEPT: (100.0, 1, " % of the distance kept"),
+    data.DROPPED: (100.0, 1, " points less than in the nominal scene"),
+    data.CHANGED: (100.0, 1, " % further than after good guidance"),
+    data.UNLEARNED: (100.0, 1, " points below the best validation"),
 }
 """Quantity -> factor, digits and unit as it is shown."""
-SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
+SHORT = {data.DISTANCE: "distance", data.REWARD: "reward", data.SUCCESS: "success"}
 SAME_LEVEL = 0.05  # What is on one level differs by no more than this share, or by so much success
 NEARLY = 0.02
 """Share of the distance that poor guidance may change where the paper says nearly 50:50."""
@@ -99,7 +57,7 @@ class Claim(NamedTuple):
     ours: Sequence[Line]
     others: Sequence[Line | None] = (None,)
     """None: not compared with another line, but with ``bar``."""
-    quantities: Sequence[str] = (DISTANCE,)
+    quantities: Sequence[str] = (data.DISTANCE,)
     bar: float = 0.0
     """What the difference is to be above or below, how near a level is, how many times as soon."""
     enough: int = 0  # So many comparisons must hold; 0: all
@@ -121,7 +79,7 @@ def judge(results: Results, claim: Claim, kind: str) -> Comparison:
     """
     made = list(claim.test(results, kind, claim))
     verdicts = [one.holds for one in made]
-    holds = enough_of(verdicts, claim.enough)
+    holds = data.enough_of(verdicts, claim.enough)
     measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
     if not measured:
         return Comparison("not measured", "undecided", float("nan"), False)
@@ -134,8 +92,8 @@ def judge(results: Results, claim: Claim, kind: str) -> Comparison:
 
 def judge_both(results: Results, claim: Claim) -> tuple[Comparison, Comparison | None]:
     """As the paper does, with training curves; and of the policy alone, where it has curves."""
-    alone = judge(results, claim, ALONE) if claim.source in OF_CURVES else None
-    return judge(results, claim, TRAINING), alone
+    alone = judge(results, claim, data.ALONE) if claim.source in OF_CURVES else None
+    return judge(results, claim, data.TRAINING), alone
 
 
 def ahead(results: Results, kind: str, claim: Claim, sign: float = 1.0) -> Iterator[Comparison]:
@@ -150,15 +108,15 @@ def ahead(results: Results, kind: str, claim: Claim, sign: float = 1.0) -> Itera
         one, over = own, ""
         if second:
             found = results.differences(place, first, second, quantity, kind)
-            one, over = mean_estimate(found.values()), f" minus {second.name}"
+            one, over = data.mean_estimate(found.values()), f" minus {second.name}"
             complete = complete and results.complete(place, second, quantity)
         bar, (factor, digits, unit) = claim.bar, UNITS[quantity]
         if sign:
-            holds, margin = above(one.times(sign), sign * bar), sign * (one.value - bar)
+            holds, margin = data.above(one.times(sign), sign * bar), sign * (one.value - bar)
         else:
-            scale = 1.0 if quantity == SUCCESS else abs(own.value)
+            scale = 1.0 if quantity == data.SUCCESS else abs(own.value)
             bar = bar or SAME_LEVEL * scale
-            holds, margin = within(one, bar), bar - abs(one.value)
+            holds, margin = data.within(one, bar), bar - abs(one.value)
         said = f", bar {'' if sign else '±'}{factor * bar:.{digits}f}" if bar else ""
         text = f"{one.times(factor).text(digits)}{unit}{said}: {first.name}{over}, "
         margin /= max(one.high - one.low, 1e-9)
@@ -169,7 +127,7 @@ behind, level = partial(ahead, sign=-1.0), partial(ahead, sign=0.0)
 
 
 def _where(claim: Claim, place: Place, quantity: str) -> str:
-    return words(place) + (f", {SHORT[quantity]}" if len(claim.quantities) > 1 else "")
+    return data.words(place) + (f", {SHORT[quantity]}" if len(claim.quantities) > 1 else "")
 
 
 def sooner(
@@ -186,7 +144,7 @@ def sooner(
     end of the two, so that both can reach it; ``best``: only the best of the others counts;
     ``level``: a level of the policy alone instead.
     """
-    kind = kind if level is None else ALONE
+    kind = kind if level is None else data.ALONE
     for place, quantity in product(claim.places, claim.quantities):
 
         def ended(line: Line, place: Place = place, quantity: str = quantity) -> float:
@@ -205,7 +163,7 @@ def sooner(
                 found = f"cannot be compared ({steps})"
             where = _where(claim, place, quantity)
             text = f"{found}: {first.name} against {second.name}, {where}"
-            holds = above(one, times)
+            holds = data.above(one, times)
             end = one.high if holds == "no" else one.low
             yield Comparison(text, holds, end - times if one.size else np.nan, complete)
 
@@ -229,7 +187,7 @@ def sooner_by(
     a bootstrap over the seeds, the same of both, reaches from the lower ones to the upper ones.
     """
     if not own or not other:
-        return NOTHING, ""
+        return data.NOTHING, ""
     grid = own[0].grid
     curves = [np.stack([r.curve(kind, quantity) for r in each]) for each in (own, other)]
     ends = [np.array([r.end(kind, quantity) for r in each]) for each in (own, other)]
@@ -248,9 +206,9 @@ def sooner_by(
     first, second = reached([np.arange(len(curve)) for curve in curves])
     exact = first.low == first.high and second.low == second.high
     point = second.low / first.low if exact else float("nan")
-    lowest = bootstrap([its.low / ours.high for ours, its in drawn], point, seeds)
+    lowest = data.bootstrap([its.low / ours.high for ours, its in drawn], point, seeds)
     ratios = [its.high / ours.low if ours.low else np.inf for ours, its in drawn]
-    highest = bootstrap(ratios, point, seeds)
+    highest = data.bootstrap(ratios, point, seeds)
     return lowest._replace(high=highest.high), f"{first.said()} against {second.said()} steps"
 
 
@@ -287,14 +245,16 @@ def same_ranking(results: Results, kind: str, claim: Claim) -> Iterator[Comparis
 
     Yes where every neighbour is ahead in both, no where two have changed places for sure.
     """
-    settings = (claim.ours, [Line(line.algorithm, ONE_FRAME) for line in claim.ours])
+    settings = (claim.ours, [Line(line.algorithm, plan.ONE_FRAME) for line in claim.ours])
     for place in claim.places:
 
         def is_ahead(first: Line, second: Line, place: Place = place) -> Holds:
-            found = results.differences(place, first, second, DISTANCE, kind)
-            return above(mean_estimate(found.values()))
+            found = results.differences(place, first, second, data.DISTANCE, kind)
+            return data.above(data.mean_estimate(found.values()))
 
-        means = [[results.estimate(place, x, DISTANCE, kind).value for x in s] for s in settings]
+        means = [
+            [results.estimate(place, x, data.DISTANCE, kind).value for x in s] for s in settings
+        ]
         orders = [list(np.argsort(np.negative(each), kind="stable")) for each in means]
         swapped = any(
             is_ahead(*two) == "yes" and is_ahead(*one) == "no"
@@ -307,22 +267,24 @@ def same_ranking(results: Results, kind: str, claim: Claim) -> Iterator[Comparis
         )
         shown = [" > ".join(claim.ours[i].name for i in order) for order in orders]
         same: Holds = "yes" if apart and orders[0] == orders[1] else "undecided"
-        text = f"{words(place)}: two frames {shown[0]}, one {shown[1]}"
-        complete = all(results.complete(place, line, KEPT) for line in claim.ours)
+        text = f"{data.words(place)}: two frames {shown[0]}, one {shown[1]}"
+        complete = all(results.complete(place, line, data.KEPT) for line in claim.ours)
         yield Comparison(text, "no" if swapped else same, float(np.sum(means)), complete)
 
 
-LEFT, JAM = SCENARIOS
-LEFTS, JAMS = ([s for s in PAPER_SCENES if s.scenario == scenario] for scenario in SCENARIOS)
-BOTH = (REWARD, DISTANCE)
-PHIL, IA, HI, PER = map(Line, FOUR)
+LEFT, JAM = plan.SCENARIOS
+LEFTS, JAMS = (
+    [s for s in data.PAPER_SCENES if s.scenario == scenario] for scenario in plan.SCENARIOS
+)
+BOTH = (data.REWARD, data.DISTANCE)
+PHIL, IA, HI, PER = map(Line, plan.FOUR)
 BASELINES = (IA, HI, PER)
-HUMAN = Line(HUMAN_MODEL)
+HUMAN = Line(plan.HUMAN_MODEL)
 TD, ADVANTAGE = Line("phil_td_only"), Line("phil_q_advantage_only")
 SMALL, LARGE = Line("phil_advantage_0.1"), Line("phil_advantage_100")
 RD2_PHIL, RD2 = Line("rd2_phil"), Line("rd2_td3")
 NO_CLONING, NO_SHAPING = Line("phil_without_cloning"), Line("phil_without_shaping")
-POOR_PHIL, POOR_IA, POOR_HI = (Line(name, RANDOM) for name in GUIDED)
+POOR_PHIL, POOR_IA, POOR_HI = (Line(name, plan.RANDOM) for name in plan.GUIDED)
 CLAIMS: tuple[Claim, ...] = (
     Claim("fig7", "left turn: PHIL-TD3 learns the best asymptotic policy", "best",
           ahead, [LEFT], [PHIL], BASELINES, BOTH),
@@ -333,11 +295,11 @@ CLAIMS: tuple[Claim, ...] = (
     Claim("fig7", "left turn: HI-TD3 is the slowest of the guided", "slowest",
           sooner_to_common, [LEFT], [PHIL, IA], [HI], BOTH),
     Claim("fig7", "left turn: PHIL-TD3 reaches the best baseline's reward 8 times as soon",
-          "over 700 % better", sooner_than_best, [LEFT], [PHIL], BASELINES, [REWARD], 8.0),
+          "over 700 % better", sooner_than_best, [LEFT], [PHIL], BASELINES, [data.REWARD], 8.0),
     Claim("fig7", "congestion: PHIL-TD3 and IA-TD3 have comparable rewards", "comparable",
-          level, [JAM], [PHIL], [IA], [REWARD]),
+          level, [JAM], [PHIL], [IA], [data.REWARD]),
     Claim("fig7", "congestion: their rewards are above those of HI-TD3 and vanilla TD3", "better",
-          ahead, [JAM], [PHIL, IA], [HI, PER], [REWARD]),
+          ahead, [JAM], [PHIL, IA], [HI, PER], [data.REWARD]),
     Claim("fig7", "congestion: PHIL-TD3 survives furthest", "highest",
           ahead, [JAM], [PHIL], BASELINES),
     Claim("fig7", "congestion: IA-TD3 and HI-TD3 survive comparably far", "comparable",
@@ -345,121 +307,123 @@ CLAIMS: tuple[Claim, ...] = (
     Claim("fig7", "congestion: IA-TD3 learns faster than HI-TD3", "faster",
           sooner_to_common, [JAM], [IA], [HI]),
     Claim("fig7", "congestion: PHIL-TD3 reaches the best baseline's distance 2.2 times as soon",
-          "over 120 % better", sooner_than_best, [JAM], [PHIL], BASELINES, [DISTANCE], 2.2),
+          "over 120 % better", sooner_than_best, [JAM], [PHIL], BASELINES, [data.DISTANCE], 2.2),
     Claim("fig8", "one frame instead of two does not change the ranking", "same",
-          same_ranking, SCENARIOS, [PHIL, IA, HI, PER]),
+          same_ranking, plan.SCENARIOS, [PHIL, IA, HI, PER]),
     Claim("fig8", "PHIL-TD3 and IA-TD3 lose less by it than HI-TD3 and vanilla TD3", "less",
-          ahead, SCENARIOS, [PHIL, IA], [HI, PER], [KEPT]),
+          ahead, plan.SCENARIOS, [PHIL, IA], [HI, PER], [data.KEPT]),
     Claim("fig8", "HI-TD3 and vanilla TD3 lose significantly by it", "significantly",
-          behind, SCENARIOS, [HI, PER], quantities=[KEPT], bar=1.0),
+          behind, plan.SCENARIOS, [HI, PER], quantities=[data.KEPT], bar=1.0),
     Claim("fig9", "PHIL-TD3 has the highest success rate in the three left turns", "highest",
-          ahead, LEFTS, [PHIL], BASELINES, [SUCCESS]),
+          ahead, LEFTS, [PHIL], BASELINES, [data.SUCCESS]),
     Claim("fig9", "PHIL-TD3 has the highest success rate in the three congestions", "highest",
-          ahead, JAMS, [PHIL], BASELINES, [SUCCESS]),
+          ahead, JAMS, [PHIL], BASELINES, [data.SUCCESS]),
     Claim("fig9", "PHIL-TD3 survives furthest in the three left turns", "furthest",
           ahead, LEFTS, [PHIL], BASELINES),
     Claim("fig9", "PHIL-TD3 survives furthest in the three congestions",
           "furthest; but in table II's variant IA-TD3 78.39 m, PHIL-TD3 77.29 m",
           ahead, JAMS, [PHIL], BASELINES),
     Claim("fig9", "PHIL-TD3's distance varies least from drive to drive", "lowest variance",
-          behind, PAPER_SCENES, [PHIL], BASELINES, [SPREAD]),
+          behind, data.PAPER_SCENES, [PHIL], BASELINES, [data.SPREAD]),
     Claim("fig9", "vanilla TD3 is competitive with IA-TD3 and HI-TD3 in success", "competitive",
-          level, PAPER_SCENES, [PER], [IA, HI], [SUCCESS]),
+          level, data.PAPER_SCENES, [PER], [IA, HI], [data.SUCCESS]),
     Claim("fig9", "the variant scenes significantly degrade the three baselines", "significantly",
-          ahead, SCENARIOS, BASELINES, quantities=[DROPPED]),
+          ahead, plan.SCENARIOS, BASELINES, quantities=[data.DROPPED]),
     Claim("fig10", "left turn: PHIL-TD3 takes the least time", "least",
-          behind, LEFTS, [PHIL], BASELINES, [TIME_S]),
+          behind, LEFTS, [PHIL], BASELINES, [data.TIME_S]),
     Claim("fig10", "congestion, nominal and noise: the guided are smoother than vanilla TD3",
-          "smoother", behind, JAMS[:2], [PHIL, IA, HI], [PER], [LATERAL]),
+          "smoother", behind, JAMS[:2], [PHIL, IA, HI], [PER], [data.LATERAL]),
     Claim("fig10", "congestion, variant: PHIL-TD3 is the smoothest", "smoothest",
-          behind, JAMS[2:], [PHIL], BASELINES, [LATERAL]),
+          behind, JAMS[2:], [PHIL], BASELINES, [data.LATERAL]),
     Claim("table1", "left turn: PHIL-TD3 survives further than the human model",
           "21.28 to 20.70, 21.27 to 20.88, 21.29 to 20.90 m", ahead, LEFTS, [PHIL], [HUMAN]),
     Claim("table2", "congestion: PHIL-TD3 survives further than the human model",
           "80.15 to 80.11, 79.26 to 77.66, 77.29 to 75.15 m", ahead, JAMS, [PHIL], [HUMAN]),
     Claim("fig11", "TD error alone learns faster than the Q advantage alone", "faster",
-          sooner_to_common, SCENARIOS, [TD], [ADVANTAGE], BOTH),
+          sooner_to_common, plan.SCENARIOS, [TD], [ADVANTAGE], BOTH),
     Claim("fig11", "the Q advantage alone ends significantly above TD error alone", "above",
-          ahead, SCENARIOS, [ADVANTAGE], [TD], BOTH),
+          ahead, plan.SCENARIOS, [ADVANTAGE], [TD], BOTH),
     Claim("fig11", "both together (PHIL-TD3) end highest", "most favourable",
-          ahead, SCENARIOS, [PHIL], [TD, ADVANTAGE], BOTH),
+          ahead, plan.SCENARIOS, [PHIL], [TD, ADVANTAGE], BOTH),
     Claim("fig12", "weight 0.1 on the Q advantage converges faster than 1", "faster",
-          sooner_to_common, SCENARIOS, [SMALL], [PHIL], BOTH),
-    Claim("fig12", "weight 0.1 ends below 1", "below", ahead, SCENARIOS, [PHIL], [SMALL], BOTH),
+          sooner_to_common, plan.SCENARIOS, [SMALL], [PHIL], BOTH),
+    Claim("fig12", "weight 0.1 ends below 1", "below",
+          ahead, plan.SCENARIOS, [PHIL], [SMALL], BOTH),
     Claim("fig12", "weight 100 ends on the level of 1", "same level",
-          level, SCENARIOS, [PHIL], [LARGE], BOTH),
+          level, plan.SCENARIOS, [PHIL], [LARGE], BOTH),
     Claim("fig13", "one buffer (PHIL-TD3) learns faster than two (RD2-PHIL)", "faster",
-          sooner_to_common, SCENARIOS, [PHIL], [RD2_PHIL], BOTH),
+          sooner_to_common, plan.SCENARIOS, [PHIL], [RD2_PHIL], BOTH),
     Claim("fig13", "RD2-TD3, without the Q advantage, ends lowest", "least favourable",
-          behind, SCENARIOS, [RD2], [PHIL, RD2_PHIL], BOTH),
+          behind, plan.SCENARIOS, [RD2], [PHIL, RD2_PHIL], BOTH),
     Claim("ablation", "behaviour cloning is effective", "effective",
-          ahead, SCENARIOS, [PHIL], [NO_CLONING], BOTH),
+          ahead, plan.SCENARIOS, [PHIL], [NO_CLONING], BOTH),
     Claim("ablation", "the priority of human demonstrations is effective", "effective",
-          ahead, SCENARIOS, [PHIL], [IA], BOTH),
+          ahead, plan.SCENARIOS, [PHIL], [IA], BOTH),
     Claim("ablation", "intervention-based shaping is effective", "effective",
-          ahead, SCENARIOS, [PHIL], [NO_SHAPING], BOTH),
+          ahead, plan.SCENARIOS, [PHIL], [NO_SHAPING], BOTH),
     Claim("fig14", "poor guidance hardly changes PHIL-TD3's distance in any of six scenes",
-          "nearly 50:50", level, PAPER_SCENES, [PHIL], quantities=[CHANGED], bar=NEARLY),
+          "nearly 50:50", level, data.PAPER_SCENES, [PHIL], quantities=[data.CHANGED], bar=NEARLY),
     Claim("fig14", "poor guidance degrades IA-TD3", "-2.1 %",
-          behind, [EVERYWHERE], [IA], quantities=[CHANGED], bar=-NEARLY),
+          behind, [data.EVERYWHERE], [IA], quantities=[data.CHANGED], bar=-NEARLY),
     Claim("fig14", "poor guidance does not degrade HI-TD3", "+3.6 %",
-          ahead, [EVERYWHERE], [HI], quantities=[CHANGED], bar=-NEARLY),
+          ahead, [data.EVERYWHERE], [HI], quantities=[data.CHANGED], bar=-NEARLY),
     Claim("fig14", "poor guidance degrades IA-TD3 more than PHIL-TD3 and HI-TD3", "most",
-          ahead, [EVERYWHERE], [PHIL, HI], [IA], [CHANGED]),
+          ahead, [data.EVERYWHERE], [PHIL, HI], [IA], [data.CHANGED]),
     Claim("fig15", "left turn: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
-          behind, LEFTS, [POOR_PHIL], [POOR_IA, POOR_HI], [LONGITUDINAL]),
+          behind, LEFTS, [POOR_PHIL], [POOR_IA, POOR_HI], [data.LONGITUDINAL]),
     Claim("fig15", "congestion: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
-          behind, JAMS, [POOR_PHIL], [POOR_IA, POOR_HI], [LATERAL]),
+          behind, JAMS, [POOR_PHIL], [POOR_IA, POOR_HI], [data.LATERAL]),
     Claim("time", "PHIL-TD3 and IA-TD3 take a similar time to train", "similar, 1.03 times",
-          level, [LEFT], [PHIL], [IA], [SECONDS]),
+          level, [LEFT], [PHIL], [IA], [data.SECONDS]),
 )  # fmt: skip
 """All that the paper says of its results."""
 AS_PRINTED = tuple(
     claim._replace(
-        source=PRINTED,
-        ours=[Line(line.algorithm, PRINTED) for line in claim.ours],
-        others=[line and Line(line.algorithm, PRINTED) for line in claim.others],
+        source=plan.PRINTED,
+        ours=[Line(line.algorithm, plan.PRINTED) for line in claim.ours],
+        others=[line and Line(line.algorithm, plan.PRINTED) for line in claim.others],
     )
     for claim in CLAIMS
-    if claim.source == "fig9" and claim.quantities in ([SUCCESS], [DROPPED])
+    if claim.source == "fig9" and claim.quantities in ([data.SUCCESS], [data.DROPPED])
 )
 """Its claims of success once more, of the settings as it prints them."""
 NOMINAL, NOISE, VARIANT, DENSE = (
-    [scene for scene in SCENES if scene.condition == condition] for condition in CONDITIONS
+    [scene for scene in data.SCENES if scene.condition == condition] for condition in CONDITIONS
 )
 GOALS: tuple[Claim, ...] = (
     Claim("goals", "vanilla TD3 and HI-TD3 learn to drive", "85 %",
-          ahead, NOMINAL, [PER, HI], quantities=[SUCCESS], bar=0.85),
+          ahead, NOMINAL, [PER, HI], quantities=[data.SUCCESS], bar=0.85),
     Claim("goals", "vanilla TD3 and HI-TD3 are above the best constant action", "ahead",
-          ahead, SCENES, [PER, HI], [Line(CONSTANT)], [SUCCESS]),
+          ahead, data.SCENES, [PER, HI], [Line(plan.CONSTANT)], [data.SUCCESS]),
     Claim("goals", "PHIL-TD3's success in the nominal scenes", "99 %",
-          ahead, NOMINAL, [PHIL], quantities=[SUCCESS], bar=0.99),
+          ahead, NOMINAL, [PHIL], quantities=[data.SUCCESS], bar=0.99),
     Claim("goals", "PHIL-TD3's success with command noise", "98 %",
-          ahead, NOISE, [PHIL], quantities=[SUCCESS], bar=0.98),
+          ahead, NOISE, [PHIL], quantities=[data.SUCCESS], bar=0.98),
     Claim("goals", "PHIL-TD3's success in the variants", "96 %",
-          ahead, VARIANT, [PHIL], quantities=[SUCCESS], bar=0.96),
+          ahead, VARIANT, [PHIL], quantities=[data.SUCCESS], bar=0.96),
     Claim("goals", "PHIL-TD3 is ahead of its human in success", "in four of six scenes",
-          ahead, PAPER_SCENES, [PHIL], [HUMAN], [SUCCESS], enough=4),
+          ahead, data.PAPER_SCENES, [PHIL], [HUMAN], [data.SUCCESS], enough=4),
     Claim("goals", "PHIL-TD3 is ahead of its human in distance", "in four of six scenes",
-          ahead, PAPER_SCENES, [PHIL], [HUMAN], enough=4),
+          ahead, data.PAPER_SCENES, [PHIL], [HUMAN], enough=4),
     Claim("goals", "PHIL-TD3 learns to drive (90 % of the validations) sooner than vanilla TD3",
-          "3 times as soon", sooner_learned, SCENARIOS, [PHIL], [PER], [SUCCESS], 3.0),
+          "3 times as soon", sooner_learned, plan.SCENARIOS, [PHIL], [PER], [data.SUCCESS], 3.0),
     Claim("goals", "PHIL-TD3 learns to drive sooner than IA-TD3", "no later",
-          sooner_learned, SCENARIOS, [PHIL], [IA], [SUCCESS]),
+          sooner_learned, plan.SCENARIOS, [PHIL], [IA], [data.SUCCESS]),
     Claim("goals", "the end of PHIL-TD3's training is near its best validation", "2 points",
-          behind, SCENARIOS, [PHIL], quantities=[UNLEARNED], bar=0.02),
+          behind, plan.SCENARIOS, [PHIL], quantities=[data.UNLEARNED], bar=0.02),
     Claim("goals", "PHIL-TD3 is ahead of the baselines in the dense scenes", "ahead",
-          ahead, DENSE, [PHIL], BASELINES, [SUCCESS]),
+          ahead, DENSE, [PHIL], BASELINES, [data.SUCCESS]),
     Claim("goals", "PHIL-TD3 is ahead of IA-TD3 after biased guidance", "in one scene",
-          ahead, SCENES, [Line("phil_td3", BIASED)], [Line("ia_td3", BIASED)], [SUCCESS],
-          enough=1),
+          ahead, data.SCENES, [Line("phil_td3", plan.BIASED)], [Line("ia_td3", plan.BIASED)],
+          [data.SUCCESS], enough=1),
     *(
         Claim("goals",
-              f"{words(scenario)}: after biased guidance PHIL-TD3 is better without cloning",
+              f"{data.words(scenario)}: after biased guidance PHIL-TD3 is better without cloning",
               "if imitation is to blame", ahead,
-              [scene for scene in SCENES if scene.scenario == scenario],
-              [Line("phil_without_cloning", BIASED)], [Line("phil_td3", BIASED)], [SUCCESS])
-        for scenario in SCENARIOS
+              [scene for scene in data.SCENES if scene.scenario == scenario],
+              [Line("phil_without_cloning", plan.BIASED)], [Line("phil_td3", plan.BIASED)],
+              [data.SUCCESS])
+        for scenario in plan.SCENARIOS
     ),
 )  # fmt: skip
 """What this project wants of the learner, beyond what the paper says."""
