@@ -528,10 +528,12 @@ def _policies(place: Path, folder: Path) -> tuple[list[str], Callable[[int], Pol
 
     A snapshot becomes a policy file in ``folder``. In a simulation none need be signed.
     """
-    paths = sorted(place.glob("*.onnx")) or sorted((place / SNAPSHOTS).glob("*/"))
+    paths = sorted((place / SNAPSHOTS).glob("*/"))
+    if len(paths) < 2:
+        paths = sorted(place.glob("*.onnx"))
     if len(paths) < 2:
         many = "train with --set snapshots=true, or name a directory of policy files"
-        raise UserError(f"{place} holds no two policies: {many}")
+        raise UserError(f"{place} holds fewer than two policies: {many}")
 
     def load(number: int) -> Policy:
         path = paths[number]

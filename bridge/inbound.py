@@ -132,6 +132,7 @@ def _action_fault(values: Sequence[float], actions: Sequence[Action], rounding: 
     return ""
 
 
+OVERTAKEN_S = 5.0
 NO_FEEDBACK = "no_feedback"
 """Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
 SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
@@ -260,9 +261,10 @@ class EdgeCounts:
         with self._lock:
             last, before = self.newest, health.rejected
             if last is not None:
-                # Where a message and an answer have overtaken one another both clocks say so; a
-                # wall clock that was set back, or a restart, turns back only one of the two.
-                if health.sent_ns <= last.sent_ns and health.uptime_s <= last.uptime_s:
+                # Where a message and an answer have overtaken one another both clocks are behind by
+                # little. A board that starts anew, its wall clock not yet set, is behind by much.
+                late_s = last.uptime_s - health.uptime_s
+                if health.sent_ns <= last.sent_ns and 0.0 <= late_s < OVERTAKEN_S:
                     return
                 # A restarted edge runtime has a younger clock; it counts from zero, as another.
                 another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id

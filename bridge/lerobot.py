@@ -74,7 +74,7 @@ def run(arguments: Any) -> int:
     left_out = sum(not state.final for state in drive.states()) - frames
     if trouble := drive.recording.trouble():
         print(f"the recording {trouble}; what is whole of it was exported", file=sys.stderr)
-    missing = f"; left out: {counted(left_out, 'state')} without an answer" if left_out else ""
+    missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
     print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
     return 0
 

@@ -6,6 +6,7 @@ policy never hears it: it holds what the environment knows and the vehicle does 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -173,25 +174,17 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 """Topic -> decoder; for what is not valid it returns a ``Rejection``, for a scene None."""
 
 
-BURST = 2.0  # Two at once, so that the jitter of a stream at just the pace costs no message
-
-
 class Pace:
     """Lets one message an interval through on average, and two at once at most; of 0 s, all."""
 
     def __init__(self, interval_s: float) -> None:
         self._interval_s = interval_s
-        self._tokens = BURST
-        self._filled_s: float | None = None
+        self._free_s = -math.inf  # When the next one is due
 
     def due(self, now_s: float) -> bool:
         """Whether a message may pass now."""
-        if not self._interval_s:
-            return True
-        elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
-        self._filled_s = now_s
-        self._tokens = min(BURST, self._tokens + elapsed_s / self._interval_s)
-        if self._tokens < 1.0:
+        # One interval early will do, so that the jitter of a stream at the pace costs no message.
+        if self._interval_s and now_s < self._free_s - self._interval_s:
             return False
-        self._tokens -= 1.0
+        self._free_s = max(self._free_s, now_s) + self._interval_s
         return True

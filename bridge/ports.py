@@ -1,6 +1,6 @@
 """Both ends of the bridge on Zenoh: the simulator's port, and what a listener hears.
 
-The port publishes states and hands on what comes back. A listener (viewer, recorder, ROS 2) hears
+The port publishes states and hands on what comes back. A listener (viewer, recorder) hears
 every topic through a bounded queue. Zenoh's threads only put into it, so a listener that falls
 behind loses messages and never holds up the vehicle.
 
@@ -14,6 +14,7 @@ import contextlib
 import math
 import queue
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -60,6 +61,7 @@ class SimulatorPort:
         self.session = secrets.token_hex(8)
         self.vehicle_id = vehicle_id
         self.edge_counts = EdgeCounts()
+        self._is_undrawn = False
         self._zenoh = zenoh_session
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
@@ -88,7 +90,13 @@ class SimulatorPort:
         somebody: Any = self._scenes.matching_status
         if not somebody.matching:
             return
-        self._scenes.put(scene_payload(environment, stamps))
+        try:
+            payload = scene_payload(environment, stamps)
+        except Exception as error:  # Of any kind: it is somebody else's, and the drive goes on.
+            if not self._is_undrawn:
+                print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
+            self._is_undrawn, payload = True, encode_scene({}, stamps)
+        self._scenes.put(payload)
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""

@@ -135,7 +135,7 @@ class ViewerCopies:
 
     def __init__(self, add: Callable[[str, Schema, int, bytes], None]) -> None:
         self._add = add
-        self._layout: Layout | None = None  # The simulator says it with its scenes
+        self._layouts: dict[str, Layout] = {}  # By the vehicle: a simulator says it with its scenes
 
     def write(self, heard: Heard) -> None:
         """Copy one message, or tell of it as an event."""
@@ -159,10 +159,13 @@ class ViewerCopies:
         except ValueError as error:  # The wire carries integers that protobuf's do not hold.
             self._event(heard, Level.WARNING, f"{heard.topic} not drawn: {error}")
             return
+        vehicle = _vehicle_id(heard)
         if isinstance(message, Scene):
-            self._layout = Layout(message.task) if message.task else None
-        elif isinstance(message, wire.State) and self._layout is not None:
-            self._copy_images(heard, message, self._layout)
+            self._layouts.pop(vehicle, None)
+            if message.task:
+                self._layouts[vehicle] = Layout(message.task)
+        elif isinstance(message, wire.State) and vehicle in self._layouts:
+            self._copy_images(heard, message, self._layouts[vehicle])
 
     def _copy_images(self, heard: Heard, state: wire.State, layout: Layout) -> None:
         if layout.refusal(state.observation) is not None:

@@ -164,7 +164,7 @@ def make_report(
     """Join the summary of the episodes with what happened on the wire.
 
     ``facts`` are rows of the report as they are: what was asked for, counts, ``policy_ids`` and
-    ``wall_s``. The report's policy_id is that of the policy that answered last.
+    ``wall_s``. The report's policy_id is that of the policy that appeared last.
     """
     policy_id = next(reversed(facts["policy_ids"]), "")
     summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])

@@ -6,6 +6,7 @@ The report is JSON, and beside it Markdown for people, with tables and pictures.
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import math
 import shlex
 import sys
@@ -31,8 +32,8 @@ from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests import sweep
-from hil_tests.faults.rows import Row
-from hil_tests.faults.run import choose_rows, run_faults
+from hil_tests.faults.rows import ROWS, Row
+from hil_tests.faults.run import run_faults
 from hil_tests.sweep import Found
 from trainer.options import add_scenario
 from trainer.pictures import write_figure
@@ -77,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
     check_report(out)
-    axes, rows = _choose(arguments)
+    axes, rows = choose(arguments.rows, arguments.only)
     jobs = arguments.jobs or cores()
     command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
     result: dict[str, Any] = {"command": command}
@@ -105,21 +106,21 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if not rows or result["faults"]["passed"] else 1
 
 
-def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[Row]]:
-    """The latency axes, and the rows of the fault table."""
-    known = {axis.name: axis for axis in sweep.NETWORK_AXES}
-    named = arguments.rows.split(",") if arguments.rows else []
-    axes = [known[name] for name in named if name in known] if named else list(known.values())
-    faults = [name for name in named if name not in known] if named else ["*"]
-    if arguments.only == "latency":
-        if named and faults:
-            raise UserError(f"no latency axis {faults[0]!r}; choose from {', '.join(known)}")
-        faults = []
-    if arguments.only == "faults":
-        if not faults:
-            raise UserError(f"{arguments.rows} names latency axes, no fault")
-        axes = []
-    return axes, choose_rows(faults)
+def choose(names: str | None, only: str | None) -> tuple[list[sweep.Axis], list[Row]]:
+    """The latency axes and the faults of these names or patterns (``hunter_*``), in their order.
+
+    UserError where one fits none.
+    """
+    axes = sweep.NETWORK_AXES if only != "faults" else ()
+    faults = ROWS if only != "latency" else ()
+    known, chosen = [row.name for row in (*axes, *faults)], set[str]()
+    for name in names.split(",") if names else ["*"]:
+        if not (found := fnmatch.filter(known, name)):
+            kind = " or ".join(["latency axis"] * bool(axes) + ["fault"] * bool(faults))
+            raise UserError(f"no {kind} {name!r}; choose from {', '.join(known)}")
+        chosen.update(found)
+    wanted = [axis for axis in axes if axis.name in chosen]
+    return wanted, [row for row in faults if row.name in chosen]
 
 
 def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:

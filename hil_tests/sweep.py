@@ -104,7 +104,7 @@ def budget(axes: Sequence[Axis], rows: Rows, target: float, name: str) -> dict[s
     for axis in axes:
         limit = limits[axis.name]
         if limit is None:
-            missed.append(f"on {axis.base} alone it is below that, so no {axis.name} has a budget")
+            missed.append(f"on {axis.base} alone it is below {goal}: no {axis.name} has a budget")
         else:
             shown = axis.limit.format(f"{limit:g} {axis.unit}" if limit else "none")
             most = " (the most that was tested)" if open_ended[axis.name] else ""
@@ -268,8 +268,7 @@ def drive_network(task: Task, part: Part, attempts: int = ATTEMPTS) -> list[dict
 
 def worth_keeping(report: Found) -> dict[str, Any]:
     """What a campaign keeps of a simulator's report."""
-    names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected",
-             "tick_overruns")  # fmt: skip
+    names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected")
     of_each = ("seed", "outcome", "distance_m", "time_s", "steps")
     reasons = Counter(event["reason"] for event in report["safe_stop_events"])
     return {
@@ -300,7 +299,6 @@ def make_row(spec: str, parts: Sequence[Found]) -> dict[str, Any]:
         "safe_stops_per_episode": sum(part["safe_stops"] for part in parts) / count,
         "safe_stop_reasons": _counted(parts, "safe_stop_reasons"),
         "ticks_without_new_command": sum(part["deadline_misses"] for part in parts) / steps,
-        "tick_overruns": sum(part["tick_overruns"] for part in parts),
         "latency_ms": {
             "p50": statistics.median(each["p50"] for each in latencies) if latencies else None,
             "p99": max((each["p99"] for each in latencies), default=None),

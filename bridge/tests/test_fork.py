@@ -21,6 +21,7 @@ from bridge.environments import describe, make_environment
 from bridge.fork import first_change
 from bridge.policy_file import make_policy as make_any_policy
 from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.report import SNAPSHOTS
 from bridge.tests.harness import (
     LEFT_TURN,
     TOY,
@@ -307,5 +308,10 @@ def test_bisection_says_where_there_is_no_change_or_more_than_one(
     found = bisected(LEFT_TURN, policies(tmp_path / "several", there_and_back))
     assert (found["changes_at"], found["one_change"]) == ("after_003.onnx", False)
     assert "more than one change" in capsys.readouterr().out
-    said = refusal("bisect", LEFT_TURN, "--episode", 1, "--runs", tmp_path)
-    assert "--set snapshots=true" in said
+    bisect = ("bisect", LEFT_TURN, "--episode", 1, "--runs")
+    assert "--set snapshots=true" in refusal(*bisect, tmp_path)
+    # A run's snapshots come before what was exported from it.
+    run = policies(tmp_path / "run", [STOPS] * 2)
+    for number in (1, 2):
+        (run / SNAPSHOTS / f"after_{number}").mkdir(parents=True)
+    assert f"{run / SNAPSHOTS / 'after_1'} cannot be exported" in refusal(*bisect, run)

@@ -308,6 +308,8 @@ def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
         ([health(1, 9.0, stale=1), health(2, 0.5, stale=3)], {"stale": 3}),
         # The board's wall clock was set back in between.
         ([health(9, 1.0), health(2, 2.0, stale=1), health(3, 3.0, stale=2)], {"stale": 2}),
+        # Restarted, and its wall clock is not yet set.
+        ([health(99, 300.0, stale=5), health(1, 1.0, stale=2)], {"stale": 2}),
         # A message that an answer has overtaken is no restart.
         ([health(1, 1.0), health(3, 3.0, stale=2), health(2, 2.0, stale=1)], {"stale": 2}),
     ],

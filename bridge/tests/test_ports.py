@@ -5,10 +5,14 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 
+from bridge.messages import Scene, decode_scene
 from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
@@ -48,6 +52,26 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     port.close()
     assert heard == [b"own"] * 2
     assert port.edge_counts.newest is None
+
+
+def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys):
+    """JPEG has no fourth colour; and only while somebody looks is anything drawn at all."""
+    _, router, client = sessions
+    see_through: Any = SimpleNamespace(unwrapped=SimpleNamespace(render_mode="rgb_array"))
+    see_through.render = lambda: np.zeros((4, 4, 4), np.uint8)
+    heard: list[bytes] = []
+    key = "phil/v1/scene"
+    viewer = client.declare_subscriber(key, lambda one: heard.append(bytes(one.payload)))
+    with contextlib.closing(SimulatorPort(router, "v1")) as port:
+        time.sleep(HEARS_S)
+        for step in range(2):
+            port.publish_scene(see_through, Scene(episode=0, step=step, sim_time_s=0.1 * step))
+        time.sleep(HEARS_S)
+    viewer.undeclare()
+    seen = [decode_scene(payload) for payload in heard]
+    assert [(scene.step, scene.picture) for scene in seen if scene] == [(0, b""), (1, b"")]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("the environment cannot be shown: OSError")
 
 
 @pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])

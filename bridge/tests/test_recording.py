@@ -64,6 +64,8 @@ from edge_runtime.wire import MAX_STATE_BYTES, State, decode_state, encode
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 
+ODD_SIZE = msgspec.structs.replace(TASK, observation={"frames": Entry(dtype="uint8", shape=[2])})
+
 
 def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
     return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
@@ -83,6 +85,8 @@ def test_the_picture_is_what_the_policy_saw(tmp_path):
     with writing(path) as writer:
         told = encode_scene({}, Scene(episode=0, step=3, sim_time_s=0.3, task=TASK))
         writer.write(heard("scene", told))  # it says how to read the states
+        other = encode_scene({}, Scene(episode=0, step=3, sim_time_s=0.3, task=ODD_SIZE))
+        writer.write(Heard("phil/w/scene", "scene", other, 2, len(other)))  # another vehicle's
         state = encode(make_state(3, observation={"frames": frames}))
         writer.write(heard("state", state, arrived_ns=5 * 10**9 + 7))
     (data,) = (data for topic, _, data in told_in(path) if topic == "view/v/frames")

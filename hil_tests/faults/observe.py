@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
 import can
 import zenoh
 
+from bridge.messages import DECODERS
 from edge_runtime import wire
 from edge_runtime.manifest import Task
 from edge_runtime.tests.policies import TASK
@@ -152,58 +154,43 @@ class Probe:
         self.timeline = timeline
         self.health: list[wire.Health] = []
         session = stack.enter_context(open_session(listen=listen, connect=connect, mode="router"))
-        handlers: dict[str, Callable[[zenoh.Sample], None]] = {
-            "state": lambda sample: self.note_state(bytes(sample.payload), time.monotonic()),
-            "command": self._on_command,
-            "health": self._on_health,
-            "feedback": self._on_feedback,
-        }
-        # BLOCK: a message that the campaign says it sent has been sent.
-        self._publishers = {
-            topic: session.declare_publisher(
-                wire.key(vehicle_id, topic),
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        for topic in ("state", "command", "health", "feedback"):
+            key, hear = wire.key(vehicle_id, topic), partial(self._hear, topic)
+            publisher = session.declare_publisher(
+                key,
+                # BLOCK: a message that the campaign says it sent has been sent.
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 allowed_destination=zenoh.Locality.REMOTE,  # it hears the others, not itself
             )
-            for topic in handlers
-        }
-        for topic, handler in handlers.items():
-            stack.enter_context(self._publishers[topic])
-            stack.enter_context(session.declare_subscriber(wire.key(vehicle_id, topic), handler))
+            self._publishers[topic] = stack.enter_context(publisher)
+            stack.enter_context(session.declare_subscriber(key, hear))
 
     def put(self, topic: str, payload: bytes) -> None:
         """Send bytes as they are."""
         self._publishers[topic].put(payload)
 
-    def note_state(self, payload: bytes, seen_s: float) -> None:
+    def note_state(self, state: wire.State, seen_s: float) -> None:
         """Remember a state that a policy may answer."""
-        state = wire.decode_state(payload)
-        if isinstance(state, wire.State):
-            place = (state.session, state.episode, state.step)
-            self.timeline.states.setdefault(place, seen_s)
-            self.timeline.flow_s.append(seen_s)
+        self.timeline.states.setdefault((state.session, state.episode, state.step), seen_s)
+        self.timeline.flow_s.append(seen_s)
 
-    def _on_command(self, sample: zenoh.Sample) -> None:
+    def _hear(self, topic: str, sample: zenoh.Sample) -> None:
         seen_s, offset_ns = time.monotonic(), time.time_ns() - time.monotonic_ns()
-        command = wire.decode_command(bytes(sample.payload))
-        if isinstance(command, wire.Rejection):
-            self.timeline.unreadable += 1
-            return
-        place = (command.session, command.episode, command.step)
-        sent_s = (command.sent_ns - offset_ns) * 1e-9
-        seen = CommandSeen(seen_s, sent_s, place, command.mode, command.action, command.reason)
-        self.timeline.commands.append(seen)
-
-    def _on_feedback(self, sample: zenoh.Sample) -> None:
-        seen_s = time.monotonic()
-        feedback = wire.decode_feedback(bytes(sample.payload))
-        if isinstance(feedback, wire.Feedback):
-            self.timeline.feedback.append((seen_s, feedback))
-
-    def _on_health(self, sample: zenoh.Sample) -> None:
-        health = wire.decode_health(bytes(sample.payload))
-        if isinstance(health, wire.Health):
-            self.health.append(health)
+        match DECODERS[topic](bytes(sample.payload)):
+            case wire.State() as state:
+                self.note_state(state, seen_s)
+            case wire.Command() as told:
+                place = (told.session, told.episode, told.step)
+                sent_s = (told.sent_ns - offset_ns) * 1e-9
+                seen = CommandSeen(seen_s, sent_s, place, told.mode, told.action, told.reason)
+                self.timeline.commands.append(seen)
+            case wire.Feedback() as feedback:
+                self.timeline.feedback.append((seen_s, feedback))
+            case wire.Health() as health:
+                self.health.append(health)
+            case _:
+                self.timeline.unreadable += topic == "command"
 
 
 class Heard(NamedTuple):

@@ -325,9 +325,8 @@ class Sender:
 
     def send(self, state: State) -> None:
         """Send one acceptable state and remember it as such. Hold ``lock`` to keep the order."""
-        payload = encode(state)
-        self._probe.note_state(payload, time.monotonic())
-        self._probe.put("state", payload)
+        self._probe.note_state(state, time.monotonic())
+        self._probe.put("state", encode(state))
 
     def send_next(self) -> None:
         """Send the next step now."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import tempfile
 import threading
 import time
@@ -21,7 +20,7 @@ from edge_runtime.util import UserError
 from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase, do_fault
+from hil_tests.faults.rows import Row, Try, at_any_phase, do_fault
 from hil_tests.processes import POLICY, in_parallel, trusting
 
 SLOW_S = 2.5 * TASK.control_period_s
@@ -106,20 +105,6 @@ def run_faults(
         "unsafe_commands": sum(len(row["unsafe"]) for row in found),
         "passed": all(row["passed"] for row in found),
     }
-
-
-def choose_rows(names: Sequence[str]) -> list[Row]:
-    """The rows of these names or patterns (``hunter_*``), in the table's order.
-
-    UserError where one fits none.
-    """
-    known = [row.name for row in ROWS]
-    chosen: set[str] = set()
-    for name in names:
-        if not (found := fnmatch.filter(known, name)):
-            raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
-        chosen.update(found)
-    return [row for row in ROWS if row.name in chosen]
 
 
 def task_of(row: Row, given: Task) -> Task:

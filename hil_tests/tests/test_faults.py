@@ -13,20 +13,12 @@ from edge_runtime import wire
 from edge_runtime.manifest import Layout
 from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
-from hil_tests.campaign import render_faults
+from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
 from hil_tests.faults.rig import ChassisProcess, Rig, Truth, make_state
-from hil_tests.faults.rows import Row, Try
-from hil_tests.faults.run import (
-    ROWS,
-    Outcome,
-    _try,
-    choose_rows,
-    report_row,
-    run_faults,
-    run_row,
-)  # fmt: skip
+from hil_tests.faults.rows import ROWS, Row, Try
+from hil_tests.faults.run import Outcome, _try, report_row, run_faults, run_row
 from hil_tests.mock_hunter.chassis import FAULTS
 from hil_tests.processes import in_parallel
 
@@ -165,11 +157,13 @@ def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
     assert len(set(names)) == len(names)
     assert f"{len(names)} faults" in (Path(__file__).parents[2] / "README.md").read_text()
     for other in ("meteor", "meteor_*"):
-        with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from .*edge_killed"):
-            choose_rows([other])
+        with pytest.raises(UserError, match=r"no latency axis or fault 'meteor.*'; .*edge_killed"):
+            choose(other, None)
     hunters = {name for name in names if fnmatch.fnmatch(name, "hunter_*")}
     assert hunters == {f"hunter_{name}" for name in FAULTS}
-    chosen = [row.name for row in choose_rows(["vehicle_*", "vehicle_stuck", "edge_killed"])]
+    axes, rows = choose("vehicle_*,vehicle_stuck,edge_killed,delay", None)
+    assert [axis.name for axis in axes] == ["delay"]
+    chosen = [row.name for row in rows]
     assert chosen == ["edge_killed", "vehicle_silent", "vehicle_stuck", "vehicle_lying"]
 
 
@@ -180,7 +174,7 @@ def test_a_real_fault_stops_it_and_it_drives_on_when_it_may(name, reason):
     """Off the bus for over 500 ms the chassis stands by, and takes control again when frames come
     back: the very thing that our own latch is for."""
     progress: list[str] = []
-    report = run_faults(choose_rows([name]), 1, on_try=progress.append)
+    report = run_faults(choose(name, "faults")[1], 1, on_try=progress.append)
     (row,) = report["rows"]
     assert (row["wrong"], row["unsafe"], row["crashes"]) == ([], [], [])
     assert row["reasons"] == {reason: 1}

@@ -228,7 +228,7 @@ def test_what_the_mutations_settings_name_is_there():
 MISTAKES = {
     "campaign --out {tmp}/r.json": {
         "--rows lag --only latency": "no latency axis 'lag'",
-        "--rows delay,edge_kiled": "no fault 'edge_kiled'",
+        "--rows delay,edge_kiled": "no latency axis or fault 'edge_kiled'",
         "--rows delay --only faults": "no fault",
         "--runs 1": "at least 2",
         "--policy nowhere.onnx --only latency": "nowhere.onnx",
