@@ -11,8 +11,11 @@ COMMANDS = {
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
-    "fork": ("bridge.fork:FORK", "drive a recorded drive again, and on in another way"),
-    "bisect": ("bridge.fork:BISECT", "find the checkpoint from which on a drive ends otherwise"),
+    "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and go on in another way"),
+    "bisect": (
+        "bridge.fork:BISECT",
+        "find the policy of a run from which on a drive ends differently",
+    ),
     "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
     "repair": ("bridge.record:REPAIR", "save what is whole of a cut-off or damaged recording"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),

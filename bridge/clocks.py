@@ -43,7 +43,7 @@ from edge_runtime.wire import SAFE_STOP, Command, Feedback, Reason, State, encod
 
 Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must not block
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
-"""Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
+"""Stop reasons of wall time. In lock-step they mean that the machine stalled."""
 
 
 class _Clock:

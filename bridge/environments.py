@@ -200,7 +200,7 @@ def _entries(environment: Environment, name: str) -> dict[str, Entry]:
     entries = {}
     for entry, box in boxes.items():
         if not entry or entry.isdigit() or entry == OUTPUT:  # An ONNX graph would rename it
-            taken = "a number, nothing, and what the policy answers with are no names"
+            taken = "an observation's name must not be empty, a number or the policy's output"
             raise UserError(f"environment {name!r} observes {entry!r}: {taken}")
         dtype = str(getattr(box, "dtype", None)).replace("float64", "float32")
         if not isinstance(box, Box) or dtype not in DTYPES:

@@ -128,7 +128,7 @@ class EpisodeRunner:
         """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
         self.ridden_steps = 0
         """Ticks in which an action of an earlier command's plan was done."""
-        self._ridden = 0  # In the tick before: of the plan
+        self._ridden = 0  # `Decision.ridden` of the tick before
         self._under_way: State | None = None
         self._applied: tuple[list[float] | None, bool] = (None, False)
         self._options = {"standing": True} if self.origin.standing else None

@@ -501,7 +501,7 @@ def _run_bisect(asked: Namespace) -> int:
         ends = f"{outcomes[0]} with {names[0]}, {outcomes[len(names) - 1]} with {names[-1]}"
         print(f"no change between the first and the last: {ends}; {tried}")
     if not alone:
-        print("what is beside it says that there is more than one change: this is one of them")
+        print("the policies beside it disagree: there is more than one change, this is one of them")
     return 0
 
 

@@ -45,9 +45,9 @@ class CommandCheck:
         self._actions, self._period_s = task.action, task.control_period_s
         self.newest = (0, -1)  # Episode and step of the newest state that was sent
         self._ended = (-1, -1)
-        self._stamps: deque[int] = deque(maxlen=64)  # Of commands: a copy is no second one.
+        self._stamps: deque[int] = deque(maxlen=64)  # Of recent commands: a copy counts once
         self.heard: dict[str, int] = {}
-        """Of this session's commands, as a state says it; empty before the first."""
+        """What the next state says of this session's commands; empty before the first."""
 
     def begin(self, episode: int) -> None:
         """Note that an episode begins: whatever answers an earlier one is stale from now on."""
@@ -88,7 +88,7 @@ class CommandCheck:
             self.policy_ids.append(command.policy_id)
         is_stop = command.mode == SAFE_STOP
         if is_stop and _action_fault(command.action, self._actions, COMMAND_ROUNDING):
-            # It is a stop by its mode; who reads its action finds one that fits.
+            # The mode alone makes it a stop; its action is replaced by a valid one.
             stop = [row.stop or min(max(0.0, row.low), row.high) for row in self._actions]
             return msgspec.structs.replace(command, action=stop)
         return command

@@ -214,8 +214,8 @@ class RecordedDrive:
     def outside(self) -> set[Key]:
         """The states that found the link outside of the policy's envelope.
 
-        A stop for it is told of until enough states in a row were fresh. So where the runtime then
-        drove again, the last ones before that found the link inside.
+        The runtime gives this reason until enough states in a row were fresh. So before it drove
+        again, the last of them found the link inside.
         """
         found: set[Key] = set()
         run: list[Key] = []
@@ -294,7 +294,7 @@ def key_of(message: State | Command) -> Key:
 
 
 def _first_exchange(command: Command, sent_s: float, period_s: float) -> Exchange:
-    """The state arrived as long before its answer as the runtime had it."""
+    """When it arrived: the answer's sending, less the time between the runtime's two stamps."""
     arrived_s = sent_s - max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
     begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
     finished_s = sent_s

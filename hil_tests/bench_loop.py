@@ -190,7 +190,7 @@ class Contender:
 
 
 def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
-    """Blocks in turn, who begins a pair ends the next; one pair is not counted."""
+    """Blocks alternate, and so does who begins a pair; the first pair is a warm-up."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
     with ProgressBar("pairs of blocks", blocks + 1) as bar:
         for number in range(blocks + 1):

@@ -98,7 +98,7 @@ def _judge(bench: Bench) -> None:
     """Say what is wrong by each rule, in their order."""
     for is_kept in RULES.values():
         try:
-            words = "" if is_kept(bench) else f"it says {bench.last}"
+            words = "" if is_kept(bench) else f"last report: {bench.last}"
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
             words = f"{type(error).__name__}: {error}"

@@ -103,7 +103,7 @@ class Check(NamedTuple):
     """One thing that a machine may have.
 
     ``probe`` does it, and says in a few words what it found; any exception says that it is missing.
-    ``without`` says what is left where it is missing, or is not; ``remedy``, how to get it.
+    ``without`` says what fails or is worse where it is missing; ``remedy``, how to get it.
     """
 
     group: str
@@ -272,20 +272,20 @@ def python_says(script: str) -> str:
 
 
 CHECKS = (
-    Check(BASICS, "Python", _python, "nothing", "Python 3.11 or newer; make PYTHON=..."),
-    Check(BASICS, "packages", _packages, "nothing that imports them", INSTALL),
+    Check(BASICS, "Python", _python, "nothing runs", "Python 3.11 or newer; make PYTHON=..."),
+    Check(BASICS, "packages", _packages, "nothing runs", INSTALL),
     Check(BASICS, "loopback", _loopback, "no drive over Zenoh, no `make demo`, no `make test`",
           "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall"),
     Check(BASICS, "disk", _disk, "no training, no recordings (--out)",
           "free some space, or work in another directory"),
     Check(BASICS, "memory", _memory, "no training", "end other programs"),
     Check("training", "locked versions", _versions,
-          "everything, but not to the last bits of results/", INSTALL),
+          "results differ from results/ in the last bits", INSTALL),
     Check("training", "C++ kernel", partial(python_says, _KERNEL),
-          "everything, but `trainer train` takes several times as long",
+          "`trainer train` takes several times as long",
           "a C++ compiler: apt install g++"),
     Check("training", "GPU", partial(python_says, _GPU),
-          "no `--device cuda`; the processor trains, too",
+          "no `--device cuda`",
           "an NVIDIA GPU with its driver, and torch with CUDA"),
     Check("person", "window", partial(python_says, _WINDOW),
           "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
@@ -296,7 +296,7 @@ CHECKS = (
     Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
           "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
     Check("vehicle", "real-time priority", _realtime_priority,
-          "`edge_runtime run`, but a busy machine may make its commands late",
+          "a busy machine may make the edge runtime's commands late",
           "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)"),
 )  # fmt: skip
 """In the order of the output. Nothing much works without the basics."""

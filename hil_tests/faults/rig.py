@@ -62,11 +62,10 @@ class Rig:
     """Start it with ``with``; it ends every process that it started.
 
     ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
-    ``vehicle`` is its ``--vehicle``. The
-    ``directory`` is an empty one, for switches and reports. Edge runtime and probe meet at a
-    ``link`` or a ``router`` where ``between`` says so. ``sender`` sends states here, without a
-    simulator. With the vehicle ``hunter`` there is a mock of it on a CAN bus. Only what the options
-    ask for is there of the following.
+    ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
+    Edge runtime and probe meet at a ``link`` or a ``router`` where ``between`` says so. ``sender``
+    sends states here, without a simulator. With the vehicle ``hunter`` there is a mock of it on a
+    CAN bus. The attributes below exist only where the options ask for them.
     """
 
     simulator: Process

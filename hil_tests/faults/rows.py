@@ -319,7 +319,7 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     rig.switch(VEHICLE, word)
     stop = rig.stop_command(begin_s)
     # A silent vehicle may still speak between the mark and the switch, and what it says counts.
-    # What another says after the switch is no good any more.
+    # What a stuck or lying vehicle says after the switch no longer counts.
     end_s = stop.seen_s if word == "silent" else begin_s
     last_s = max(s for s, _ in rig.timeline.feedback if s < end_s)
     sleep_until(begin_s + LASTS_S)
@@ -472,7 +472,7 @@ for _name, _done, _reason, _do, _limit_s in (
     ("ended", "edge runtime ended while it rides; a new one", "runtime_ended", _is_ended,
      REACTION_LIMIT_S),
 ):  # fmt: skip
-    fault(f"edge sends safe_stop: {_reason}; stays stopped", "that to safe_stop on the wire",
+    fault(f"edge sends safe_stop: {_reason}; stays stopped", "cause to safe_stop on the wire",
           f"ride_{_name}", _done, reaction_limit_s=_limit_s, recovery_limit_s=None, rig=_VEHICLE,
           policy="steady")(partial(_stops, _reason, _do))  # fmt: skip
 fault("simulator brakes by itself: no_command", "last drive command to the simulator's brake",
