@@ -24,6 +24,7 @@ from deploy.installer.layout import (
     POLICY,
     PUBLIC_KEY,
     Layout,
+    check_room,
     make_release,
     why_not_whole,
     write_whole,
@@ -166,6 +167,7 @@ class Installer:
         self._layout = layout
         self._service = service
         self._limits = limits
+        self._is_stopped = False
 
     def install(self, bundle_path: str, trust: str | None) -> str:
         """Install or upgrade; return the version. Nothing is written before the bundle is verified.
@@ -229,7 +231,9 @@ class Installer:
         except UnhealthyError as error:
             if is_new and version not in (before, layout.linked("previous")):
                 layout.remove_release(version)
-            stays = f"{before} goes on" if before else "nothing is installed"
+            # It was stopped to be made again, and what was made does not run.
+            goes_on = "is stopped" if self._is_stopped else "goes on"
+            stays = f"{before} {goes_on}" if before else "nothing is installed"
             raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
         self._switch(version, before)
         for other in layout.versions():
@@ -244,8 +248,10 @@ class Installer:
                 _say(f"{version} lies here already, whole")
                 return
             _say(f"{version} lies here damaged ({fault}): made again")
+            check_room(bundle, layout)  # Before anything is taken away
             if layout.linked("current") == version:
                 self._service.stop()
+                self._is_stopped = True
             layout.remove_release(version)
         _say(f"unpacked {make_release(bundle, layout, self._service.group())}")
 

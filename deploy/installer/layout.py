@@ -212,7 +212,7 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
     version = bundle.manifest.version
     folder, draft = layout.release(version), layout.making(version)
     remove_tree(draft)
-    _check_room(bundle, layout)
+    check_room(bundle, layout)
     try:
         _fill(bundle, draft, folder, group)
         _write(draft / CONTENTS, json.dumps(hashes(draft), indent=0).encode())
@@ -309,7 +309,7 @@ def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None)
     os.chmod(str(path), mode)
 
 
-def _check_room(bundle: Bundle, layout: Layout) -> None:
+def check_room(bundle: Bundle, layout: Layout) -> None:
     """Unpacked and compiled, wheels take some four times their size."""
     needed = 5 * sum(map(len, bundle.files.values()))
     free = shutil.disk_usage(str(layout.releases)).free

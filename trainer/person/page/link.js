@@ -27,6 +27,7 @@ export class Link {
   open() {
     const url = new URL("socket", location.href);
     url.protocol = "ws:";
+    clearTimeout(this.retry); // one connection at a time: `beat` may have been quicker
     this.socket = new WebSocket(url);
     this.heardMs = performance.now();
     this.socket.onopen = () => {
@@ -38,7 +39,7 @@ export class Link {
     this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
     this.socket.onclose = () => {
       this.on.state(this.over ? "over" : "lost");
-      if (!this.over) setTimeout(() => this.open(), RETRY_MS);
+      if (!this.over) this.retry = setTimeout(() => this.open(), RETRY_MS);
     };
   }
 
@@ -107,7 +108,7 @@ export class Link {
     this.socket.send(JSON.stringify(said));
   }
 
-  // The median of the last two seconds, ms.
+  // The median of the last 20, ms.
   tripMs() {
     const sorted = [...this.trips].sort((a, b) => a - b);
     return sorted.length ? sorted[sorted.length >> 1] : NaN;

@@ -264,7 +264,7 @@ async def test_the_end_of_the_sitting_is_told(browser, cockpit):
     assert await browser.text_content("#who") == "The sitting is over"
 
 
-@pytest.mark.parametrize("how", ["closed", "silent"])
+@pytest.mark.parametrize("how", ["closed", "silent", "silent, then closed"])
 async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, how):
     """Through a tunnel, as over ``ssh -L``, that is cut or swallows everything."""
     async with Tunnel(cockpit.port) as tunnel:
@@ -274,5 +274,11 @@ async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, 
         await reads(cockpit, lambda r: r.engaged)
         tunnel.cut() if how == "closed" else tunnel.swallow()
         await reads(cockpit, lambda r: r == LET_GO)
+        if "then" in how:  # As the page is about to give it up: one connection comes back, not two.
+            await asyncio.sleep(1.2)
+            tunnel.cut()
         await until(browser, "document.body.dataset.link === 'lost'")
         await press_again(browser, cockpit)
+        joined = len(tunnel._ways)
+        await asyncio.sleep(3.0 * ("then" in how))
+        assert len(tunnel._ways) == joined, "it does not connect again and again"
