@@ -108,11 +108,11 @@ def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
     add = functools.partial(parser.add_argument, type=Path, metavar="FILE")
     add("--policy", required=True, help="signed policy file")
     add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
-    add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="of whoever signed the policy")
+    add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="public key of the policy's signer")
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
     add = functools.partial(parser.add_argument, type=Path, metavar="DIR")
     add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
-    driver = "a wheel to install besides, like a vehicle's driver; may be repeated"
+    driver = "another wheel to install, such as a vehicle's driver; may be repeated"
     parser.add_argument(
         "--with", dest="more", action="append", type=Path, default=[], metavar="WHEEL", help=driver
     )
@@ -135,7 +135,7 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
         made = make_bundle(inputs._replace(wheels=wheels), target, out)
     for name, size in made.sizes.items():
         print(f"{size:>12,}  {name}")
-    print(f"{sum(s for n, s in made.sizes.items() if n.startswith(WHEELS)):>12,}  of it wheels")
+    print(f"{sum(s for n, s in made.sizes.items() if n.startswith(WHEELS)):>12,}  of that, wheels")
     size, manifest = made.path.stat().st_size, made.manifest
     print(f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB), signed by {made.path.name}.sig")
     print(
@@ -308,9 +308,7 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
     keys = tomllib.loads(given).keys()
     for name in _OF_THE_BUNDLE:
         if name in keys:
-            raise UserError(
-                f"config file {inputs.config}: {name} is the bundle's to say; leave it out"
-            )
+            raise UserError(f"config file {inputs.config}: the bundle sets {name}; leave it out")
     if "armed_at_start" in keys and config.armed_at_start and config.vehicle != NONE:
         raise UserError(
             f"config file {inputs.config}: armed_at_start would let a machine move the vehicle"

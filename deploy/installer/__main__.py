@@ -97,10 +97,10 @@ def _parser() -> argparse.ArgumentParser:
         add("--service", metavar=ways, choices=WAYS, help=f"who runs it (default: {who})")
         if name in ("install", "rollback"):
             for option, default, text in (
-                ("--health-limit", LIMITS.within_s, "healthy by then, or back"),
-                ("--settle", LIMITS.settle_s, "and for so long after that"),
+                ("--health-limit", LIMITS.within_s, "go back unless it is healthy within"),
+                ("--settle", LIMITS.settle_s, "how long it must then stay healthy"),
             ):
-                add(option, metavar="S", type=seconds, default=default, help=f"{text}, s")
+                add(option, metavar="S", type=seconds, default=default, help=f"{text} (s)")
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
             trust = "first install: the public key to trust from now"

@@ -180,7 +180,7 @@ class Systemd(NoService):
 
 
 def settle(looks_well: Callable[[], bool], limits: Limits, what: str) -> None:
-    """Look again and again until it was well for `settle_s` on end.
+    """Look again and again until it has been healthy for `settle_s` without a break.
 
     `looks_well` raises UnhealthyError itself where there is no hope. Raises UnhealthyError where
     it is not well within `within_s`, or not any more after that.
@@ -223,7 +223,7 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
     if os.geteuid() != 0 and not only_look:
         raise UserError("--service systemd needs root: use sudo, or --service none")
     if not _FITS_A_UNIT.fullmatch(str(root)):
-        raise UserError(f"--root {root}: in a unit only letters, digits and ._+@/- are taken")
+        raise UserError(f"--root {root}: a unit's path may hold only letters, digits and ._+@/-")
     return Systemd(root)
 
 

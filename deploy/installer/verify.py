@@ -139,7 +139,7 @@ def _unpack(data: bytes) -> dict[str, bytes]:
             for member in tar:
                 stream = tar.extractfile(member) if member.isreg() else None
                 if stream is None or not _NAME.fullmatch(member.name) or member.name in files:
-                    raise UserError(f"it holds what no bundle holds: {member.name!r}")
+                    raise UserError(f"it holds what no bundle may hold: {member.name!r}")
                 files[member.name] = stream.read()
     except tarfile.TarError:
         raise UserError("it is no bundle") from None

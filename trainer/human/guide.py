@@ -13,9 +13,9 @@ Observation = NDArray[Any]
 Reason = str  # Why the human takes over
 STUCK, ASKED = "stuck", "asked"
 REASONS: tuple[Reason, ...] = ("collision", "lane", STUCK, "heading", "offset", "person", ASKED)
-"""Hardly a way out of a crash, a car that stops in the traffic's lane, one that waits for nothing,
-one that turns aside or is aside; a person has reasons of their own; the robot asked for help.
-Another environment's expert may have others."""
+"""In this order: a crash can hardly be avoided; the car stops in the traffic's lane; it waits for
+nothing; it turns aside; it is aside; a person took over; the robot asked for help. Another
+environment's expert may have others."""
 
 
 class Driver(Protocol):
@@ -125,7 +125,7 @@ class Attention:
         self._steps_left = 0
 
     def notices(self, reason: Reason | None) -> Reason | None:
-        """The reason to take over, so much later; once begun a take-over is not given up."""
+        """The reason, once the delay has passed; a take-over that has begun is not given up."""
         if self._steps_left == 0:
             if reason is None:
                 return None

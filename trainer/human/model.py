@@ -43,8 +43,8 @@ class HumanModelConfig:
     when nothing goes wrong."""
     label_every_step: bool = False
     """Whether the person also says, at every step that the model drives, what they would do. A
-    scripted expert can (DAgger as of Ross et al. 2011), a person cannot. Interventions alone leave
-    the model without an answer where it errs and nobody need step in, as too far from the line."""
+    scripted expert can (DAgger as of Ross et al. 2011), a person cannot. Interventions alone do
+    not correct errors too small to step in for, such as standing too far from the line."""
     refining_updates: int = 0
     """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
     paper. On few examples 2,000 made no difference; on 22,000 examples 12,000 brought the left

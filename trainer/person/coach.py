@@ -19,7 +19,7 @@ LEARNED, WELL = LEVELS
 """Success of the policy alone from which the person only watches, and from which all is done."""
 RECENT = 10  # Episodes that are listed, and that the advice looks at
 TOO_LATE_S = 2.0  # A failure so soon after a take-over says that it came too late
-LATE_ONES = 3  # Recent failures without the person, or after a late take-over, to say so
+LATE_ONES = 3  # So many recent failures, alone or after a late take-over, make the coach say so
 NEEDLESS_ONES, NEEDLESS_SHARE = 3, 2.0 / 3.0
 """At least so many recent episodes with take-overs, and this share of them, must be ones that the
 policy alone masters, to say that they were needless."""

@@ -38,7 +38,7 @@ class Controls:
     names: tuple[str, ...]  # Of the actions
 
     def mix(self, shares: Mapping[str, float]) -> Amount:
-        """The action while keys are pressed so far, each from 0 to 1; unknown ones do nothing."""
+        """The action for keys pressed by these shares, 0 to 1; unknown ones do nothing."""
         pressed = [np.multiply(share, self.keys[key]) for key, share in shares.items()
                    if key in self.keys]  # fmt: skip
         return amount(np.clip(np.add(self.rest, sum(pressed)), -1.0, 1.0))

@@ -39,7 +39,7 @@ from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
 TOKEN_BYTES = 16
-MAX_INPUT_BYTES = 1024  # A page's message is not longer; the longest honest one is a fifth of this
+MAX_INPUT_BYTES = 1024  # A page's message is not longer: with 16 actions it is half of this
 KEEP_ALIVE_S = 10.0  # How long a connection stays open for another request
 LOGGER = logging.getLogger(__name__)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")

@@ -45,15 +45,15 @@ class CongestionConfig(ScenarioConfig):
     brake_mps2: float = 4.0
     """Deceleration of the ego car at most; what the brake of a safe stop does."""
     traffic_speed_mps: Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
-    jam_speed_mps: Range = (4.5, 5.5)  # Speed of the whole jam, and ...
+    jam_speed_mps: Range = (4.5, 5.5)  # Speed of the whole jam
     lane_speed_mps: Range = (-0.5, 0.5)
-    """... what each lane's first car is faster. Lanes that drifted apart at 2 m/s would leave the
-    ego car alone before half of the way."""
+    """How much faster than the jam each lane's first car is. Lanes that drifted apart at 2 m/s
+    would leave the ego car alone before half of the way."""
     side_cars: int = 3
     """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
     cars_behind: int = 1
-    """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
-    elsewhere has nothing to react to."""
+    """In the ego car's lane. They follow it as one of them; cars in other lanes never react to
+    it."""
     traffic_mix: traffic.Mix = traffic.CARS_ONLY
     side_front_m: Range = (9.0, 13.0)
     """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
@@ -182,7 +182,7 @@ class CongestionEnv(DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """Its throttle is the IDM's, which no action reaches; the action +1 turns right."""
+        """The IDM sets the throttle, no action does; the action +1 turns right."""
         c = self.config
         return {
             "throttle_mps2": traffic.CAR.acceleration_mps2,
@@ -194,7 +194,7 @@ class CongestionEnv(DrivingEnv):
 
     @property
     def brake_action(self) -> Action:
-        """What a simulator applies when commands stop: the last steering. ``press_brake``, too."""
+        """What a simulator applies when commands stop: the last steering; ``press_brake`` brakes."""
         return np.array([self._steering], dtype=np.float32)
 
     def press_brake(self, pressed: bool) -> None:

@@ -103,7 +103,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     rest_action = np.zeros(1, np.float32)  # Hands off
     keys: Mapping[str, tuple[float, ...]]  # Key -> the action while a person holds it
     key_rate_per_s: float  # How quickly a key presses
-    biased_action: float  # What a human of biased guidance does whenever wrong
+    biased_action: float  # The wrong action of biased guidance
     expert_class: str  # By its name: its module imports the scenario
     scenes: ClassVar[Mapping[Scene, Any]]  # Their configs
     config: ScenarioConfig

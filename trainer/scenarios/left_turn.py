@@ -30,7 +30,7 @@ HEADING_GAIN = 1.5
 OFFSET_GAIN_RAD_PER_M = 0.5
 INTEGRAL_GAIN_RAD_PER_MS = 0.1
 INTEGRAL_LIMIT_MS = 1.0
-"""Of the control that keeps the car on its path."""
+"""Gains and limit of the PI control that keeps the car on its path."""
 
 
 class Pose(NamedTuple):
@@ -174,7 +174,7 @@ class LeftTurnEnv(DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """Its steering is where the path's control ends: no action of the left turn steers."""
+        """Its full steering is the path control's limit: no action of the left turn steers."""
         c = self.config
         return {
             "throttle_mps2": c.throttle_mps2,

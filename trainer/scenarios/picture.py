@@ -69,8 +69,8 @@ class Rasteriser:
         self.metres_per_pixel = metres_per_pixel
         steps_m = (np.arange(COLUMNS) + 0.5) * metres_per_pixel
         self._centres = np.stack([left_m + steps_m, top_m + steps_m])
-        """Where the middles of columns and rows are; of the rows more than there are, so that both
-        fit into one array."""
+        """Centres of the columns and rows, m; the rows are padded, so that both fit into one
+        array."""
         self._column_x, self._row_y = self._centres[0], self._centres[1, :ROWS]
         self.background = np.full((ROWS, COLUMNS), GROUND, dtype=np.float32)
         """The still part of the picture, grey values [45, 80]."""

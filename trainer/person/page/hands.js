@@ -12,7 +12,7 @@ export const OFF = { action: null, engaged: false, by_moving: false };
 export const list = (action) => [].concat(action ?? 0);
 const plain = (values) => (values.length === 1 ? values[0] : values);
 
-// The action while keys are pressed so far, each from 0 to 1.
+// The action for keys pressed by these shares, 0 to 1.
 export function mix(controls, shares) {
   const added = list(controls.rest).map((rest, i) =>
     Object.entries(shares).reduce(
