@@ -194,7 +194,7 @@ class CongestionEnv(DrivingEnv):
 
     @property
     def brake_action(self) -> Action:
-        """What a simulator applies when commands stop: the last steering; ``press_brake`` brakes."""
+        """Applied when commands stop: the last steering; ``press_brake`` brakes."""
         return np.array([self._steering], dtype=np.float32)
 
     def press_brake(self, pressed: bool) -> None:
