@@ -132,7 +132,6 @@ def _action_fault(values: Sequence[float], actions: Sequence[Action], rounding: 
     return ""
 
 
-OVERTAKEN_S = 5.0
 NO_FEEDBACK = "no_feedback"
 """Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
 SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
@@ -226,6 +225,9 @@ class FeedbackCheck:
         return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
 
 
+OVERTAKEN_S = 5.0  # At most, by a message or an answer that came later
+
+
 class EdgeCounts:
     """Adds up how the edge's counts grow; the first health seen is where they stood before.
 
@@ -263,8 +265,8 @@ class EdgeCounts:
             if last is not None:
                 # Where a message and an answer have overtaken one another both clocks are behind by
                 # little. A board that starts anew, its wall clock not yet set, is behind by much.
-                late_s = last.uptime_s - health.uptime_s
-                if health.sent_ns <= last.sent_ns and 0.0 <= late_s < OVERTAKEN_S:
+                behind_s = last.uptime_s - health.uptime_s, (last.sent_ns - health.sent_ns) * 1e-9
+                if all(0.0 <= one < OVERTAKEN_S for one in behind_s):
                     return
                 # A restarted edge runtime has a younger clock; it counts from zero, as another.
                 another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any, NoReturn
 
 import msgspec
@@ -47,11 +48,20 @@ PayloadHandler = Callable[[bytes], None]
 
 
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
-    """The scene as it is sent, or else the environment's picture."""
-    scene = scene_of(environment)
-    if scene is None:
-        stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
+    """The scene as it is sent, or else the environment's picture, where that can be drawn."""
+    scene = None
+    try:
+        scene = scene_of(environment)
+        if scene is None:
+            stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
+    except Exception as error:  # Of any kind: it is somebody else's code, and the drive goes on.
+        _say_once(f"the environment cannot be shown: {error!r}")
     return encode_scene(scene or {}, stamps)
+
+
+@cache
+def _say_once(words: str) -> None:
+    print(words, file=sys.stderr)
 
 
 class SimulatorPort:
@@ -61,7 +71,6 @@ class SimulatorPort:
         self.session = secrets.token_hex(8)
         self.vehicle_id = vehicle_id
         self.edge_counts = EdgeCounts()
-        self._is_undrawn = False
         self._zenoh = zenoh_session
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
@@ -90,13 +99,7 @@ class SimulatorPort:
         somebody: Any = self._scenes.matching_status
         if not somebody.matching:
             return
-        try:
-            payload = scene_payload(environment, stamps)
-        except Exception as error:  # Of any kind: it is somebody else's, and the drive goes on.
-            if not self._is_undrawn:
-                print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
-            self._is_undrawn, payload = True, encode_scene({}, stamps)
-        self._scenes.put(payload)
+        self._scenes.put(scene_payload(environment, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""

@@ -7,7 +7,7 @@ viewers can draw:
 |---|---|
 | ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
 | ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
-| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t (or another picture array) |
+| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t; so each picture array |
 | ``view/<id>/<topic>``, of every topic of the wire | protobuf ``phil.State`` and so on |
 | ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
 

@@ -17,7 +17,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -109,7 +109,10 @@ class Condition:
 
 
 class Recording(Condition):
-    """One MCAP file; its condition is known when ``messages`` or ``records`` came to the end."""
+    """One MCAP file; its condition is known when ``messages`` or ``records`` came to the end.
+
+    One pass at a time: a new one ends the one before.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -155,7 +158,7 @@ class Recording(Condition):
         UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
         work than its size accounts for.
         """
-        vars(self).update(asdict(Condition()), metadata={})
+        vars(self).update(vars(Condition()), metadata={})
         self._has_ended, self._spent_bytes = False, 0
         try:
             with open_regular(self.path) as self._stream:

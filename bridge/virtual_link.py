@@ -7,10 +7,9 @@ command is held from tick to tick; when none has arrived for 2 T, or when the co
 `VirtualLink` is shared by lock-step and by training under latency. The caller gives the answers:
 those of a real edge runtime, or of a function. An answer takes no time.
 
-In lock-step states come faster than in real time, so a real edge runtime would not notice a gap in
-virtual time. So the link runs the safety machine on virtual time itself, and what that would not
-drive becomes a safe stop. It begins each episode in standby: episodes do not depend on
-each other.
+In lock-step states come faster than in real time: a real edge runtime would not notice a gap in
+virtual time. The link runs the safety machine on virtual time itself, and what that would not drive
+becomes a safe stop. It begins each episode in standby: episodes do not depend on each other.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     """The file's settings with the given flags (those that are not None) in their place.
 
     Raises UserError for a file that is no TOML, an unknown key, and a value out of range; where
-    the value stands in the file, the error names it. The vehicle's driver checks its own table.
+    one value of the file is wrong, the error names it. The vehicle's driver checks its own table.
     """
     given = {name: value for name, value in flags.items() if value is not None}
     from_file = Config()
@@ -106,7 +106,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     _check(config)
     if not config.policy:
         raise UserError("no policy to drive: name it with --policy, or as policy in --config")
-    check_fits(check_endpoint(config.connect), config.tls is not None)
+    check_fits(config.connect, config.tls is not None)
     if bus is None:
         return config
     if config.vehicle != "hunter":

@@ -13,7 +13,7 @@ from typing import Dict, NamedTuple, Optional, Tuple
 from edge_runtime.wire import Reason, Rejection, State
 
 TAKEOVER_PERIODS = 2
-MAX_SESSIONS = 10_000  # Some 6 MB, and half an hour of one take-over after the other
+MAX_SESSIONS = 10_000  # Some 6 MB; at T = 0.1 s half an hour of one take-over after the other
 # One message from far ahead would make all that follow it old. So many may be lost on the way; the
 # two rates below add what a fast simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
@@ -80,9 +80,9 @@ class LatestState:
         if refusal is None or refusal.reason is not Reason.FUTURE:
             return refusal
         leap, self._leap = self._leap, (session, state.episode, state.step)
+        # A simulator that counts in leaps goes on from where it came to.
         if leap is not None and leap[:2] == (session, state.episode):
-            # A simulator that counts in leaps goes on from where it came to.
-            return None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
+            refusal = None if 0 < state.step - leap[2] <= MAX_LOST_STEPS else refusal
         return refusal
 
 

@@ -79,7 +79,7 @@ def failing_drive(
         behind = partial(drive, env, driver, condition, seed)
         if behind(UNDISTURBED).outcome != GOAL or behind(whole, spec).outcome == GOAL:
             continue
-        if behind(whole).outcome != GOAL:  # Else two messages of one period differed: no trace can.
+        if behind(whole).outcome != GOAL:  # No trace tells two of one period apart.
             return seed, str(spec), whole
     return None
 

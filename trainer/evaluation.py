@@ -18,9 +18,8 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.manifest import MANIFEST_KEY, decode_manifest
-from edge_runtime.policy import MAX_POLICY_MIB, check_graph
-from edge_runtime.util import UserError, counted, read_bytes, read_json
+from edge_runtime.policy import load_policy
+from edge_runtime.util import UserError, counted, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
@@ -134,7 +133,7 @@ def evaluate(
     if runs < 1:
         raise UserError(f"runs must be at least 1: {runs}")
     policy, spec = fspath(policy), parse_spec(latency)
-    scenario = scenario_of(scenario or _trained_in(policy))
+    scenario = scenario_of(scenario or _trained_in(policy, public_key))
     env = make_environment(scenario, condition)
     driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     threads, goals = torch.get_num_threads(), 0
@@ -155,14 +154,13 @@ def evaluate(
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
 
-def _trained_in(policy: str) -> str:
+def _trained_in(policy: str, public_key: str | None) -> str:
     """The scenario of a run, a human model or a policy file; of anything else the left turn."""
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
             return str(read_json(Path(policy) / name, "config").get("scenario"))
     if policy.endswith(".onnx"):
-        metadata = check_graph(read_bytes(policy, "policy file", MAX_POLICY_MIB))
-        task = decode_manifest(metadata[MANIFEST_KEY]).task if MANIFEST_KEY in metadata else ""
+        task = load_policy(policy, public_key, allow_unsigned=True).manifest.task
         if task in SCENARIOS:
             return task
     return "left_turn"

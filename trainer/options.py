@@ -25,7 +25,7 @@ def add_scenario(parser: Group, default: str | None = "left_turn") -> None:
     """``--scenario``; ``default`` None: what the policy was trained in."""
     words = ", ".join(SCENARIOS)
     what = f"what is driven: {words}, a gymnasium id, or module:id"
-    what += "" if default else " (default: what the run was trained in, else left_turn)"
+    what += "" if default else " (default: what the policy was trained in, else left_turn)"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
 
 

@@ -121,7 +121,7 @@ def export_policy(
     allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
     if not difference < allowed:
         raise UserError(
-            f"onnxruntime and torch differ by {difference:.1e} (allowed: {allowed:.0e}); "
+            f"onnxruntime and torch differ by {difference:.1e} (allowed: {allowed:.1e}); "
             "nothing was written"
         )
     return Export(model, policy_id_of(model), difference)

@@ -615,7 +615,6 @@ def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
 
 
 class ReadCounting(io.BytesIO):
-    name = "crafted.mcap"
     read_bytes = 0
 
     def read(self, count: int | None = -1) -> bytes:

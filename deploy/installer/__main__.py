@@ -247,11 +247,11 @@ class Installer:
             if not fault:
                 _say(f"{version} lies here already, whole")
                 return
+            check_room(bundle, layout, layout.release(version))  # Before it is taken away
             _say(f"{version} lies here damaged ({fault}): made again")
-            check_room(bundle, layout)  # Before anything is taken away
             if layout.linked("current") == version:
                 self._service.stop()
-                self._is_stopped = True
+                self._is_stopped = self._service.name != "none"
             layout.remove_release(version)
         _say(f"unpacked {make_release(bundle, layout, self._service.group())}")
 

@@ -309,10 +309,11 @@ def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None)
     os.chmod(str(path), mode)
 
 
-def check_room(bundle: Bundle, layout: Layout) -> None:
-    """Unpacked and compiled, wheels take some four times their size."""
+def check_room(bundle: Bundle, layout: Layout, replaced: Path | None = None) -> None:
+    """Unpacked and compiled, wheels take some four times their size. UserError; `replaced` goes."""
     needed = 5 * sum(map(len, bundle.files.values()))
     free = shutil.disk_usage(str(layout.releases)).free
+    free += sum(path.lstat().st_size for path in replaced.rglob("*")) if replaced else 0
     if free < needed:
         raise UserError(
             f"not enough room in {layout.root}: {needed // 10**6} MB are needed,"

@@ -350,7 +350,7 @@ def test_what_may_not_be_read_or_named_in_a_unit_is_said(board, workshop, monkey
     monkeypatch.setattr(systemd, "is_there", lambda: True)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     for root in ("/opt/two words", "/opt/100%"):
-        with pytest.raises(UserError, match="in a unit only"):
+        with pytest.raises(UserError, match="may hold only letters"):
             systemd.choose("systemd", Path(root))
     (board.root / "state/way").write_text("systemd")
     with pytest.raises(UserError, match="systemd runs this board"):  # Its unit would be nobody's.

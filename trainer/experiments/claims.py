@@ -140,7 +140,7 @@ def sooner(
 ) -> Iterator[Comparison]:
     """Whether each of ours reaches the other's final level more than ``bar`` times as soon.
 
-    The claim's bar is the times, and its others must be named. ``common``: the level is the lower
+    The claim's others must be named. ``common``: the level is the lower
     end of the two, so that both can reach it; ``best``: only the best of the others counts;
     ``level``: a level of the policy alone instead.
     """

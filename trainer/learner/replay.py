@@ -353,7 +353,7 @@ def _find(weights: NDArray[np.float64], shares: NDArray[np.float64]) -> Indices:
     """The indices in whose part of the sum of all weights the shares (0 to below 1) fall."""
     sums = np.cumsum(weights)
     found = np.searchsorted(sums, shares * sums[-1], side="right")
-    return np.minimum(found, np.flatnonzero(weights)[-1])  # Rounding may lead beyond the last.
+    return np.minimum(found, np.searchsorted(sums, sums[-1]))  # Rounding may lead beyond the last.
 
 
 def _mean(values: NDArray[np.float64]) -> float:

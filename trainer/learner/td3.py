@@ -258,7 +258,7 @@ class TD3Learner:
         return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
-        """Loss that prefers the human's action where the overruled one would have led to."""
+        """Loss that prefers the human's action in what the overruled one would have led to."""
         seen = tensors(self._shift(foreseen.next_frames), self.device)
         with self._precision():
             picture = self.actor.picture(*seen)

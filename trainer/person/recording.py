@@ -3,7 +3,7 @@
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on; its messages are whole transitions
 (``Step``) in MessagePack. Each step is a chunk of its own, handed to the operating system at once.
 So whatever ends the process, at most one step is lost: the one that was being taken, or an
-episode's last, which says whether the person discarded it. 30 minutes are about 12 MB. Nothing is
+episode's last, which says whether the person discarded it. 30 minutes are about 14 MB. Nothing is
 ever overwritten: sittings add up.
 """
 
@@ -134,6 +134,11 @@ def sittings(directory: Path) -> list[Path]:
     return sorted(found, key=_number)
 
 
+def _begun(directory: Path) -> list[Path]:
+    """Those that hold anything: of one that was just begun a power cut may leave nothing."""
+    return [path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE]
+
+
 def _number(path: Path) -> int:
     return int(NAME.sub(r"\1", path.name))
 
@@ -142,7 +147,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     """The recordings in files, directories and training runs; UserError where a place has none."""
     found: list[Path] = []
     for place in places:
-        here = [place] if place.is_file() else sittings(place) or sittings(place / DIRECTORY)
+        here = [place] if place.is_file() else _begun(place) or _begun(place / DIRECTORY)
         if not here:
             raise UserError(f"no recording in {place}: expected sitting-NNNN.mcap, or such files")
         found += [path for path in here if path not in found]
@@ -180,8 +185,7 @@ def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
 
 def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Step]:
     """The recorded steps from ``position``, a sitting and an index, on, over all sittings."""
-    # Of a file that was just begun a power cut may leave nothing.
-    for path in (path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE):
+    for path in _begun(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
 
 

@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         with closing(made) as sitting, quit_on_signals(sitting.quit):
             outcomes = drive(sitting, policy, seed_of, arguments.episodes)
-    print(f"episodes: {_listed(outcomes) or 'none'}; {sitting.summary()}")
+    print(f"outcomes: {_listed(outcomes) or 'none'}; {sitting.summary()}")
     return 0
 
 

@@ -247,10 +247,7 @@ def test_a_slot_that_changes_hands_leaves_the_other_buffer():
     assert not sample(buffer).human.any()
 
 
-weights_lists = st.lists(st.floats(0, 100), min_size=1, max_size=70)
-
-
-@given(weights_lists, st.floats(0, 1, exclude_max=True))
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=70), st.floats(0, 1, exclude_max=True))
 def test_find_inverts_the_cumulative_sum(weights, share):
     plain = np.array(weights)
     assume(plain.sum() > 1e-6)

@@ -309,7 +309,7 @@ def _take_config(arguments: argparse.Namespace) -> list[str]:
 
 
 class _Noted(argparse._StoreAction):
-    """Stores an option's value, and that it was given: such a value goes before ``--config``."""
+    """Stores an option's value, and that it was given: such a value wins over ``--config``."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
         super().__call__(parser, namespace, values, option)

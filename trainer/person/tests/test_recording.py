@@ -184,6 +184,7 @@ def test_only_what_came_after_the_checkpoint(tmp_path, position, left):
     for sitting, count in ((1, 3), (2, 2)):
         record(tmp_path, episode(sitting, 0, count, range(0)))
     (tmp_path / "sitting-0003.mcap").touch()  # A power cut just after its beginning.
+    assert len(recording.find_recordings([tmp_path])) == 2
     assert len(list(recording.steps_since(tmp_path, position))) == left
 
 
