@@ -165,23 +165,6 @@ def test_the_human_holds_on_and_gives_back(reasons, how, held, first):
     assert {step.reason for step in steps} == {next(filter(None, reasons))}
 
 
-class Alarm:
-    """A trigger that goes off at the given control periods, from 0."""
-
-    def __init__(self, *periods):
-        self.periods, self.period = periods, -1
-
-    def reset(self):
-        self.period = -1
-
-    def wants_control(self, action):
-        self.period += 1
-        return "collision" if self.period in self.periods else None
-
-    def may_return(self):
-        return True
-
-
 def noticed(attention, *periods, count):
     """What a human notices of a reason that is there in these periods."""
     return [attention.notices("collision" if n in periods else None) for n in range(count)]
@@ -220,7 +203,9 @@ def test_at_the_wheel_every_human_is_attentive():
 
 
 def test_the_robot_asks_where_its_doubt_is_high_once_it_knows_what_that_is():
-    gate, asked = Asking(Alarm(3), 0.05), []
+    asked: list[Any] = []
+    human: Any = SimpleNamespace(wants_control=lambda _: CRASH if len(asked) == 3 else None)
+    gate = Asking(human, 0.05)
     for number in range(gate.MEMORY + 100):
         gate.doubts.append(float(number % 100))
         asked.append(gate.wants_control(FULL))
