@@ -291,6 +291,10 @@ class PersonRun(TrainingRun):
             ticks_late(self.network, self.env.control_period_s),
         )
         self.learning.release(discarded=False)
+        # Episodes that ended after the checkpoint count: the person gave what their rows say.
+        ended = read_metrics(self.run_dir)[self.episode :]
+        self.episode += len(ended)
+        self.steps += sum(int(row["steps"]) for row in ended)
 
 
 def check_settings(config: RunConfig) -> None:
