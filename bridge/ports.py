@@ -18,7 +18,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import cache
 from typing import Any, NoReturn
 
 import msgspec
@@ -45,6 +44,7 @@ QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 EDGE_POLL_S = 0.1
 QUERY_S = 1.0
 PayloadHandler = Callable[[bytes], None]
+_UNDRAWN: set[type[Exception]] = set()  # What was said already
 
 
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
@@ -55,13 +55,10 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
         if scene is None:
             stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
     except Exception as error:  # Of any kind: it is somebody else's code, and the drive goes on.
-        _say_once(f"the environment cannot be shown: {error!r}")
+        if type(error) not in _UNDRAWN:  # Not at every step, whose number may be in its text
+            _UNDRAWN.add(type(error))
+            print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
     return encode_scene(scene or {}, stamps)
-
-
-@cache
-def _say_once(words: str) -> None:
-    print(words, file=sys.stderr)
 
 
 class SimulatorPort:

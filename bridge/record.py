@@ -135,7 +135,7 @@ class ViewerCopies:
 
     def __init__(self, add: Callable[[str, Schema, int, bytes], None]) -> None:
         self._add = add
-        self._layouts: dict[str, Layout] = {}  # By the vehicle: a simulator says it with its scenes
+        self._layouts: dict[str, Layout | None] = {}  # By the vehicle, as its scenes say
 
     def write(self, heard: Heard) -> None:
         """Copy one message, or tell of it as an event."""
@@ -161,11 +161,9 @@ class ViewerCopies:
             return
         vehicle = _vehicle_id(heard)
         if isinstance(message, Scene):
-            self._layouts.pop(vehicle, None)
-            if message.task:
-                self._layouts[vehicle] = Layout(message.task)
-        elif isinstance(message, wire.State) and vehicle in self._layouts:
-            self._copy_images(heard, message, self._layouts[vehicle])
+            self._layouts[vehicle] = Layout(message.task) if message.task else None
+        elif isinstance(message, wire.State) and (layout := self._layouts.get(vehicle)) is not None:
+            self._copy_images(heard, message, layout)
 
     def _copy_images(self, heard: Heard, state: wire.State, layout: Layout) -> None:
         if layout.refusal(state.observation) is not None:

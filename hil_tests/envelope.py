@@ -58,7 +58,7 @@ ZONE = 0.7
 """The test tells the promise from 0.7 times more, and 0.7 times fewer, failures: for 95 %, from
 98.5 % and from 91.5 %."""
 TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
-MOST_FAILURES = 50  # A point stays undecided after as many drives as have these at the promise
+MOST_FAILURES = 50  # At the promise: a point is left undecided after the drives that have so many
 CHUNK = 8  # Drives of one task of a process
 FRESH = 1_000_000  # So far from the seeds of the search are those that confirm it
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing

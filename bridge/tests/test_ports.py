@@ -1,6 +1,7 @@
 """Both ends: what each hears."""
 
 import contextlib
+import itertools
 import signal
 import subprocess
 import sys
@@ -8,10 +9,10 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import zenoh
 
+from bridge import ports
 from bridge.messages import Scene, decode_scene
 from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
 from edge_runtime.reach import free_endpoint
@@ -54,11 +55,17 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     assert port.edge_counts.newest is None
 
 
-def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys):
-    """JPEG has no fourth colour; and only while somebody looks is anything drawn at all."""
+def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeypatch):
+    """Only while somebody looks is anything drawn; what is wrong is said once, not at each step."""
+    monkeypatch.setattr(ports, "_UNDRAWN", set())
     _, router, client = sessions
     see_through: Any = SimpleNamespace(unwrapped=SimpleNamespace(render_mode="rgb_array"))
-    see_through.render = lambda: np.zeros((4, 4, 4), np.uint8)
+    steps = itertools.count()
+
+    def render():
+        raise OSError(f"no picture of step {next(steps)}")
+
+    see_through.render = render
     heard: list[bytes] = []
     key = "phil/v1/scene"
     viewer = client.declare_subscriber(key, lambda one: heard.append(bytes(one.payload)))

@@ -61,8 +61,9 @@ STORIES: dict = {
     ],
     "the first state of a session may stand anywhere": [(A, 10**9, 10**12, 0.0, None)],
     "past sessions may come back with newer states, and never with older ones": [
-        *((f"s{number}", 0, 0, number * 1.0, None) for number in range(100)),
-        ("s1", 0, 0, 200.0, DUPLICATE), ("s1", 0, 1, 201.0, None), ("s1", 0, 0, 202.0, STALE),
+        *((f"s{number}", 0, 0, number * 1.0, None) for number in range(2000)),
+        ("s1", 0, 0, 2100.0, DUPLICATE), ("s1", 0, 1, 2101.0, None), ("s1", 0, 0, 2102.0, STALE),
+        ("s2", 10**9, 10**9, 2102.1, FOREIGN), ("s2", 10**9, 10**9, 2104.0, FUTURE),
     ],
 }  # fmt: skip
 

@@ -255,3 +255,12 @@ def test_find_inverts_the_cumulative_sum(weights, share):
     assert plain[found] > 0
     total, above = plain.sum(), np.cumsum(plain)[found]
     assert above - plain[found] - 1e-9 * total <= share * total <= above + 1e-9 * total
+
+
+def test_samples_are_in_proportion_to_the_priorities():
+    buffer, _ = filled(5, alpha=1.0)
+    # Of an index that is named twice, the last priority counts.
+    priorities = np.array([0.0, 1.0, 9.0, 3.0, 4.0, 2.0])
+    buffer.update_priorities(np.array([0, 1, 2, 3, 4, 2]), priorities)
+    shares = np.bincount(sample(buffer, 10_000).indices, minlength=5) / 10_000
+    np.testing.assert_allclose(shares, [0.0, 0.1, 0.2, 0.3, 0.4], atol=0.01)
