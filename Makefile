@@ -51,7 +51,8 @@ lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
-	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
+	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer \
+	  hil_tests/__init__.py hil_tests/__main__.py hil_tests/doctor.py
 
 $(CONTAINER_STAMP): requirements/container.txt
 	$(PYTHON) -m venv $(CONTAINER)
@@ -96,8 +97,7 @@ mutate: $(MUTATION_STAMP)  ## change the safety core in every small way, and sho
 	done
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
-	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new
-	echo 'torch==2.13.0' >> requirements/workstation.txt.new
+	$(BIN)/python -m pip freeze --exclude-editable | sed 's/^\(torch==[^+]*\)+.*/\1/' > requirements/workstation.txt.new
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
 clean:  ## remove caches and the virtual environments; trained runs stay

@@ -136,7 +136,7 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
         if arguments.tls is not None:
             raise UserError("--tls is for a link, of --listen or --connect; --policy has none")
         policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
-        config = load_config(arguments.config, {"policy": arguments.policy})
+        config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
         return policy.policy_id, replay_in_process(drive, policy, config)
     if arguments.config is not None:
         raise UserError("--config is for --policy; an edge runtime that is asked has its own")

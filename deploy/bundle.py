@@ -74,7 +74,7 @@ TARGETS = {
         ("linux-x86_64", "3.8", "x86_64"),  # jetpack5's versions on a workstation
     )
 }
-_PATCH = 2  # pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2.
+_PATCH = 2  # pip reads 3.9 as 3.9.0, which cryptography excludes; Debian bullseye has 3.9.2.
 _LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
 _SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
 _EPOCH_S = 315532800
@@ -206,11 +206,11 @@ def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
 
     Those of another package's driver are not read: it need not be installed here.
     """
-    name = config.vehicle.partition(":")[0]
+    name, colon, _ = config.vehicle.partition(":")
     if name in (NONE, *BUILT_IN):
         limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
         shared_limits(policy.manifest.action, limits)
-    elif name not in brought:
+    elif name + colon not in brought:
         known = ", ".join((NONE, *BUILT_IN))
         raise UserError(
             f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
@@ -219,7 +219,7 @@ def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
 
 
 def _drivers_in(path: Path) -> set[str]:
-    """The vehicles that a wheel names in its entry points, and all of its modules."""
+    """The vehicles that a wheel names in its entry points, and all of its modules, as `module:`."""
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as wheel:
             names = wheel.namelist()
@@ -229,7 +229,7 @@ def _drivers_in(path: Path) -> set[str]:
         points.read_string("\n".join(text.decode() for text in read))
     except (OSError, *NO_ZIP, configparser.Error, ValueError) as error:
         raise UserError(f"wheel {path} cannot be read: {error}") from None
-    modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") for one in names}
+    modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") + ":" for one in names}
     return modules | (set(points[GROUP]) if GROUP in points else set())
 
 

@@ -126,7 +126,7 @@ def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_certs(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the authority and the parties; UserError where nothing is."""
+    """Make the authority and the parties that are missing; UserError where none is."""
     out, days = Path(arguments.out), arguments.days
     hosts = list(dict.fromkeys(map(_host, [*LOOPBACK_HOSTS, *arguments.host])))
     roles = _missing(out, arguments.vehicle_id or [DEFAULT_VEHICLE_ID])

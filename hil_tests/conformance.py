@@ -48,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print a table of all rules; 0 where the driver keeps them, 1 where it breaks one."""
-    config = load_config(arguments.config, {"policy": "any", "vehicle": arguments.vehicle})
+    flags = {"policy": "any", "vehicle": arguments.vehicle}
+    config = load_config(arguments.config, flags, opens_link=False)
     if config.vehicle == NONE:
         raise UserError("no vehicle to try: name it with --vehicle")
     log.configure("error")

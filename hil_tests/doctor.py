@@ -1,13 +1,14 @@
 """``python -m hil_tests doctor``: what this machine can and cannot do, and how to get the rest.
 
-Each probe does the thing instead of looking for it; CHECKS, at the end, says what is not there
-without it. It runs in a fresh clone, before anything is installed, so only the standard library is
+Each probe does the thing instead of looking for it; CHECKS, at the end, says what each is for. It
+runs in a fresh clone, before anything is installed, so only the standard library is
 imported up here; heavy libraries are tried in a process of their own.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import platform
 import re
@@ -201,15 +202,21 @@ def _loopback() -> str:
 
     came = threading.Event()
     endpoint = free_endpoint()
-    with (
-        open_session(listen=endpoint, mode="router") as router,
-        open_session(connect=endpoint, mode="client") as client,
-        router.declare_subscriber("phil/doctor", lambda _: came.set()),
-    ):
+    with contextlib.ExitStack() as stack:  # An old Python, which is to be told so, reads it, too.
+        router = stack.enter_context(open_session(listen=endpoint, mode="router"))
+        client = stack.enter_context(open_session(connect=endpoint, mode="client"))
+        stack.enter_context(router.declare_subscriber("phil/doctor", lambda _: came.set()))
         client.put("phil/doctor", b"doctor")
         if not came.wait(ARRIVAL_S):
             raise UserError(f"no message within {ARRIVAL_S:.0f} s over {endpoint}")
     return f"a message went over {endpoint}"
+
+
+def _ssh_keygen() -> str:
+    found = shutil.which("ssh-keygen")
+    if found is None:
+        raise UserError("not found")
+    return found
 
 
 def _disk() -> str:
@@ -293,6 +300,8 @@ CHECKS = (
     Check("person", "gamepad or wheel", partial(python_says, _CONTROLLERS),
           "no `--human gamepad`, no `--human wheel`",
           "plug one in; if it is: the right to read /dev/input/* (group input)"),
+    Check("vehicle", "ssh-keygen", _ssh_keygen, "no bundle for a board, no `make test`",
+          "apt install openssh-client"),
     Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
           "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
     Check("vehicle", "real-time priority", _realtime_priority,

@@ -266,7 +266,8 @@ def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
     hand.drive(20, 23)
     assert is_the_same(hand, compared=23)
     settings = tmp_path / "edge.toml"
-    settings.write_text("vehicle.driver = 'hunter'\nvehicle.hunter.scale = 0.2\n")
+    link = "connect = 'tls/10.0.0.1:7447'"  # It opens none, and takes no --tls.
+    settings.write_text(f"{link}\nvehicle.driver = 'hunter'\nvehicle.hunter.scale = 0.2\n")
     assert replay(hand, None, "--config", str(settings))[0] == 0
     settings.write_text("[vehicle.hunter]\nscale = -1\n")
     assert replay(hand, None, "--config", str(settings))[0] == 2

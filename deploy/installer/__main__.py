@@ -25,6 +25,7 @@ from deploy.installer.layout import (
     PUBLIC_KEY,
     Layout,
     check_room,
+    let_read_key,
     make_release,
     why_not_whole,
     write_whole,
@@ -185,7 +186,6 @@ class Installer:
             layout.tidy()
             if not layout.trusted.exists():
                 write_whole(layout.trusted, key)
-            remember(self._service.name, layout.root)
             self._unpack(bundle)
             self.activate(version, is_new=True)
         return version
@@ -193,6 +193,8 @@ class Installer:
     def rollback(self) -> str:
         """Go back to the release before; return its version."""
         layout = self._layout
+        if not layout.releases.is_dir():  # Before the lock, which would make the folder.
+            raise UserError(f"nothing is installed in {layout.root}")
         with layout.locked():
             layout.tidy()
             version = layout.linked("previous")
@@ -235,6 +237,7 @@ class Installer:
             goes_on = "is stopped" if self._is_stopped else "goes on"
             stays = f"{before} {goes_on}" if before else "nothing is installed"
             raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
+        remember(self._service.name, layout.root)
         self._switch(version, before)
         for other in layout.versions():
             if other not in (layout.linked("current"), layout.linked("previous")):
@@ -271,6 +274,8 @@ class Installer:
             raise UnhealthyError(f"edge_runtime check: {lines[-1]}")
         _say("edge_runtime check: the policy may drive")
         if self._service.name != "none":
+            # It may have been unpacked for its owner alone, under --service none.
+            let_read_key(folder, self._service.group())
             policy_id = _manifest(self._layout, version).policy_id
             self._service.try_release(folder, policy_id, self._limits)
             _say("trial: healthy, in a network of its own")

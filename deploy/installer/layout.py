@@ -288,9 +288,10 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
         if path.startswith(WHEELS):
             unpack_wheel(data, path, draft / SITE)
         elif path.startswith(TLS):
-            _write(draft / path, data, 0o600 if group is None else 0o640, group)
+            _write(draft / path, data, 0o600)
         else:
             _write(draft / path, data)
+    let_read_key(draft, group)
     _write(draft / "launch.py", _LAUNCH.encode())
     start = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
     text = f'#!/bin/sh\nexec {" ".join(map(shlex.quote, start))} "$@"\n'
@@ -299,13 +300,18 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
     compileall.compile_dir(str(draft / SITE), quiet=2, rx=_NOT_COMPILED)
 
 
-def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None) -> None:
+def let_read_key(folder: Path, group: int | None) -> None:
+    """Let a group, if there is one, read the TLS key of a release."""
+    for path in (folder / TLS).glob("*") if group is not None else ():
+        os.chown(str(path), -1, group)
+        os.chmod(str(path), 0o640)
+
+
+def _write(path: Path, data: bytes, mode: int = 0o644) -> None:
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
     descriptor = os.open(str(path), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with open(descriptor, "wb") as stream:
         stream.write(data)
-    if group is not None:
-        os.chown(str(path), -1, group)
     os.chmod(str(path), mode)
 
 

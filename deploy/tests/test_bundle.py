@@ -192,6 +192,10 @@ def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(workshop, 
     for name, said in (("rover", absent), (vehicle, absent), ("tank", "rover, or a module")):
         ended = subprocess.run([*start, name], capture_output=True, text=True)
         assert (ended.returncode, said in ended.stderr) == (2, True), ended.stderr
+    for vehicle in ("my_vehicle", "rover:Rover"):  # A module is no name, nor a name a module.
+        config.write_text(f'vehicle = "{vehicle}"\n')
+        with pytest.raises(UserError, match="in no wheel"):
+            workshop.make(wheels=inputs, config=config)
     with pytest.raises(UserError, match="the bundle has another my_vehicle"):
         workshop.make(wheels=[*inputs, wheel])
 

@@ -181,8 +181,8 @@ def test_an_empty_board_must_be_told_whom_to_trust_and_has_nothing_to_undo(board
     if not systemd.is_there():
         refused(board.install(bundle, "systemd"), "no systemd runs this computer")
     refused(subprocess.run(board.command("")[:3], capture_output=True, text=True, timeout=60))
+    refused(board.run("rollback"), "nothing is installed")
     assert not board.root.exists()
-    refused(board.run("rollback"), "no earlier release")
 
 
 def test_a_bundle_of_another_key_is_refused_now_and_later(board: Board, workshop, tmp_path):
@@ -212,16 +212,27 @@ def test_a_bundle_for_another_computer_is_refused(board: Board, workshop, tmp_pa
 
 
 def test_a_policy_that_may_not_drive_there_changes_nothing(board: Board, workshop, tmp_path):
+    board.runs_a_process()
     good = workshop.make(0.1)
     assert board.install(good.path).returncode == 0
     change = ("edge_runtime/policy.py", "range(13, 22)", "range(18, 22)")
     wheel = changed_wheel(workshop.edge_wheel, tmp_path / "w", *change)
-    done = board.install(workshop.make(0.2, wheels=[wheel, workshop.host]).path)
+    done = board.install(workshop.make(0.2, wheels=[wheel, workshop.host]).path, "process")
     assert done.returncode == 1
     assert "edge_runtime check" in done.stderr
     assert "opset" in done.stderr
     assert board.status()["current"] == good.manifest.version
     assert Layout(str(board.root)).versions() == [good.manifest.version]
+    assert (board.root / "state/way").read_text() == "none"  # for the next one, too
+
+
+def test_the_services_group_reads_a_key_that_was_unpacked_for_its_owner_alone(tmp_path):
+    key = tmp_path / "tls" / "key.pem"
+    key.parent.mkdir()
+    key.touch(0o600)
+    for group, mode in ((None, 0o600), (os.getgid(), 0o640)):
+        layout_module.let_read_key(tmp_path, group)
+        assert key.stat().st_mode & 0o777 == mode
 
 
 def test_a_damaged_release_is_said_and_made_again(board: Board, workshop):

@@ -140,7 +140,8 @@ def test_a_driver_that_hangs_is_named_and_not_waited_for(
 
 def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
     bus, config = free_bus(), tmp_path / "edge.toml"
-    config.write_text(f"vehicle.driver = 'hunter'\nvehicle.hunter.bus = '{bus}'\n")
+    link = "connect = 'tls/10.0.0.1:7447'"  # It opens none, and has no --tls.
+    config.write_text(f"{link}\nvehicle.driver = 'hunter'\nvehicle.hunter.bus = '{bus}'\n")
     chassis = ChassisProcess(bus)
     with chassis.process:
         status = exit_status(main, ["conformance", "--config", str(config)])

@@ -1,5 +1,6 @@
 """The demo, whole but small: every step once, and again from what it kept."""
 
+import argparse
 import json
 import os
 import signal
@@ -55,6 +56,26 @@ def test_a_policy_without_signature_is_not_offered_and_a_failing_command_says_wh
     assert not kept.has_kept()
     with pytest.raises(UserError, match="does not exist"):
         Process("edge_runtime", "run", "--policy", str(tmp_path / "none.onnx"), ready="ready")
+
+
+def test_a_demo_cut_off_in_its_export_does_not_keep_the_policy_of_an_earlier_key(
+    tmp_path, monkeypatch
+):
+    def cut_off(*words):
+        if words[:2] == ("trainer", "export"):
+            raise KeyboardInterrupt
+
+    cut = Demo(tmp_path, runs=1)
+    monkeypatch.setattr(demo, "run_command", cut_off)
+    monkeypatch.setattr(demo.shutil, "copy", lambda *_: None)
+    for path in (cut.policy, tmp_path / "left_turn.onnx.sig"):
+        path.touch()
+    numbers = dict.fromkeys(("seed", "human_episodes", "human_minutes", "steps", "minutes"), 1)
+    with pytest.raises(KeyboardInterrupt):
+        cut.train(argparse.Namespace(**numbers, fresh=True))
+    cut.public_key.parent.mkdir(exist_ok=True)
+    cut.public_key.touch()
+    assert not cut.has_kept()
 
 
 CHILD = """
