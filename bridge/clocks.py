@@ -63,8 +63,8 @@ class _Clock:
         self.missed_ticks = 0
         """Whole ticks of the wall clock that went by without a state because of it."""
         self.wall_clock_stalls = 0
-        """States of lock-step that the edge runtime did not answer in wall time, or only with a
-        safe stop because of it: it was gone, or got no processor. Always 0 in real time."""
+        """States of lock-step that the edge runtime answered too late in wall time, not at all, or
+        with a stop for that: it was gone or starved. Always 0 in real time."""
         self.check = check
         self._publish = publish
         self._spec = spec

@@ -8,8 +8,8 @@ network repeats a drive of lock-step.
 
 A person forks a drive in the trainer: the bridge imports nothing of it, and runs its command.
 
-``bisect`` finds the policy of a training from which on a drive changes. Each that is tried drives
-on from the same place of the same drive: the scene and the network's luck are the same for all.
+``bisect`` finds the policy of a training from which on a drive changes. Each one tried drives on
+from the same place of the same drive, with the same scene and the same luck of the network.
 """
 
 from __future__ import annotations
@@ -402,7 +402,12 @@ def _run_fork(asked: Namespace) -> int:
     policy = None if asked.policy is None else load_policy(asked.policy, *trust)
     with ExitStack() as stack:
         environment = stack.enter_context(closing(drive.environment(asked.env)))
-        recorded = ForkedDrive(drive, environment, drive.steps).run() if drive.ended else None
+        again = ForkedDrive(drive, environment, drive.steps)
+        recorded = again.run() if drive.ended else None
+        if again.first_difference == drive.steps:
+            raise UserError(
+                f"{drive.path}: the drive cannot be rebuilt: its end is not as recorded"
+            )
         out, made = None, Path(stack.enter_context(tempfile.TemporaryDirectory()), "fork.mcap")
         if record:
             out = stack.enter_context(closing(RecordingWriter(made)))

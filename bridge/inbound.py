@@ -68,7 +68,7 @@ class CommandCheck:
     def read(self, payload: bytes, now_ns: int = 0) -> Command | None:
         """Return the command if it answers a state of this episode; None otherwise.
 
-        An answer that the end of its episode overtook is None, too, but is not counted. ``now_ns``
+        An answer that comes after its episode's end is None, too, but not counted. ``now_ns``
         is the wall clock.
         """
         command = decode_command(payload)
@@ -143,8 +143,8 @@ class FeedbackCheck:
     """Reads feedback for the session of ``commands`` and keeps the counts of the whole run.
 
     Another simulator's session is no fault before the vehicle has heard of this one, but is not
-    believed either. Its stamps say which feedback is the newest; after 2 T without any, order
-    begins anew: another board, with another clock, may have taken over.
+    believed either. Feedback is ordered by its stamps; after 2 T of silence any stamp is taken:
+    another board, with another clock, may be there.
     """
 
     def __init__(self, commands: CommandCheck, task: Task) -> None:

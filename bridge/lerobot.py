@@ -114,15 +114,18 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
 
 
 def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
-    """The states that can be read, each with the first answer that does not repeat a stop."""
-    layout = Layout(task)
+    """The states that can be read, each with the first answer that does not repeat a stop.
+
+    Of an answer with a plan, the action of now.
+    """
+    layout, size = Layout(task), len(task.action)
     answers = without_repetitions(exchange.answers for exchange in drive.exchanges.values())
     first = {key: each[0] for key, each in zip(drive.exchanges, answers, strict=True)}
     for state in drive.states():
         answer = None if state.final else first.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
-        if readable and answer is not None and len(answer.action) == len(task.action):
-            yield state, answer
+        if readable and answer and answer.action and len(answer.action) % size == 0:
+            yield state, answer._replace(action=answer.action[:size])
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:

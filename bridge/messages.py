@@ -175,7 +175,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 
 
 class Pace:
-    """Lets one message an interval through on average, and two at once at most; of 0 s, all."""
+    """Passes one message an interval on average, at most two at once; all where it is 0 s."""
 
     def __init__(self, interval_s: float) -> None:
         self._interval_s = interval_s

@@ -11,12 +11,11 @@ under way, held back or not, duplicated or not, and in order if order is kept.
 
 from __future__ import annotations
 
-import heapq
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -399,26 +398,3 @@ def make_link(spec: LatencySpec | Link, seed: int) -> Link:
         return spec
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Link(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
-
-
-Message = TypeVar("Message")
-
-
-class EventHeap(Generic[Message]):
-    """Messages under way, by arrival time; those with the same time keep their order."""
-
-    def __init__(self) -> None:
-        self._entries: list[tuple[float, int, Message]] = []
-        self._pushed = 0
-
-    def push(self, arrival_s: float, message: Message) -> None:
-        """Add a message that arrives at ``arrival_s``."""
-        heapq.heappush(self._entries, (arrival_s, self._pushed, message))
-        self._pushed += 1
-
-    def pop_due(self, now_s: float) -> tuple[float, Message] | None:
-        """Take the earliest message that has arrived by ``now_s``, with its time; None if none."""
-        if not self._entries or self._entries[0][0] > now_s:
-            return None
-        arrival_s, _, message = heapq.heappop(self._entries)
-        return arrival_s, message

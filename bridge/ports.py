@@ -39,6 +39,7 @@ from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
 RETRY_S = 0.2
+LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
 QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 EDGE_POLL_S = 0.1
@@ -49,16 +50,15 @@ _UNDRAWN: set[type[Exception]] = set()  # What was said already
 
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
     """The scene as it is sent, or else the environment's picture, where that can be drawn."""
-    scene = None
     try:
-        scene = scene_of(environment)
-        if scene is None:
-            stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
+        if (scene := scene_of(environment)) is not None:
+            return encode_scene(scene, stamps)
+        stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
     except Exception as error:  # Of any kind: it is somebody else's code, and the drive goes on.
         if type(error) not in _UNDRAWN:  # Not at every step, whose number may be in its text
             _UNDRAWN.add(type(error))
             print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
-    return encode_scene(scene or {}, stamps)
+    return encode_scene({}, stamps)
 
 
 class SimulatorPort:
@@ -193,7 +193,7 @@ class WireListener:
         return None
 
     def until_gone(
-        self, duration_s: float | None, linger_s: float = POLL_S
+        self, duration_s: float | None, linger_s: float = LINGER_S
     ) -> Iterator[Heard | None]:
         """Yield messages, and None where none comes, until the time is over, or no simulator has
         been there for ``linger_s`` and the queue is empty.
@@ -261,7 +261,7 @@ def open_listener(
         for topic in TOKEN_TOPICS:
             declare, watch = session.liveliness().declare_subscriber, listener.watch
             stack.enter_context(declare(f"{keys}/{topic}", watch, history=True))
-        # A listener to a vehicle that is not there would never see it go, nor end.
+        # Where the vehicle never was, nothing would tell the listener to end.
         if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
             if vehicle_id == ANY_VEHICLE:
                 which, hint = "", "start one: python -m bridge simulate"

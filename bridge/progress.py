@@ -47,7 +47,7 @@ class ProgressBar:
         self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def advance(self, figures: dict[str, str], count: int = 1, told: str = "") -> None:
-        """``count`` more are done; shown are the figures, or where no bar is, ``told`` instead."""
+        """Count ``count`` more as done and show the figures; without a bar, print ``told``."""
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         self._bar.update(self._task, completed=self.done, figures=text)

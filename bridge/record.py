@@ -39,6 +39,7 @@ from mcap.writer import CompressionType, Writer
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, images_of
 from bridge.ports import (
     ANY_VEHICLE,
+    LINGER_S,
     QUEUE_MESSAGES,
     WireListener,
     add_options,
@@ -80,7 +81,9 @@ def _add_record_arguments(parser: Any) -> None:
     help_text = "record this vehicle only (otherwise all)"
     add_options(parser, "--vehicle-id", default=None, help=help_text)
     linger = "how long to go on without any simulator: it may come back, in seconds"
-    parser.add_argument("--linger-s", metavar="SECONDS", type=seconds, default=2.0, help=linger)
+    parser.add_argument(
+        "--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger
+    )
 
 
 def _run_record(arguments: Any) -> int:

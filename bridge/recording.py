@@ -39,8 +39,9 @@ MAX_RECORD_BYTES = 64 << 20
 """A torn length must not ask for more memory than any record of ours needs."""
 MAX_CHUNK_BYTES = 8 << 20  # Unpacked; ours hold little more than 1 MiB
 MAX_WORK = 200
-"""Bytes read and unpacked for each byte of the file, above one chunk. The recording of a car that
-stands still for an hour comes to 100: every picture in it is the same."""
+"""Bytes read for each byte of the file, above one chunk."""
+UNPACKED_AS_READ = 64
+"""Bytes unpacked that count as one read: black pictures come to 10,000 a byte of the file."""
 RECORD_BYTES = 256
 """What a record counts besides its bytes: taking it apart costs as much, however empty it is."""
 TORN = (
@@ -267,7 +268,7 @@ class Recording(Condition):
         # -1: the data do not say. They are then unpacked up to what the chunk says.
         if size not in (-1, chunk.uncompressed_size) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-        self._spend(chunk.uncompressed_size, end)
+        self._spend(chunk.uncompressed_size // UNPACKED_AS_READ, end)
         parts = breakup_chunk(chunk, validate_crc=True)
         self._spend(RECORD_BYTES * len(parts), end)
         return parts

@@ -14,13 +14,15 @@ becomes a safe stop. It begins each episode in standby: episodes do not depend o
 
 from __future__ import annotations
 
+import heapq
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from bridge.network import EventHeap, LatencySpec, Link, make_link
+from bridge.network import LatencySpec, Link, make_link
 from edge_runtime.safety import (
     Mode,
     Safety,
@@ -181,7 +183,9 @@ class VirtualLink(Generic[Message]):
         self.hold = CommandHold(0.0, period_s)
         self._link = make_link(spec, seed)
         self._on_heard, self._on_stale, self._on_command = on_heard, on_stale, on_command
-        self._under_way: EventHeap[tuple[int, Message] | _Answer] = EventHeap()
+        self._under_way: list[tuple[float, int, Any]] = []
+        """A heap by arrival time; messages of the same time keep their order."""
+        self._numbers = itertools.count()
         self._newest_at_edge = -1
         self._safety = Safety(period_s)
         self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
@@ -196,15 +200,12 @@ class VirtualLink(Generic[Message]):
         tick_s = step * self._period_s
         self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
         for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
-            self._under_way.push(arrival_s, (step, message))
+            self._push(arrival_s, (step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
         """Let time run to the next state's arrival at the edge runtime; None: the window ends."""
-        while True:
-            due = self._under_way.pop_due(self._window_end_s + ROUNDING_S)
-            if due is None:
-                return None
-            now_s, message = due
+        while self._under_way and self._under_way[0][0] <= self._window_end_s + ROUNDING_S:
+            now_s, _, message = heapq.heappop(self._under_way)
             if isinstance(message, _Answer):
                 self._arrive_at_vehicle(message, now_s)
                 continue
@@ -214,6 +215,10 @@ class VirtualLink(Generic[Message]):
                 self._newest_at_edge = step
                 self._note_fresh(now_s)
             return Arrival(step, now_s, content, overtaken)
+        return None
+
+    def _push(self, arrival_s: float, message: tuple[int, Message] | _Answer) -> None:
+        heapq.heappush(self._under_way, (arrival_s, next(self._numbers), message))
 
     def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
         """Send the answer to the newest state back; ``computing_s`` is reported only."""
@@ -224,7 +229,7 @@ class VirtualLink(Generic[Message]):
             self._safety = self._safety._replace(ride_s=ride_s)
         answer = _Answer(command, arrival.step * self._period_s, computing_s)
         for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
-            self._under_way.push(arrival_s, answer)
+            self._push(arrival_s, answer)
 
     def decide(self, edge_silence_s: float | None = None) -> Decision:
         """What the vehicle does in this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""

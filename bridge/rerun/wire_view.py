@@ -239,7 +239,9 @@ class WireLog:
         self._layout: Layout | None = None
         self._session = ""  # Of the newest state
         self._told, self._reason = "", ""
-        self._heard_command_ns: int | None = None
+        self._episode: tuple[str, int] | None = None  # The newest one seen
+        self._heard_command_ns = 0
+        self._camera = ""  # The first array of pictures
         self._plan_periods = 0
         self._sent_ns: dict[Place, int] = {}
         self._answered_ns: dict[Place, int] = {}
@@ -282,9 +284,9 @@ class WireLog:
             self._event(f"episode {state.episode} begins")
         if state.final:
             self._event(f"episode {state.episode} ends at step {state.step}")
-        if self._heard_command_ns is None:
-            # A viewer that comes late has not yet had the time to hear one.
-            self._heard_command_ns = arrived_ns
+        if self._episode != place[:2]:
+            # For a viewer that comes late, or in a new episode, no command was due before.
+            self._episode, self._heard_command_ns = place[:2], arrived_ns
         periods = SILENCE_PERIODS + self._plan_periods
         silent = arrived_ns - self._heard_command_ns > periods * self._timeline.period_s * 1e9
         # Between two episodes no command is due.
@@ -363,12 +365,16 @@ class WireLog:
         for name, array in self._layout.arrays(state.observation).items():
             images = images_of(array)
             if images is not None:
+                # The layout has views for the first camera; a person may add those of others.
+                root = "frames" if (self._camera or name) == name else f"frames/{name}"
+                self._camera = self._camera or name
                 for place, image in zip(("now", "before"), images[::-1], strict=False):
                     model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
-                    self._recording.log(f"frames/{place}", rr.Image(image, color_model=model))
+                    self._recording.log(f"{root}/{place}", rr.Image(image, color_model=model))
             else:
                 few = array.size <= MOST_LINES
-                numbers = rr.Scalars(array.ravel()) if few else rr.Tensor(array)
+                # As numbers: rerun has no tensor of truth values.
+                numbers = rr.Scalars(array.ravel()) if few else rr.Tensor(array * 1)
                 self._recording.log(f"observation/{name}", numbers)
 
     def _stand_at(self, place: Place) -> None:

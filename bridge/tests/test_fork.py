@@ -10,6 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -177,8 +178,8 @@ def a_pixel(topic, message):
     return message
 
 
-def a_car(topic, message):
-    if topic == "scene" and (message["episode"], message["step"]) == (1, 31):
+def a_car(topic, message, step=31):
+    if topic == "scene" and (message["episode"], message["step"]) == (1, step):
         message["vehicles"][1]["x"] = np.nextafter(message["vehicles"][1]["x"], 1e9).item()
     return message
 
@@ -224,9 +225,9 @@ def test_a_recording_that_cannot_be_rebuilt_gets_one_line(tmp_path, refusal, cha
 
 def test_a_change_behind_the_fork_is_found_as_well(tmp_path, refusal):
     """What the recorded drive came to is found by driving it to its end."""
-    path = rewritten(LEFT_TURN, tmp_path / "changed.mcap", a_car)
-    said = refusal("fork", path, "--episode", 1, "--at", "3")
-    assert "at step 31" in said
+    for step, says in ((31, "at step 31"), (63, "its end is not as recorded")):
+        path = rewritten(LEFT_TURN, tmp_path / f"{step}.mcap", partial(a_car, step=step))
+        assert says in refusal("fork", path, "--episode", 1, "--at", "3")
 
 
 def test_other_places_and_damage(tmp_path, refusal):

@@ -136,13 +136,6 @@ def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
     assert hold.decide(0.4).brake_reason == "no_fresh_state"
 
 
-def test_lock_step_brakes_at_once_when_the_edge_is_silent():
-    hold = CommandHold(0.0, T)
-    hold.admit(make_command(0), now_s=0.0, sent_s=0.0)
-    decision = hold.decide(0.025, edge_silence_s=0.21)
-    assert (decision.brake_reason, decision.undriven_s) == (NO_COMMAND, 0.21)
-
-
 def decisions(*reasons):
     """Decisions of a hold that is silent in the ticks with a reason."""
     hold = CommandHold(0.0, T)

@@ -12,7 +12,6 @@ from bridge.network import (
     SETTINGS,
     TAILS,
     DirectionSpec,
-    EventHeap,
     LatencyModel,
     LatencySpec,
     Outage,
@@ -284,15 +283,3 @@ def test_a_feature_does_not_change_the_luck_of_the_others():
     assert all(b in (a, ()) for a, b in zip(clean, plain, strict=True))
     more = run(one_way("50ms+-10ms,loss=10%,duplicate=20%,reorder=20%"), 300)
     assert [bool(times) for times in plain] == [bool(times) for times in more]
-
-
-times = st.lists(st.floats(0, 100, allow_nan=False), max_size=30)
-
-
-@given(times, st.floats(0, 100, allow_nan=False))
-def test_what_is_due_comes_out_in_order_of_time_then_of_arrival(arrivals, now_s):
-    heap: EventHeap[int] = EventHeap()
-    for number, arrival_s in enumerate(arrivals):
-        heap.push(arrival_s, number)
-    expected = sorted((arrival_s, n) for n, arrival_s in enumerate(arrivals) if arrival_s <= now_s)
-    assert list(iter(lambda: heap.pop_due(now_s), None)) == expected

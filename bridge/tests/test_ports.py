@@ -55,7 +55,8 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     assert port.edge_counts.newest is None
 
 
-def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeypatch):
+@pytest.mark.parametrize("scene", [None, [], {"vehicles": [object()]}])
+def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeypatch, scene):
     """Only while somebody looks is anything drawn; what is wrong is said once, not at each step."""
     monkeypatch.setattr(ports, "_UNDRAWN", set())
     _, router, client = sessions
@@ -66,6 +67,8 @@ def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeyp
         raise OSError(f"no picture of step {next(steps)}")
 
     see_through.render = render
+    if scene is not None:
+        see_through.unwrapped.scene = lambda: scene
     heard: list[bytes] = []
     key = "phil/v1/scene"
     viewer = client.declare_subscriber(key, lambda one: heard.append(bytes(one.payload)))
@@ -78,7 +81,8 @@ def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeyp
     seen = [decode_scene(payload) for payload in heard]
     assert [(scene.step, scene.picture) for scene in seen if scene] == [(0, b""), (1, b"")]
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("the environment cannot be shown: OSError")
+    assert line.startswith("the environment cannot be shown: ")
+    assert scene is not None or "OSError('no picture of step 0')" in line
 
 
 @pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])

@@ -178,9 +178,7 @@ def verify(recording):
     return harness.rerun("rrd", "stats", str(recording))
 
 
-@pytest.mark.parametrize(
-    "told", ["the drive ends", "the view is interrupted", "the simulator is killed"]
-)
+@pytest.mark.parametrize("told", ["the drive ends", "the view is interrupted"])
 def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_path):
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
     words = ("view", "--save", str(recording), "--connect", endpoint)
@@ -195,10 +193,7 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
         else:
             time.sleep(0.3)
             assert not recording.exists()
-            if told == "the view is interrupted":
-                view.process.send_signal(signal.SIGTERM)
-            else:
-                run.process.kill()
+            view.process.send_signal(signal.SIGTERM)
         assert view.wait(20) == 0, view.errors
     found = verify(recording)
     entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
@@ -223,6 +218,12 @@ def test_a_late_viewer_does_not_call_it_silence(log, events):
     assert events == []
     log.write_state(make_state(53), 10**18 + 3 * 10**8)
     assert events == ["no command: the simulator brakes by itself"]
+
+
+def test_the_time_between_two_episodes_is_no_silence(log, events):
+    log.write_command(harness.make_command(50), 10**18)
+    log.write_state(make_state(1, episode=1), 10**18 + 10**9)
+    assert events == ["drive"]
 
 
 def test_a_ride_is_shown_and_no_silence(log, events):

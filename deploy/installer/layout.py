@@ -302,9 +302,10 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
 
 def let_read_key(folder: Path, group: int | None) -> None:
     """Let a group, if there is one, read the TLS key of a release."""
-    for path in (folder / TLS).glob("*") if group is not None else ():
-        os.chown(str(path), -1, group)
-        os.chmod(str(path), 0o640)
+    if group is not None:
+        for path in (folder / TLS).glob("*"):
+            os.chown(str(path), -1, group)
+            os.chmod(str(path), 0o640)
 
 
 def _write(path: Path, data: bytes, mode: int = 0o644) -> None:
