@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import signal
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
 from edge_runtime.cli import Command, examples
@@ -38,7 +40,7 @@ from trainer.environments import make_environment
 from trainer.pictures import write_figure
 from trainer.training.metrics import read_metrics
 
-MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}  # Scenario -> seed and time, s
+MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s
 SHIPPED = Path("results/latency/left_turn/shipped.json")
 WINDOW = "1400x900"
 LOADED_S, DRAWN_S = 20.0, 5.0
@@ -89,22 +91,32 @@ def _run_pictures(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _from_above(scenario: str) -> Make:
+def _moment(scenario: str) -> tuple[Any, Any]:
+    """The environment there, the expert driving, and what is observed."""
     seed, time_s = MOMENTS[scenario]
-    words = ("trainer", "picture", "expert", "--scenario", scenario, "--seed", seed)
-    return lambda out, _work: run_command(*words, "--time", time_s, "--out", str(out))
+    env = make_environment(scenario)
+    driver, _ = load_driver("expert", env)
+    frames, _ = env.reset(seed=seed)
+    driver.reset()
+    for _ in range(round(time_s / env.control_period_s)):
+        frames, *_ = env.step(driver.act(frames))
+    return env, frames
+
+
+def _from_above(scenario: str) -> Make:
+    def make(out: Path, _work: Path) -> None:
+        buffer = io.BytesIO()
+        Image.fromarray(_moment(scenario)[0].render()).save(buffer, format="png")
+        write_atomic(out, buffer.getvalue())
+
+    return make
 
 
 def policy_sees(out: Path, _work: Path) -> None:
     """Both frames of both scenarios, enlarged pixel by pixel."""
     figure = Figure(figsize=(8.6, 5.6), layout="constrained")
-    for row, (scenario, (seed, time_s)) in enumerate(MOMENTS.items()):
-        env = make_environment(scenario)
-        driver, _ = load_driver("expert", env)
-        frames, _ = env.reset(seed=int(seed))
-        driver.reset()
-        for _ in range(round(float(time_s) / env.config.control_period_s)):
-            frames, *_ = env.step(driver.act(frames))
+    for row, scenario in enumerate(MOMENTS):
+        _, frames = _moment(scenario)
         for column, (frame, when) in enumerate(zip(frames, ("0.1 s ago", "now"), strict=True)):
             panel = figure.add_subplot(len(MOMENTS), 2, 2 * row + column + 1)
             panel.imshow(np.asarray(frame), cmap="gray", vmin=0, vmax=255, interpolation="nearest")

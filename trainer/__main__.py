@@ -11,7 +11,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("trainer.evaluation", "drive test episodes and report how well it does"),
     "export": ("trainer.policy_file", "write a run's actor as the file that a board drives"),
     "plot": ("trainer.pictures:PLOT", "draw the learning curve of a run"),
-    "picture": ("trainer.pictures:PICTURE", "draw a moment of an episode from above"),
     "view": ("trainer.view", "show recorded sittings in rerun"),
     "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
     "experiment": ("trainer.experiments.command", "run the paper's experiments, judge its claims"),

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from bridge.episode import finite
 from bridge.network import LatencySpec, Link, parse_spec
@@ -23,8 +22,7 @@ from edge_runtime.util import UserError, counted, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
-from trainer.options import add_latency, add_scenario, add_seed, set_threads
-from trainer.scenarios import SCENARIOS
+from trainer.options import add_latency, add_scenario, add_seed, limited_threads
 from trainer.training.delayed import VehicleEnd
 
 EXAMPLE = examples(
@@ -136,20 +134,17 @@ def evaluate(
     scenario = scenario_of(scenario or _trained_in(policy, public_key))
     env = make_environment(scenario, condition)
     driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
-    threads, goals = torch.get_num_threads(), 0
-    set_threads(1)  # The last bits must not depend on the machine's cores.
-    try:
-        with ProgressBar("evaluating", runs) as bar:
+    goals = 0
+    # The last bits must not depend on the machine's cores.
+    with limited_threads(1), ProgressBar("evaluating", runs) as bar:
 
-            def on_episode(result: EpisodeResult) -> None:
-                nonlocal goals
-                goals += result.outcome == GOAL
-                bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
+        def on_episode(result: EpisodeResult) -> None:
+            nonlocal goals
+            goals += result.outcome == GOAL
+            bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
-            seeds = range(seed, seed + runs)
-            results = drive_episodes(env, driver, seeds, condition, on_episode, spec)
-    finally:
-        set_threads(threads)
+        seeds = range(seed, seed + runs)
+        results = drive_episodes(env, driver, seeds, condition, on_episode, spec)
     report = summarise(results, scenario, condition, policy_id, seed)
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
@@ -160,9 +155,14 @@ def _trained_in(policy: str, public_key: str | None) -> str:
         if (Path(policy) / name).is_file():
             return str(read_json(Path(policy) / name, "config").get("scenario"))
     if policy.endswith(".onnx"):
-        task = load_policy(policy, public_key, allow_unsigned=True).manifest.task
-        if task in SCENARIOS:
-            return task
+        manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
+        config = manifest.training.get("config")
+        named = config.get("scenario") if isinstance(config, dict) else None
+        # One of `deploy policy` names its environment itself.
+        name = str(named or manifest.training.get("environment") or manifest.task)
+        if ":" in name:  # A module is imported where a person names it, not because a file does.
+            raise UserError(f"{policy} was trained in {name}, a module's: name it with --scenario")
+        return name
     return "left_turn"
 
 

@@ -7,7 +7,8 @@ import math
 import re
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -124,3 +125,16 @@ def set_threads(count: int) -> None:
         import torch  # takes two seconds, which --help need not wait
 
         torch.set_num_threads(count)
+
+
+@contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """``set_threads`` for the block."""
+    import torch  # see set_threads
+
+    before = torch.get_num_threads()
+    set_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

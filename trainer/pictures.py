@@ -1,4 +1,4 @@
-"""Pictures as files: learning curves (``plot``), and a moment of a drive (``picture``)."""
+"""``python -m trainer plot``: learning curves as pictures."""
 
 import argparse
 import io
@@ -7,15 +7,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
 
 from bridge.report import GOAL
-from edge_runtime.cli import Command, add_public_key, examples, positive_number
+from edge_runtime.cli import Command, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
-from trainer.drivers import load_driver
-from trainer.environments import make_environment
-from trainer.options import add_scenario, add_seed
 from trainer.training.metrics import read_metrics
 
 CURVE_FILE = "learning_curve.png"
@@ -131,37 +127,3 @@ def _columns(run_dir: Path) -> dict[str, Values]:
         "human_share": column("human_steps") / column("steps"),
         "validation": column("validation_success"),
     }
-
-
-def _add_picture_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("policy", metavar="POLICY", help="what drives: see `trainer evaluate`")
-    add_public_key(parser)
-    add_scenario(parser)
-    add_seed(parser, "the episode")
-    when = "the moment, in simulated seconds from the start"
-    parser.add_argument("--time", type=positive_number, default=3.0, metavar="S", help=when)
-    parser.add_argument("--out", type=_png, required=True, metavar="F.png", help="the picture")
-
-
-def _picture(arguments: argparse.Namespace) -> int:
-    check_writable(arguments.out)
-    env = make_environment(arguments.scenario)
-    driver, _ = load_driver(arguments.policy, env, arguments.public_key)
-    observation, _ = env.reset(seed=arguments.seed)
-    driver.reset()
-    for _ in range(round(arguments.time / env.control_period_s)):
-        observation, _, terminated, truncated, _ = env.step(driver.act(observation))
-        if terminated or truncated:
-            break
-    buffer = io.BytesIO()
-    Image.fromarray(env.render()).save(buffer, format="png")
-    write_atomic(arguments.out, buffer.getvalue())
-    print(arguments.out)
-    return 0
-
-
-PICTURE = Command(
-    examples("python -m trainer picture expert --seed 8 --time 3.4 --out scene.png"),
-    _add_picture_arguments,
-    _picture,
-)

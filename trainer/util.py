@@ -122,7 +122,7 @@ def load_torch(path: Path) -> dict[str, Any]:
 def claimed(directory: Path) -> Iterator[None]:
     """Be the only process that trains in a directory.
 
-    It is made where it is not there, and goes again if nothing has come into it.
+    It is made if it is missing, and removed again if it stays empty.
 
     Raises UserError: another process trains there, or the directory cannot be made or written.
     """

@@ -35,8 +35,8 @@ class Algorithm:
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
     q_term: bool = True  # The actor climbs the critic (eq. 23, first term)
     rewarded: bool = True
-    """The environment's reward counts. Without it only take-overs do, and so each of them: one
-    from a car that waits too long, too."""
+    """The environment's reward counts. Without it only take-overs count, and all do, even from a
+    car that waits too long."""
     proxy_values: bool = False
     """The critics are told what the human's action and the overruled one are worth: 1 and -1."""
     human_share: float = 0.0  # Of each minibatch; 0: what the priorities make of it
@@ -45,8 +45,8 @@ class Algorithm:
     """Share of the control periods in which the robot asks for help, since its critics disagree
     most; 0: the human watches, and takes over by itself."""
     foresight: int = 0
-    """Control periods for which a preference holds in what the overruled action would have led to;
-    0: there is none. A loss of the actor, beside its other terms."""
+    """Control periods ahead in which the actor learns to prefer the human's action to the overruled
+    one, by a further loss; 0: none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters that this row starts from instead of the common ones: its paper's, where
     ours do not fit what it learns from."""
@@ -99,9 +99,9 @@ ALGORITHMS: dict[str, Algorithm] = {
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
-    # Layer normalisation in the critics all rows have. Two critics, not ten. Beside a human who
-    # lets nothing fail the critics see no failure, and find every action good. One update of the
-    # actor a step.
+    # Layer normalisation in the critics all rows have. Two critics, not ten. If the human prevents
+    # every failure, the critics see none, and rate every action good. One update of the actor a
+    # step.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
         updates_per_step=2,

@@ -335,7 +335,7 @@ class ReplayBuffer:
         return self._frame_ids[slots, -1] == self._frame_ids[following, -2]
 
     def _add_picture(self, picture: NDArray[Any]) -> int:
-        """Store a picture; its running number. Forget the transitions that lose theirs by it."""
+        """Store a picture; returns its number. Forgets transitions whose picture it replaces."""
         number = self._frames_added
         self._frames_added += 1
         self._pictures[number % self._frame_slots] = picture

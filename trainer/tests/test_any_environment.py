@@ -247,15 +247,19 @@ def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space)
 
 
 def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_path):
-    settings = {"batch_size": 8, "warmup_steps": 20, "evaluation_runs": 1}
-    row = f"{__name__}:PHIL"
+    settings: dict[str, float] = {"batch_size": 8, "warmup_steps": 20, "evaluation_runs": 1}
+    settings |= {"late_from_s": 0.05, "late_to_s": 0.1}  # Only together do they hold.
+    row, threads = f"{__name__}:PHIL", torch.get_num_threads()
     run = train(ROVER, algorithm=row, episodes=4, settings=settings, out=tmp_path / "run")
     assert sum(int(each["human_steps"]) for each in run.metrics) > 0
+    assert torch.get_num_threads() == threads
     alone = evaluate(run, runs=2)
     made = export(run, tmp_path / "p.onnx")
     assert made.max_difference < 1e-5
     policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
     assert list(policy.manifest.observation) == ["camera", "far", "wheels"]
+    with pytest.raises(UserError, match="a module's: name it with --scenario"):
+        evaluate(tmp_path / "p.onnx")
     filed = evaluate(tmp_path / "p.onnx", ROVER, runs=2)
     assert filed.mean_return == pytest.approx(alone.mean_return, abs=1e-3)
     env = make_environment(ROVER)
@@ -277,10 +281,17 @@ MISSPELT = replace(PHIL, settings={"bach_size": 4})
 
 def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
     """In Python, too, where no option's choices stand before it."""
-    (tmp_path / "config.toml").write_text("learner = 3\n")
     words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
-    with pytest.raises(UserError, match="learner"):
-        main(["train", *words])
+    for text, given, says in (
+        ("learner = 3", "", "learner"),
+        ("tau = 0.1", "--preset printed", "sets tau, and so does --preset"),
+        ("algorithm = 'phil_td3'\nalpha = 0.5", "--algorithm rlpd_td3", "sets alpha, and so does"),
+        ("human = 'person'", "", "a person guides that run: name --human keyboard"),
+        ("late_to_s = 0.1\nlate_from_s = 0.3", "", "late_to_s 0.1 is below late_from_s 0.3"),
+    ):
+        (tmp_path / "config.toml").write_text(f"{text}\n")
+        with pytest.raises(UserError, match=says):
+            main(["train", *words, *given.split()])
     for wrong in ({"device": "gpu"}, {"threads": -1}, {"seed": -1}, {"preset": "mine"}):
         with pytest.raises(UserError, match=f"{next(iter(wrong))} (must be one of|= -1 is out of)"):
             train(ROVER, out=tmp_path / "run", **wrong)

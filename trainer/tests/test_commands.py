@@ -54,12 +54,9 @@ WRONG = [
     *(f"export {{tmp}} --out {{tmp}}/{words}" for words in (
         "p.onnx", "p.onnx --key {tmp}/no.key", "p.txt",
     )),
-    *(f"picture expert --out {words}" for words in (
-        "{tmp}/p.png --time -1", "/dev/null/p.png",
-    )),
     "train --out {tmp}/file/x", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
     "plot {tmp} --out {tmp}/c.pdf", "plot {tmp} --out {tmp}/c.txt", "view {tmp} --save ''",
-    "picture {tmp}/nobody --out {tmp}/p.png", "human --out {tmp}/file", "bench --threads -1",
+    "plot {tmp} --out /dev/null/p.png", "human --out {tmp}/file", "bench --threads -1",
     "bench --out /dev/null/b.json", "experiment status --results ''",
 ]  # fmt: skip
 
@@ -73,8 +70,8 @@ TOLD = [
     ("train --out x --set gamma=", "expected a number, got ''"),
     ("train --out x --set bach_size=4", "did you mean batch_size?"),
     ("trian", "did you mean train?"),
-    ("picture expert --out a.jpg", "a picture is a .png"),
-    ("picture none --out a.png", "none is no policy"),
+    ("plot x --out a.jpg", "a picture is a .png"),
+    ("evaluate none", "none is no policy"),
     ("plot one two --out c.png", "one holds no metrics"),
     ("plot one two", "several runs go into one picture"),
     ("experiment fig99", "invalid choice"),
@@ -121,9 +118,8 @@ def test_a_shipped_policy_is_verified_with_the_key_beside_it(capsys, tmp_path, m
     monkeypatch.chdir(tmp_path)
     Path("keys").mkdir()
     Path("keys/policy.pub").write_bytes(public_pem(Ed25519PrivateKey.generate()))
-    for command in (["evaluate", POLICY, "--runs", "1"], ["picture", POLICY, "--out", "a.png"]):
-        status, _, err = call(capsys, *command)
-        assert status == 0, err
+    status, _, err = call(capsys, "evaluate", POLICY, "--runs", "1")
+    assert status == 0, err
     drive = ["drive", "--human", "keyboard", "--policy", POLICY, "--public-key", "none.pub"]
     assert "public key none.pub does not exist" in refusal(capsys, *drive)
     for end in ("", ".sig"):
@@ -147,7 +143,6 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
         human, f"{train} 2 {small}", f"{train} 3 {small} --resume", "export run --out policy.onnx",
         "evaluate policy.onnx --runs 1", f"evaluate {CONGESTION} --runs 1",
         "evaluate run --runs 1", "evaluate human --runs 1", "plot run",
-        "picture policy.onnx --time 1 --out scene.png",
     ):  # fmt: skip
         status, _, err = call(capsys, *words.split())
         assert status == 0, err

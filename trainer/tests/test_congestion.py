@@ -10,7 +10,7 @@ from trainer.human.congestion import CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
 from trainer.scenarios.traffic import CAR, footprint
-from trainer.tests.humans import drive, episode
+from trainer.tests.humans import drive
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(
@@ -128,16 +128,6 @@ def test_the_brake_stops_the_car_and_no_one_behind_runs_into_it():
             speeds_mps.append(info["speed_mps"])
         assert speeds_mps[34] == 0.0
         assert speeds_mps[54] > 2.0
-
-
-@pytest.mark.parametrize("condition", ["nominal", "variant"])
-def test_nobody_behind_a_car_that_stays_standing_drives_backwards(condition):
-    env = make_environment("congestion", condition)
-    for seed in range(4):
-        env.reset(seed=seed)
-        env.press_brake(True)
-        for _ in zip(range(120), episode(env, lambda _: env.brake_action), strict=False):
-            assert min(car.speed for car in env.traffic) > -1e-9
 
 
 def test_the_picture_moves_along_the_road_but_neither_aside_nor_round():

@@ -97,11 +97,6 @@ def test_an_envelope_goes_into_the_export_of_the_network_that_it_was_measured_wi
     }  # fmt: skip
     write_policy(export_policy(make_actor(), LABEL, {}, envelope).model, path, None)
     assert LinkQuality(load_policy(path, allow_unsigned=True).manifest).limits == limits
-    changed = make_actor()
-    with torch.no_grad():
-        changed.head.output.bias.add_(0.01)
-    with pytest.raises(UserError, match="measured with another network"):
-        export_policy(changed, LABEL, {}, envelope)
 
 
 def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
@@ -110,11 +105,3 @@ def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
     policy, frames = load_policy(path, allow_unsigned=True), real_observations("left_turn", 30)[-1]
     past = np.stack([np.zeros_like(frames[0]), frames[1]])
     assert policy.act({"frames": frames}) == policy.act({"frames": past})
-
-
-def test_a_wrong_key_leaves_no_file(exported, tmp_path):
-    key = tmp_path / "wrong.key"
-    key.write_text("not a key")
-    with pytest.raises(UserError, match="not a private key"):
-        write_policy(exported.model, tmp_path / "policy.onnx", key)
-    assert not (tmp_path / "policy.onnx").exists()

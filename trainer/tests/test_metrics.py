@@ -8,7 +8,6 @@ from PIL import Image
 
 from edge_runtime.util import UserError
 from trainer.__main__ import main
-from trainer.environments import make_environment
 from trainer.pictures import moving_average
 from trainer.tests.test_commands import call, refusal
 from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics, totals
@@ -125,14 +124,3 @@ def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):
 
 def test_moving_average_by_hand():
     np.testing.assert_allclose(moving_average(np.array([1.0, 3.0, 5.0, 7.0]), 2), [1, 2, 4, 6])
-
-
-def test_a_picture_is_of_the_moment_after_so_many_seconds(tmp_path):
-    out = tmp_path / "scene.png"
-    assert main(["picture", "constant:0", "--seed", "6", "--time", "0.3", "--out", str(out)]) == 0
-    env = make_environment("left_turn")
-    env.reset(seed=6)
-    for _ in range(3):
-        env.step(np.zeros(1, np.float32))
-    with Image.open(out) as picture:
-        assert np.array_equal(np.asarray(picture), env.render())

@@ -218,17 +218,6 @@ def test_cars_move_to_the_bit_as_highway_envs_idm_vehicles(scenario, condition):
             env.step(np.zeros(1, np.float32))
 
 
-def test_types_accelerate_as_they_are():
-    env = make_environment("congestion", "variant")
-    for seed in range(10):
-        env.reset(seed=seed)
-        for car in env.traffic:
-            (kind,) = (kind for kind, _ in MIXED if kind.length_m == car.LENGTH)
-            car.speed, car.target_speed, car.leader = 0.0, 6.0, None
-            car.act()
-            assert car.action["acceleration"] == pytest.approx(kind.acceleration_mps2)
-
-
 def test_shares_of_the_mix_and_no_draw_for_one_type():
     random = np.random.default_rng(0)
     before = random.bit_generator.state

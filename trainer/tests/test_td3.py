@@ -95,26 +95,6 @@ def test_an_update_sees_shifted_pictures():
     assert plain.policy_loss != shifted.policy_loss
 
 
-def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is_not():
-    batch = replace(
-        make_batch(size=8, humans=8),
-        rewards=np.full(8, 1.0, np.float32),
-        terminals=np.ones(8, np.float32),
-        actions=np.full((8, 1), -0.5, np.float32),
-        overruled=np.full((8, 1), 0.5, np.float32),
-        penalised=np.ones(8, np.bool_),
-    )
-    config = replace(SMALL, critic_learning_rate=2e-3, intervention_penalty=-2.0)
-    learner = TD3Learner(config, PHIL, seed=0)
-    for _ in range(60):
-        learner.update(batch)
-    frames, critic = torch.from_numpy(batch.frames.copy()), learner.critics.first
-    for action, worth in ((-0.5, 1.0), (0.5, -2.0)):
-        with torch.no_grad():
-            value = critic.value(critic.picture(frames), torch.full((8, 1), action))
-        torch.testing.assert_close(value, torch.full((8,), worth), atol=0.3, rtol=0)
-
-
 @pytest.fixture
 def processor(monkeypatch):
     """Pretend to have a processor of these flags."""

@@ -33,10 +33,10 @@ from trainer.tests.test_td3 import same_weights
 from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory
-from trainer.training.config import RunConfig
+from trainer.training.config import CONFIG_FILE, RunConfig
 from trainer.training.metrics import NAMES, Trials, read_metrics
 from trainer.training.run import TrainingRun
-from trainer.util import Purpose, episode_seed, load_torch
+from trainer.util import Purpose, episode_seed, load_torch, source_revision
 
 # Learning, the slowest part, begins late, and still before what a test looks at.
 SMALL = LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=170, exploration_initial=1.0)
@@ -254,11 +254,18 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
     train(TINY, whole)
     parts.mkdir()
     for part, kept in enumerate((1, 2, 3, 2)):
-        TrainingRun(TINY, parts, resume=part > 0).train(deadline_s=time.monotonic() - 1)
+        run = TrainingRun(TINY, parts, resume=part > 0)
+        # The one after the first episode was not due.
+        assert (parts / BEST_FILE).exists() == (part > 1)
+        run.train(deadline_s=time.monotonic() - 1)
         assert load_torch(parts / BEST_FILE)["episode"] == kept
     ends = [load_torch(directory / BEST_FILE) for directory in (whole, parts)]
     assert ends[0]["episode"] == ends[1]["episode"]
     assert same_actors(*(end["actor"] for end in ends))
+    about = (whole / CONFIG_FILE).read_text().replace(source_revision(), "another revision")
+    (whole / CONFIG_FILE).write_text(about)
+    TrainingRun(TINY, whole, resume=True).train()
+    assert (whole / CONFIG_FILE).read_text() == about  # It has not trained it.
 
 
 def test_validation_has_seeds_of_its_own_and_the_network_of_the_run():

@@ -171,6 +171,8 @@ def train(
     taken.
     """
     options.check_device(device)
+    if human == PERSON:  # as a run's own --config says
+        raise UserError(f"a person guides that run: name --human {', '.join(HUMANS)}")
     if not is_expert(human) and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
         words = f"none of {known}, no module:Class and no human model's directory"
@@ -195,17 +197,17 @@ def train(
         threads=threads,
         learner=learner,
     )
-    options.set_threads(threads)
     if isinstance(settings, Mapping):
         settings = [f"{name}={value}" for name, value in settings.items()]
-    for assignment in settings:
-        config = with_setting(config, assignment)
+    changed = dict(map(parse_setting, settings))  # All at once: some hold only together.
+    ours = {name: changed.pop(name) for name in tuple(changed) if not hasattr(learner, name)}
+    config = replace(config, **ours, learner=replace(learner, **changed))
     run_dir = _new_directory(config) if out is None else Path(out)
     person = argparse.Namespace(
         human=human, scenario=config.scenario, profile=profile, host=host,
         port=port, speed=speed,
     )  # fmt: skip
-    with claimed(run_dir):
+    with claimed(run_dir), options.limited_threads(threads):
         person.resume = check_directory(run_dir, config, resume)
         return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
 
@@ -295,17 +297,30 @@ def _summary(run_dir: Path, period_s: float) -> str:
 
 def _take_config(arguments: argparse.Namespace) -> list[str]:
     """Take what ``--config`` says and no option does; the settings in it, as ``--set`` has them."""
-    path = Path(arguments.config)
+    path, given = Path(arguments.config), getattr(arguments, "given", ())
     values = _flat(read_toml(path, "config"))
+    both = {"preset": _preset_names(arguments.preset)} if "preset" in given else {}
+    rows = {arguments.algorithm, values.get("algorithm", arguments.algorithm)}
+    if len(rows) == 2 and "algorithm" in given:
+        both["algorithm"] = set().union(*(find_algorithm(str(row)).settings for row in rows))
+    for option, names in both.items():
+        if clash := [name for name in values if name in names]:
+            raise UserError(f"config {path} sets {clash[0]}, and so does --{option}: leave one out")
     assignments = []
     for name, value in values.items():
         if name not in (*OPTIONS, *EXTENT, "preset"):
             assignments.append(f"{name}={value}")
         elif type(value) is not type(getattr(DEFAULTS, name, "")):
             raise UserError(f"config {path}: {name} cannot be {value!r}")
-        elif name not in getattr(arguments, "given", ()):
+        elif name not in given:
             setattr(arguments, name, value)
     return assignments
+
+
+def _preset_names(preset: str) -> set[str]:
+    """The settings that it changes."""
+    changed = _flat(asdict(PRESETS[preset]))
+    return {name for name, default in SETTINGS.items() if changed[name] != default}
 
 
 class _Noted(argparse._StoreAction):
@@ -340,8 +355,8 @@ def setting_lines() -> Iterator[str]:
         yield textwrap.fill(said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent)
 
 
-def with_setting(config: RunConfig, assignment: str) -> RunConfig:
-    """The config with one NAME=VALUE.
+def parse_setting(assignment: str) -> tuple[str, Any]:
+    """The name and the value of one NAME=VALUE.
 
     Raises UserError: no such setting, or no such value of it.
     """
@@ -357,9 +372,7 @@ def with_setting(config: RunConfig, assignment: str) -> RunConfig:
         value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
     except (ValueError, KeyError):
         raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
-    if hasattr(config.learner, name):
-        return replace(config, learner=replace(config.learner, **{name: value}))
-    return replace(config, **{name: value})
+    return name, value
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:

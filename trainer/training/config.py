@@ -122,7 +122,7 @@ class RunConfig:
         return "target_actor" if self.averaged_actor else "actor"
 
     def label(self, episode: int) -> dict[str, Any]:
-        """What a file of the run says of whose it is, and of when."""
+        """What a file of the run says of its run and episode."""
         known = {"known_latency": self.latency} if self.delay_known else {}
         return {
             "scenario": self.scenario,

@@ -190,7 +190,7 @@ class DelayedPolicy:
     ) -> None:
         """Keep the tick that led to ``observation``; arguments as ``ReplayBuffer.add``.
 
-        The first d of an episode answer to nothing that the policy could know.
+        An episode's first d are not kept: the policy had seen nothing.
         """
         if ahead := guidance.get("foreseen"):
             guidance["foreseen"] = self._foreseen(ahead, guidance["overruled"])

@@ -301,3 +301,5 @@ class Validation(Trials):
         self._best_actor = state["best_actor"]
         if self._best_actor is not None:
             save_torch(self.run_dir / BEST_FILE, self._best_actor)
+        else:  # What is there was validated before it was due.
+            (self.run_dir / BEST_FILE).unlink(missing_ok=True)

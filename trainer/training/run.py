@@ -122,12 +122,13 @@ class TrainingRun:
     ) -> None:
         """Train until the configured end, or ``time.monotonic() > deadline_s``.
 
-        Not twice: however it ends, the learner lets go of its thread. A new run with
+        Call it once: its end stops the learner's thread. A new run with
         ``resume`` goes on.
         """
-        about = {**asdict(self.config), "source_revision": util.source_revision()}
-        write_json(self.run_dir / CONFIG_FILE, about)
-        write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
+        if not self.over:  # Else another revision has trained it.
+            about = {**asdict(self.config), "source_revision": util.source_revision()}
+            write_json(self.run_dir / CONFIG_FILE, about)
+            write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
         metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
@@ -135,8 +136,8 @@ class TrainingRun:
                 late = self._must_stop(deadline_s)
                 self._validate(metrics, at_end=self.over or late)
                 metrics_writer.add(metrics)
-                # Looked at once: what ends without a checkpoint is lost. Who quits waits for no
-                # validation that is not due anyway, so that a resumed run has had the same ones.
+                # Read once, so that every end has its checkpoint. Quitting adds no validation that
+                # is not due: a resumed run then has had the same ones.
                 ending = self.over or late or self.quitting
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
