@@ -62,7 +62,7 @@ _FLAGS: Dict[str, Tuple[str, str]] = {
     "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
     "tls": ("DIR", "this party's ca.pem, cert.pem, key.pem (deploy certs); endpoint tls/..."),
     "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
-    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to drive as well"),
+    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to move, if any"),
     "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
     "log_level": ("|".join(log.LEVELS), "lowest level that is logged to stderr"),
     "log_format": ("|".join(log.FORMATS), "each event as a line of text, or as a JSON object"),
@@ -97,8 +97,9 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
     given = {name: value for name, value in flags.items() if value is not None}
     from_file = Config()
     if path is not None:
+        tables = read_toml(path, "config file")
         try:
-            from_file = convert(_split_vehicle(read_toml(path, "config file")), Config)
+            from_file = convert(_split_vehicle(tables), Config)
             _check(from_file)
         except UserError as error:
             raise UserError(f"config file {path}: {error}") from None

@@ -1,6 +1,6 @@
 """The decisions of the edge runtime: state, answer and time in, orders out. No clock, no socket.
 
-First what a vehicle may be asked, of what a policy wants; then the controller. Times are monotonic
+First how an action is cut to what a vehicle may do; then the controller. Times are monotonic
 seconds. The caller serialises the calls (loop.py holds one lock). Contract, section 5.
 """
 

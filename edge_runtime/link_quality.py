@@ -165,12 +165,13 @@ class LinkQuality:
 
     def __init__(self, manifest: Manifest) -> None:
         self._envelope = read_envelope(manifest.envelope, manifest)
-        self.outside, self._session = "", ""
+        self._session = ""
         limits = self._envelope.limits
         self.limits = {n: float(max(getattr(limits, n), least)) for n, least in ACCURACY.items()}
         self._begin()
 
     def _begin(self) -> None:
+        self.outside = ""
         self.up, self.down = _Way(), _Way()
         self._episode, self._first = -1, 0  # `_first`: the number of its step 0
         self._recent: Deque[int] = deque(maxlen=64)  # numbers of states: a copy is no message

@@ -237,7 +237,7 @@ class ControlLoop:
         with self._lock:
             now_s = time.monotonic()
             if self._vehicle is not None:
-                # What stopped it and is over ends with `enable`; the next look says if it did.
+                # A fault whose cause is over ends with `enable`; the next look shows it.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
             refusal = self._hold.refusal() if self._hold is not None else ""
             refusal = refusal or self._controller.rearm(now_s)

@@ -63,7 +63,7 @@ class Policy(NamedTuple):
 def load_policy(
     path: PathLike, public_key: Optional[PathLike] = None, allow_unsigned: bool = False
 ) -> Policy:
-    """Load a policy that may drive: trusted, whole, its manifest and graph of one mind, probed.
+    """Load a policy that may drive: trusted, whole, probed, its manifest and graph agree.
 
     `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists, and with
     `allow_unsigned` before it a `policy.pub` beside the policy.

@@ -13,7 +13,8 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
-    """Apply what is asked for (0, empty and False ask for nothing), before a thread is started.
+    """Apply what is asked for (0, empty and False ask for nothing), before a thread
+    that drives is started.
 
     The threads of Zenoh, of the policy and of the vehicle inherit what the main thread has. What
     the system refuses is logged, one line each, and its name is in the list returned.

@@ -42,8 +42,8 @@ class Ride:
         """Whether a link that holds messages (TCP) held this state for longer than 2.2 T.
 
         After a silence through which it rode, such a backlog comes at once and looks fresh. Its
-        first state lags by as much as it came later after the one before than it was sent after
-        it; one that comes at the usual pace is no backlog, whatever its sender's clock does.
+        first state lags by the time between the arrivals less that between the sendings; one that
+        comes at the usual pace is no backlog, whatever its sender's clock does.
         """
         heard, self._heard = self._heard or received, received
         gap_s = received.arrived_s - heard.arrived_s

@@ -206,6 +206,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             loop.run()
     finally:
         over.set()
+        gc.unfreeze()  # In Python another drive may follow.
         notifier.tell("STOPPING=1")
         ended = loop.close()
         if runner is not None:

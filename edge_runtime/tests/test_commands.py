@@ -20,7 +20,7 @@ from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import HEALTH, Simulator, exit_status, run_command
+from edge_runtime.tests.harness import HEALTH, exit_status, run_command
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -177,12 +177,6 @@ def test_the_example_config_holds_every_key_at_its_default():
     names = [*Config.__struct_fields__, *(n for kind in places for n in kind.__struct_fields__)]
     missing = [name for name in names if f"{name} =" not in text]
     assert missing == ["ride_through", "vehicle_settings"]
-
-
-def test_a_busy_port_is_named():
-    endpoint = free_endpoint()
-    with Simulator(endpoint), pytest.raises(UserError, match="choose another with --listen"):
-        open_session(listen=endpoint, mode="router")
 
 
 @pytest.mark.parametrize(

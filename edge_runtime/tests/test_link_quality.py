@@ -187,7 +187,9 @@ def test_what_the_end_of_an_episode_cuts_off_is_no_loss_and_another_simulator_be
     network.run(50)
     assert sum(network.quality.up.gaps) == sum(network.quality.down.gaps) == 0
     network.session, network.step, network.heard = "b", 70, {}  # we come late to it
+    network.quality.outside = "said of the simulator before"
     network.run(1)
+    assert network.quality.outside == ""
     assert list(network.quality.up.gaps) == [0]
     assert network.quality.refusal().startswith("the link is not known yet")
 

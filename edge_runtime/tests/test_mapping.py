@@ -102,6 +102,12 @@ def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, share):
     assert inner == 0 or (inner < 0) == (share > 0)  # its action +1 turns right
 
 
+@pytest.mark.parametrize(("scale", "reach"), [(0.25, 1.0), (0.02, 0.511)])
+def test_no_steering_is_asked_for_that_the_wheels_do_not_reach(scale, reach):
+    limit = similarity_to(CARS["congestion"], SPEC, scale).limits()["steering"]
+    assert (-limit.low, limit.high) == pytest.approx((reach, reach), abs=1e-3)
+
+
 PEDALS, SPEEDS_MPS = st.floats(-3, 3), st.floats(-2, 2)
 
 

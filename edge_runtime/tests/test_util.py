@@ -161,7 +161,9 @@ def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, reader):
 def test_nested_thousands_deep_it_is_one_line(tmp_path, reader, opens, closes):
     begins = "a = " if reader == "config" else ""
     (tmp_path / "deep").write_text(begins + opens * 100_000 + "1" + closes * 100_000)
-    with pytest.raises(UserError, match=r"^(thing|config file) .* is (not JSON|no TOML): .*$"):
+    with pytest.raises(
+        UserError, match=r"^(thing|config file) (?!.*config file).* is (not JSON|no TOML): .*$"
+    ):
         READERS[reader](tmp_path / "deep")
 
 

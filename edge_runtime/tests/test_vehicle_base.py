@@ -18,7 +18,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import base, make_vehicle
 from edge_runtime.vehicles.base import LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
-from edge_runtime.wire import SAFE_STOP
+from edge_runtime.wire import SAFE_STOP, encode
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -224,6 +224,21 @@ def test_a_stop_from_before_the_rearm_does_not_undo_it(vehicle, runner):
     wait_until(lambda: vehicle.asked == ["enable", "stand"], "the order of things")
     runner.command(make_command("safe_stop"))
     wait_until(lambda: vehicle.asked == ["enable", "stand", "brake"], "a stop after it does")
+
+
+def test_words_that_no_message_can_carry_are_written_as_escapes(vehicle, runner):
+    vehicle.says = ["no port \udcff"]
+    wait_until(lambda: ["no port \\udcff"] in [each.faults for each in runner.heard], "the fault")
+    encode(runner.heard[-1])
+
+
+@pytest.mark.parametrize("stop", [-1.0, 0.0, 1.0])
+def test_a_stop_brakes_whatever_number_is_the_policys(runner, stop):
+    end_s = time.monotonic() + base.LAG_S + base.DEVIATES_S + 0.4
+    while time.monotonic() < end_s:
+        runner.command(make_command(mode=SAFE_STOP, action=[stop]))
+        time.sleep(T / 2)
+        assert runner.fault(time.monotonic()) == ""
 
 
 def test_a_command_that_waited_too_long_moves_nothing(vehicle, runner):

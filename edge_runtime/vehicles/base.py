@@ -31,7 +31,7 @@ from typing import (
 from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, printable
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 if TYPE_CHECKING:
@@ -380,6 +380,8 @@ class VehicleRunner:
         now_s = time.monotonic()
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
+        if command.mode == SAFE_STOP:  # It brakes, whatever number is the policy's stop.
+            self._watch.command({PEDAL: -1.0}, now_s)
         try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s, task.latch)
@@ -443,6 +445,7 @@ def _plain(report: VehicleReport) -> VehicleReport:
     """In Python's own types: a driver's numbers may be numpy's. Raises for what is no report."""
     more = (None if value is None else float(value) for value in report[5:])
     action = {name: float(value) for name, value in report.action.items()}
-    faults, standing = list(map(str, report.faults)), list(map(str, report.standing))
+    said = (report.faults, report.standing)
+    faults, standing = ([printable(str(words)) for words in each] for each in said)
     speed_mps, braking = float(report.speed_mps), bool(report.self_braking)
     return VehicleReport(action, speed_mps, braking, faults, standing, *more)

@@ -19,7 +19,7 @@ from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, wish_of
+from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
 
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
@@ -209,7 +209,11 @@ class StreamedCore(abc.ABC):
         words = [self.words] if self.words else []
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
-            action={"pedal": self._pedal(), "steering": self._steering()},
+            # Beyond its reach by a milliradian it is no liar.
+            action={
+                "pedal": self._pedal(),
+                "steering": clamp(self._steering(), self.similarity.reach),
+            },
             speed_mps=speed_mps,
             self_braking=self.state is not State.ENABLED,
             faults=faults if self.state is State.STOPPED else [],

@@ -118,12 +118,19 @@ class Similarity(NamedTuple):
         curvature = math.tan(centre_rad) / self.spec.wheelbase_m
         return clamp(self.car.steering(curvature * self.scale), 1.0)
 
+    @property
+    def reach(self) -> float:
+        """The most steering that the robot's wheels allow."""
+        return abs(self.steering(self.spec.centre_rad(self.spec.max_inner_steering_rad)))
+
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
         full_rad = abs(self.spec.inner_rad(self.centre_rad(1.0)))
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
-            "steering": ActionLimit(-1.0, 1.0, self.spec.max_steering_rate_radps / full_rad),
+            "steering": ActionLimit(
+                -self.reach, self.reach, self.spec.max_steering_rate_radps / full_rad
+            ),
         }
 
 
