@@ -182,9 +182,9 @@ def sooner_by(
 ) -> tuple[Estimate, str]:
     """How many times as soon one line gets where another one ends, and both in steps.
 
-    A line that is there when it is first looked at got there at some step before, and one that
-    never is does so at some step beyond the budget. So the ratio has bounds, and its interval,
-    a bootstrap over the seeds, the same of both, reaches from the lower ones to the upper ones.
+    A line that is there at the first look got there at an unknown step before; one that never
+    is, at one beyond the budget. So the ratio has bounds. Its interval, a bootstrap that draws the
+    same seeds for both, reaches from the lower bounds to the upper.
     """
     if not own or not other:
         return data.NOTHING, ""

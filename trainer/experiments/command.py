@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--scenario",
         choices=[*plan.SCENARIOS, *FOREIGN],
-        help=f"compute in this one only (default: in all; {', '.join(FOREIGN)}: of {GUIDANCE})",
+        help=f"compute this one only (default: all; {', '.join(FOREIGN)}: of {GUIDANCE})",
     )
     what.add_argument(
         "--quick",

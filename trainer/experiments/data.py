@@ -95,7 +95,7 @@ def within(difference: Estimate, reach: float) -> Holds:
 
 
 def enough_of(answers: Sequence[Holds], count: int = 0) -> Holds:
-    """Yes where so many are (0: all), no where so many no longer can be."""
+    """Yes if ``count`` are (0: all), no once too many are no."""
     least = count or len(answers)
     if len(answers) - answers.count("no") < least:
         return "no"

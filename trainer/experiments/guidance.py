@@ -109,8 +109,8 @@ def _introduction(results: Results, store: Store) -> Iterator[str]:
         "claimed.** Seconds are simulated ones in which the human drove. Watching is not in them: "
         "the human watches all the time, and beside the robot that asks for the first 500 steps.",
         "",
-        "Numbers are means of the training seeds with their 95 % interval. One seed has none; one "
-        "of no width says only that these few seeds agree. What it took to a level is the median "
+        "Numbers are means of the training seeds with their 95 % interval. One seed has none; a "
+        "width of 0 says only that these few seeds agree. What it took to a level is the median "
         "of the seeds (of an even number the lower middle), the least and the most of them (∞: "
         "never), and how many get there. A level counts as reached in the first validation that "
         f"shows it. Validations are {store.plan.evaluate_every_steps} steps apart, of "

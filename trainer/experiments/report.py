@@ -105,7 +105,7 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         "A comparison is decided where its 95 % interval lies on one side of its bar (0 where none "
         "is named): of a difference, paired by training seed, or of how many times as soon, by "
         "drawing seeds (∞: a line may never get there). A claim holds where all of its "
-        "comparisons hold, or as many as are wanted. It does not hold where that cannot be. The "
+        "comparisons hold, or as many as are wanted. It does not, once too many fail. The "
         "weakest comparison of those that decide is shown. The intervals are over training seeds, "
         "in these scenes with these test drives. Learning curves "
         "are judged twice: as the paper does, on training episodes, in which a policy that the "

@@ -35,6 +35,7 @@ class Controls:
     """Key, in small letters as ``up`` or ``w`` -> what pressing it fully adds to ``rest``."""
     rest: Amount  # Hands off
     rate_per_s: float  # How quickly a key presses
+    period_s: float  # From one action to the next
     names: tuple[str, ...]  # Of the actions
 
     def mix(self, shares: Mapping[str, float]) -> Amount:
@@ -63,12 +64,15 @@ def controls_of(scenario: str) -> Controls:
     env = make_environment(scenario)
     if isinstance(env, Adapted) and not env.can_be_seen:
         raise UserError(f"a person cannot see {scenario}: it offers no render() and no scene()")
+    if not env.keys:
+        raise UserError(f"a person cannot drive {scenario}: it has several actions, and no keys")
     rest = amount(env.rest_action)
     keys = {
         name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(action, rest))
         for name, action in env.keys.items()
     }
-    return Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))
+    rates = env.key_rate_per_s, env.control_period_s
+    return Controls(keys, rest, *rates, tuple(env.action_names))
 
 
 def keyboard_of(scenario: str) -> Controls:

@@ -41,7 +41,6 @@ WISH_KEYS: dict[int, Wish] = {
     pygame.K_q: "quit",
 }
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}
-PERIOD_S = 0.1
 SIZE = (1300, 680)  # The drawn picture's; the window shows it larger or smaller
 SCREEN_SHARE = 0.9  # The window takes this much of a small screen: frame and desktop bars need some
 SCENE_SIZE = (736, 400)
@@ -125,7 +124,8 @@ class KeyboardHands:
         """Engaged while any of the keys is down; the action ramps towards what they say."""
         held = self._down | self._tapped
         self._tapped.clear()
-        since_s = PERIOD_S if self._read_s is None else min(now_s - self._read_s, PERIOD_S)
+        period_s = self._controls.period_s
+        since_s = period_s if self._read_s is None else min(now_s - self._read_s, period_s)
         self._read_s = now_s
         rest, driving = self._controls.rest, held & self._controls.keys.keys()
         if not driving and "space" not in held:
@@ -182,6 +182,7 @@ class JoystickHands:
         elif event.type == pygame.JOYDEVICEREMOVED:
             self._joystick = None
             self._places.clear()
+            self.plug_in()  # another one that fits
 
     def read(self, now_s: float) -> Reading:
         """What axes and buttons say; nothing of a device that is gone."""

@@ -156,7 +156,7 @@ def add_person(parser: argparse.ArgumentParser) -> None:
     here = "the address at which --human web listens; by default this machine's alone"
     port = "the port of --human web; 0: any that is free"
     speed = number("a number from 0.01 to 1000", lambda value: 0.01 <= value <= 1000.0)
-    slow = "simulated seconds in one of yours: 0.5 is slow motion"
+    slow = "simulated seconds per real second: 0.5 is slow motion"
     group.add_argument("--profile", metavar="F.toml", help=shipped)
     group.add_argument("--host", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)

@@ -25,12 +25,15 @@ from contextlib import closing, contextmanager
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from numpy.typing import NDArray
 
 from bridge.report import DISCARDED, GOAL, EpisodeResult
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
 from trainer.drivers import TogetherDriver
@@ -197,7 +200,11 @@ class PersonRun(TrainingRun):
             self.sitting.close()
 
     def quit(self) -> bool:
-        """Ask for the end of the sitting; False where it is over already."""
+        """Ask for the end of the sitting. KeyboardInterrupt where it is closed: what follows is
+        left out, and not what is still to be written.
+        """
+        if self.sitting.closed:
+            raise KeyboardInterrupt
         return self.sitting.quit()
 
     def advance(self) -> EpisodeMetrics:
@@ -248,7 +255,8 @@ class PersonRun(TrainingRun):
             said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
             print(said, file=sys.stderr, flush=True)
         try:
-            super()._validate(metrics, at_end)
+            with sigterm_as_interrupt():  # SIGHUP, too: this episode's row is to be written.
+                super()._validate(metrics, at_end)
         except KeyboardInterrupt:
             print("validation left out", file=sys.stderr)
 
@@ -292,7 +300,8 @@ class PersonRun(TrainingRun):
         )
         self.learning.release(discarded=False)
         # Episodes that ended after the checkpoint count: the person gave what their rows say.
-        ended = read_metrics(self.run_dir)[self.episode :]
+        rows = read_metrics(self.run_dir)
+        ended = [row for row in rows if int(row["episode"]) >= self.episode]
         self.episode += len(ended)
         self.steps += sum(int(row["steps"]) for row in ended)
 
@@ -369,7 +378,9 @@ class BehindTheScenes:
         weights = {name: value.numpy() for name, value in check.actor.state_dict().items()}
         seeds = list(check.seeds.values())
         try:
-            with interrupts_blocked():
+            # A script that trains must not be run again there, as spawn would do.
+            script = patch.dict(sys.modules, __main__=ModuleType("__main__"))
+            with interrupts_blocked(), script:
                 self._begun = check, self._process.submit(_validate, self._config, weights, seeds)
         except BrokenExecutor:
             self._begun = None  # It was killed; `take` has said so.

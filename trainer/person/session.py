@@ -49,6 +49,8 @@ EXAMPLE = examples(
     "python -m trainer drive --from drive.mcap --at 3s --human web --out runs/drives",
 )
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
+BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
+"""What an environment's scene may leave out."""
 LATE_S = 0.02
 """A control period that begins later than this counts as late: a fifth of a period, about what a
 person notices."""
@@ -63,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
-    forked = "drive on in this recorded drive, again and again: its scene, and what was done in it"
-    add("--from", dest="recording", metavar="F.mcap", help=f"{forked} until --at")
+    forked = "each episode repeats this recorded drive until --at, and goes on from there"
+    add("--from", dest="recording", metavar="F.mcap", help=forked)
     add_place(parser)
     out = "the directory of the recordings; sittings add up there"
     add("--out", metavar="REC_DIR", default="runs/drives", help=out)
@@ -98,7 +100,7 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
     """What is driven: episodes that are others in every sitting, or one recorded drive's."""
     if asked.recording is None:
         if asked.at or asked.episode is not None or asked.vehicle_id:
-            raise UserError("--at, --episode and --vehicle-id are of a recording: --from F.mcap")
+            raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
         return make_environment(asked.scenario), seed_of
     recorded, step = find_fork(asked.recording, asked)
@@ -294,7 +296,7 @@ class Sitting:
         scene = self.env.scene()
         view = View(
             **self._now(),
-            scene=scene,
+            scene=None if scene is None else {**BARE, **scene},
             picture=self.env.render() if scene is None else None,
             frames=self._frames if self._layout.stacked else None,
             applied_action=self._applied.action,

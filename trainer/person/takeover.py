@@ -37,9 +37,9 @@ NEXT: dict[tuple[State, bool], tuple[State, State]] = {
     ("returning", True): ("taking", "human"),
     ("returning", False): ("returning", "policy"),
 }
-"""(state, whether the person holds) -> state while the goal is out of reach, state once it is
-within reach: no further away than a hand-over may move the action (``MAX_SLEW``). Until then the
-action moves by just that: the car never jumps at a hand-over, and feels it at once."""
+"""(state, whether the person holds) -> next state while the wanted action is further away than
+``MAX_SLEW``, next state once it is not. Until then the action moves by ``MAX_SLEW`` a period: it
+never jumps, and begins to move at once."""
 
 
 @dataclass(frozen=True)

@@ -186,15 +186,16 @@ def draw_scene(
         for dash in _dashes(each, skip_m):
             line(dash, shown.MARKING, 2)
     line(scene["path"], shown.PATH, 4)
-    x, y = scene["goal"]
-    line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], shown.GOAL, 8)
+    if scene["goal"] is not None:
+        x, y = scene["goal"]
+        line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], shown.GOAL, 8)
     for vehicle in scene["vehicles"]:
         body = Rectangle(*(vehicle[name] for name in BODY))
         ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
         glass = Rectangle(
             body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
         )
-        colour = ego if vehicle["ego"] else shown.APPLIED
+        colour = ego if vehicle.get("ego") else shown.APPLIED
         pen.polygon(pixels(corners(body)), fill=colour, outline=shown.GLASS, width=2)
         pen.polygon(pixels(corners(glass)), fill=shown.GLASS)
     if frames is not None:

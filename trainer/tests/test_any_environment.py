@@ -330,10 +330,15 @@ def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
     assert controls.rest == pytest.approx((-0.5, -1.0))
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)
     assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
-    monkeypatch.setattr(Rover, "keys", {"KeyQ": (0.0, 0.0)})
-    controls_of.cache_clear()
-    with pytest.raises(UserError, match=r"is driven with q, which pause, .*: name others"):
-        keyboard_of(ROVER)
+    assert controls.period_s == env.control_period_s
+    for keys, says in (
+        ({"KeyQ": (0.0, 0.0)}, r"is driven with q, which pause, .*: name others"),
+        ({}, "it has several actions, and no keys"),
+    ):
+        monkeypatch.setattr(Rover, "keys", keys)
+        controls_of.cache_clear()
+        with pytest.raises(UserError, match=says):
+            keyboard_of(ROVER)
     controls_of.cache_clear()
 
 

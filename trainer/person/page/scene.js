@@ -6,7 +6,6 @@ const COLOURS = {
   marking: "#aab2bb",
   path: "rgba(97, 175, 239, 0.65)",
   goal: "#54c878",
-  line: "#e6e6e6",
   traffic: "#eb8c28",
   glass: "rgba(10, 12, 15, 0.75)",
 };
@@ -41,8 +40,10 @@ export function drawScene(canvas, view) {
     for (const road of scene.roads) dashes(pen, road, scene.road_width_m / 2);
   }
   line(pen, scene.path, COLOURS.path, 0.22);
-  const [x, y] = scene.goal;
-  line(pen, [[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], COLOURS.goal, 0.5);
+  if (scene.goal) {
+    const [x, y] = scene.goal;
+    line(pen, [[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], COLOURS.goal, 0.5);
+  }
   for (const car of scene.vehicles) drawCar(pen, car, view.control);
 }
 

@@ -1,9 +1,9 @@
 import json
 import shutil
+import signal
 from itertools import repeat
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -115,8 +115,9 @@ def test_a_device_and_a_scenario_are_all_that_must_be_said(sit_down):
     assert str(recording) in out
 
 
-def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch):
-    monkeypatch.setattr(TrainingRun, "_validate", Mock(side_effect=KeyboardInterrupt))
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch, number):
+    monkeypatch.setattr(TrainingRun, "_validate", lambda *_: signal.raise_signal(number))
     status, out, errors = sit_down(Puppet([LET_GO] * 3, then=QUIT), *TRAIN_HERE)
     assert status == 0
     assert "validation left out" in errors

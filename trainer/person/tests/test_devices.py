@@ -156,11 +156,15 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
     wheel.unplug()
     reading = read(device)
     assert (device.present, reading.action, reading.by_moving) == (False, 0.0, False)
-    again = VirtualWheel()
+    again, third = VirtualWheel(), VirtualWheel()
     read(device)
     assert device.present
     again.axis(0, -0.25)
     assert read(device).action < -0.9
+    again.unplug()
+    read(device)
+    third.axis(0, 0.25)
+    assert read(device).action > 0.9, "the other one that fits"
 
 
 @pytest.fixture

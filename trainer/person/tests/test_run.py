@@ -1,4 +1,6 @@
 import math
+import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 from typing import Any
@@ -117,6 +119,28 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
         assert behind.take() is None
     behind.close()
     assert capsys.readouterr().err.count("no validation beside the drive") == 1
+
+
+SCRIPT = """
+from trainer.learner.networks import Actor
+from trainer.person.run import BehindTheScenes, Check
+from trainer.training.config import RunConfig
+
+print(f"this is {__name__}")
+behind = BehindTheScenes(RunConfig(evaluation_runs=1))
+behind.begin(Check(Actor(), 1, 0.0, {}))
+while behind.busy:
+    pass
+print(f"{len(behind.take()[1])} drive")
+behind.close()
+"""
+
+
+def test_a_script_that_trains_is_not_run_again_by_its_validation(tmp_path):
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT)
+    ran = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, timeout=100)
+    assert (ran.stdout, ran.stderr) == ("this is __main__\n1 drive\n", "")
 
 
 @pytest.mark.parametrize(

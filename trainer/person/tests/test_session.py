@@ -10,6 +10,8 @@ from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import Pacer, drive
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
+from trainer.scenarios.environment import DrivingEnv
+from trainer.scenarios.picture import draw_scene
 
 
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):
@@ -47,6 +49,13 @@ def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):
     assert all(s.human and s.control == "human" and s.policy_action is None for s in steps)
     assert [s.first for s in steps[:3]] == [True, False, False]
     assert steps[3].speed_mps > max(steps[1].speed_mps, steps[11].speed_mps)
+
+
+def test_a_scene_may_leave_out_what_it_does_not_have(tmp_path, monkeypatch):
+    car = {"x": 1.0, "y": 0.0, "heading_rad": 0.0, "length_m": 4.0, "width_m": 2.0}
+    monkeypatch.setattr(DrivingEnv, "scene", lambda _: {"vehicles": [car]})
+    (view, *_) = drive_and_read(tmp_path, [LET_GO])[2]
+    assert len(np.unique(draw_scene(view.scene))) > 3
 
 
 def test_quitting_ends_the_episode_and_keeps_its_last_step(tmp_path):
