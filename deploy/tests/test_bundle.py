@@ -411,7 +411,7 @@ def test_any_one_byte_changed_is_found(bundle):
     assert taken < 3
 
 
-@pytest.mark.parametrize("size", [0, 1, 511, 512, 2000, -1, -512, -1024])
+@pytest.mark.parametrize("size", [0, 1, 512, -512])
 def test_a_part_of_it_or_more_is_refused(bundle, size):
     whole = bundle.read_bytes()
     for data in (whole[:size], whole + bytes(abs(size) + 1)):
