@@ -1,6 +1,7 @@
 """A scripted human for highway-env's racetrack: keeps to the middle of a lane, and passes cars.
 
-``python -m trainer train --scenario racetrack-v0 --human examples.racetrack:RacetrackExpert``
+In a clone: ``python -m trainer train --scenario racetrack-v0 --human
+examples.racetrack:RacetrackExpert --out runs/race``
 """
 
 from typing import Any

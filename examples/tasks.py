@@ -1,6 +1,7 @@
 """Two tasks of others as the experiment on human guidance drives them: with an end and a goal.
 
-``trainer train --scenario examples.tasks:examples/Hill-v0 --human examples.tasks:HillExpert``
+In a clone: ``python -m trainer train --scenario examples.tasks:examples/Hill-v0 --human
+examples.tasks:HillExpert --out runs/hill``
 """
 
 from typing import Any

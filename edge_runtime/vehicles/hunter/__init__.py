@@ -133,10 +133,8 @@ def import_can() -> Any:
     try:
         import can
     except ImportError:
-        raise UserError(
-            "the hunter needs python-can, which is not installed:"
-            " pip install 'phil-edge-runtime[can]'"
-        ) from None
+        words = "the hunter needs python-can, which is not installed: pip install python-can"
+        raise UserError(words) from None
     return can
 
 

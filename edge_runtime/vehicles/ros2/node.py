@@ -29,10 +29,7 @@ try:
     from pycdr2._support import Buffer, Endianness
     from pycdr2.types import array, float32, float64, int32, uint32
 except ImportError:
-    raise UserError(
-        "ROS 2 messages need the package pycdr2: pip install 'phil-edge-runtime[ros2]',"
-        " or pip install pycdr2"
-    ) from None
+    raise UserError("ROS 2 messages need the package pycdr2: pip install pycdr2") from None
 
 
 PUBLISHER, SUBSCRIBER = "MP", "MS"
