@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or constant:ACTION for one action from -1 to 1 throughout",
     )
     add_public_key(parser)
-    add_scenario(parser, None)
+    add_scenario(parser, "what the policy was trained in")
     parser.add_argument(
         "--condition",
         choices=CONDITIONS,
@@ -130,6 +130,8 @@ def evaluate(
         raise UserError(f"condition must be one of {', '.join(CONDITIONS)}: {condition}")
     if runs < 1:
         raise UserError(f"runs must be at least 1: {runs}")
+    if seed < 0:
+        raise UserError(f"seed must be at least 0: {seed}")
     policy, spec = fspath(policy), parse_spec(latency)
     scenario = scenario_of(scenario or _trained_in(policy, public_key))
     env = make_environment(scenario, condition)

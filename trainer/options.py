@@ -22,11 +22,12 @@ Group = argparse.ArgumentParser | argparse._ArgumentGroup
 DEVICES = ("cpu", "cuda")
 
 
-def add_scenario(parser: Group, default: str | None = "left_turn") -> None:
-    """``--scenario``; ``default`` None: what the policy was trained in."""
+def add_scenario(parser: Group, known: str = "") -> None:
+    """``--scenario``; ``known``: what says it where it is None, in words."""
     words = ", ".join(SCENARIOS)
     what = f"what is driven: {words}, a gymnasium id, or module:id"
-    what += "" if default else " (default: what the policy was trained in, else left_turn)"
+    what += f" (default: {known}, else left_turn)" if known else ""
+    default = None if known else "left_turn"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
 
 

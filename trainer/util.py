@@ -6,13 +6,11 @@ function needs it: ``--help`` and the configs need none of it.
 """
 
 import io
-import json
 import math
 import multiprocessing
 import os
 import platform
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -26,11 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
+from edge_runtime.files import check_writable, make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
 CPU_INFO = Path("/proc/cpuinfo")
-LOCK_FILE = ".lock"  # In a directory that is claimed, for as long as it is
 WRITTEN = ("results/paper", "results/guidance")
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
 Range = tuple[float, float]
@@ -127,74 +124,35 @@ def claimed(directory: Path) -> Iterator[None]:
     Raises UserError: another process trains there, or the directory cannot be made or written.
     """
     made = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
-    make_directory(directory)
-    try:
-        with held(directory / LOCK_FILE) as mine:
-            if not mine:
-                by = holder(directory / LOCK_FILE)
-                raise UserError(f"{directory} is being trained in by {by}")
+    with held(directory) as mine:
+        if not mine:
+            raise UserError(f"{directory} is being trained in by another process")
+        try:
             yield
-    finally:
-        with suppress(OSError):  # It holds something.
-            for path in made:
-                path.rmdir()
+        finally:
+            with suppress(OSError):  # It holds something.
+                for path in made:
+                    path.rmdir()
 
 
 @contextmanager
-def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
-    """Hold a lock against other processes; gives whether that was possible within so many seconds.
+def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
+    """Hold a directory against other processes; gives whether that was possible in so many seconds.
 
-    The lock is the kernel's: when a process dies, however it dies, its lock is gone with it, and
-    the file that it leaves behind excludes no other process. Its directory must be there.
+    It is made if it is missing. The lock is the kernel's: when a process dies, however it dies, its
+    lock is gone with it.
 
-    Raises UserError: the file cannot be written or locked.
+    Raises UserError: the directory cannot be made or written.
     """
-    end_s, descriptor = time.monotonic() + patience_s, -1
+    make_directory(directory)
+    check_writable(directory / "any")
+    end_s, descriptor = time.monotonic() + patience_s, os.open(directory, os.O_RDONLY)
     try:
-        while (descriptor := _locked(path)) < 0 and time.monotonic() < end_s:
+        while not (mine := try_to_lock_file(descriptor)) and time.monotonic() < end_s:
             time.sleep(0.01)
-    except OSError as error:
-        raise UserError(f"cannot lock {path}: {error.strerror}") from None
-    try:
-        yield descriptor >= 0
+        yield mine
     finally:
-        if descriptor >= 0:
-            if _is(path, descriptor):
-                path.unlink()
-            os.close(descriptor)
-
-
-def holder(path: Path) -> str:
-    """Which process holds a lock, in words."""
-    try:
-        found = json.loads(path.read_bytes())
-        return f"process {found['pid']} on {found['host']}"
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return "another process"
-
-
-def _locked(path: Path) -> int:
-    """The locked file, opened and with this process's name in it; -1 where another has it."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    if not try_to_lock_file(descriptor):
         os.close(descriptor)
-        return -1
-    if not _is(path, descriptor):
-        # The process before has just let go and removed the file: this lock excludes no process.
-        os.close(descriptor)
-        return _locked(path)
-    os.ftruncate(descriptor, 0)
-    me = {"pid": os.getpid(), "host": socket.gethostname()}
-    os.pwrite(descriptor, json.dumps(me).encode(), 0)
-    return descriptor
-
-
-def _is(path: Path, descriptor: int) -> bool:
-    """Whether the open file is the one that has the name."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
 
 
 def cores() -> int:

@@ -105,15 +105,9 @@ class Store:
         name = plan.digest(plan.deciding(unit, self.plan, self.humans))
         return self.runs / f"{'-'.join(map(str, unit))}-{name}"
 
-    def lock_file(self, unit: Unit) -> Path:
-        """Beside the unit's directory."""
-        run_dir = self.run_dir(unit)
-        return run_dir.with_name(f"{run_dir.name}.lock")
-
     def lock(self, unit: Unit, patience_s: float = 0.0) -> AbstractContextManager[bool]:
         """Hold a unit against other processes; gives whether that was possible."""
-        make_directory(self.runs)
-        return util.held(self.lock_file(unit), patience_s)
+        return util.held(self.run_dir(unit), patience_s)
 
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
         """All records of a scenario, current or not; none where there is no file.
@@ -150,10 +144,9 @@ class Store:
     def put(self, unit: Unit, record: dict[str, Any]) -> None:
         """Add a record, in place of an older one of the unit: whole or not at all."""
         path = self.records_file(unit.scenario)
-        make_directory(path.parent)
-        with util.held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
+        with util.held(self.results, WRITING_PATIENCE_S) as mine:
             if not mine:
-                raise UserError(f"{path} is held by another process")
+                raise UserError(f"{self.results} is held by another process")
             records = {**self.records(unit.scenario), unit: record}
             lines = [
                 json.dumps(records[each], separators=(",", ":"), allow_nan=False) + "\n"
@@ -197,7 +190,7 @@ def compute(task: Task) -> str:
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
         if not free:
-            say(f"left to {util.holder(store.lock_file(unit))}: {unit}")
+            say(f"left to another process: {unit}")
             return BUSY
         if unit in store.find([unit])[0]:
             return FINISHED
@@ -221,7 +214,6 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     }
     seconds, device = {}, "cpu"
     if unit.trained:
-        make_directory(run_dir)
         if not _train(task, run_dir):
             return None
         rows = read_metrics(run_dir)

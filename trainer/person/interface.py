@@ -149,13 +149,18 @@ DEVICE_OPTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
 """Option -> its default, and the devices that have a use for it."""
 
 
+SLOWEST, FASTEST = 0.01, 1000
+"""Simulated seconds in one of the person's."""
+
+
 def add_person(parser: argparse.ArgumentParser) -> None:
     """Declare the person's options of ``drive`` and ``train``."""
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
     shipped = "what the axes and buttons of --human gamepad or wheel mean (default: as shipped)"
     here = "the address at which --human web listens; by default this machine's alone"
     port = "the port of --human web; 0: any that is free"
-    speed = number("a number from 0.01 to 1000", lambda value: 0.01 <= value <= 1000.0)
+    said = f"a number from {SLOWEST} to {FASTEST}"
+    speed = number(said, lambda value: SLOWEST <= value <= FASTEST)
     slow = "simulated seconds per real second: 0.5 is slow motion"
     group.add_argument("--profile", metavar="F.toml", help=shipped)
     group.add_argument("--host", help=here)

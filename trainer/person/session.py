@@ -58,7 +58,7 @@ person notices."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_scenario(parser)
+    add_scenario(parser, "what was recorded")
     add = parser.add_argument
     device = "the device that your hands are on"
     add("--human", "--device", dest="human", choices=list(HUMANS), default="keyboard", help=device)
@@ -102,10 +102,10 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
         if asked.at or asked.episode is not None or asked.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        return make_environment(asked.scenario), seed_of
+        return make_environment(asked.scenario or "left_turn"), seed_of
     recorded, step = find_fork(asked.recording, asked)
-    given = asked.scenario if ":" in asked.scenario else None  # No file names what is imported.
-    own, name = recorded.environment(given), scenario_of(given or recorded.origin.environment)
+    own = recorded.environment(asked.scenario)
+    name = scenario_of(asked.scenario or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
     return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed

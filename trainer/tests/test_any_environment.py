@@ -292,9 +292,16 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
         (tmp_path / "config.toml").write_text(f"{text}\n")
         with pytest.raises(UserError, match=says):
             main(["train", *words, *given.split()])
-    for wrong in ({"device": "gpu"}, {"threads": -1}, {"seed": -1}, {"preset": "mine"}):
-        with pytest.raises(UserError, match=f"{next(iter(wrong))} (must be one of|= -1 is out of)"):
-            train(ROVER, out=tmp_path / "run", **wrong)
+    wrongs: dict[str, Any] = {
+        "device": "gpu",
+        "threads": -1,
+        "seed": -1,
+        "preset": "mine",
+        "speed": 0.0,
+    }
+    for name, value in wrongs.items():
+        with pytest.raises(UserError, match=f"{name} (must be|= -1 is out of)"):
+            train(ROVER, out=tmp_path / "run", **{name: value})
     with pytest.raises(UserError, match=r"settings of .*:MISSPELT: .*'bach_size'"):
         train(ROVER, out=tmp_path / "run", algorithm=f"{__name__}:MISSPELT")
     assert not (tmp_path / "run").exists()

@@ -104,9 +104,14 @@ def test_noise_is_a_twentieth_of_the_commands_domain():
 
 
 def test_what_cannot_be_evaluated_is_said():
-    for wrong, said in (({"condition": "rain"}, "nominal, noise"), ({"runs": 0}, "at least 1: 0")):
+    wrongs: dict[str, Any] = {
+        "condition": ("rain", "nominal, noise"),
+        "runs": (0, "1: 0"),
+        "seed": (-1, "0: -1"),
+    }
+    for name, (value, said) in wrongs.items():
         with pytest.raises(UserError, match=said):
-            evaluate("expert", "left_turn", **wrong)
+            evaluate("expert", "left_turn", **{name: value})
     info = {"lateral_acceleration_mps2": np.nan, "longitudinal_acceleration_mps2": 0.0}
     env: Any = SimpleNamespace(
         reset=lambda seed: (0, {}), step=lambda action: (0, 0.0, False, False, info)

@@ -28,7 +28,14 @@ from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
 from trainer.environments import scenario_of
 from trainer.learner.config import ALGORITHMS, LearnerConfig, find_algorithm
-from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
+from trainer.person.interface import (
+    FASTEST,
+    HUMANS,
+    PERSON,
+    SLOWEST,
+    add_person,
+    check_person_options,
+)
 from trainer.pictures import write_learning_curve
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
@@ -177,6 +184,8 @@ def train(
         known = ", ".join([DEFAULTS.human, *HUMANS])
         words = f"none of {known}, no module:Class and no human model's directory"
         raise UserError(f"--human {human} is {words}")
+    if not SLOWEST <= speed <= FASTEST:
+        raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {speed}")
     if preset not in PRESETS:
         raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
     start = PRESETS[preset]

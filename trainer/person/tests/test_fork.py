@@ -67,6 +67,7 @@ def test_a_policy_may_drive_until_the_person_takes_over(sit_down, recorded):
 def test_what_is_no_fork_gets_one_line(recorded, capsys):
     alone = ["drive", "--human", "keyboard"]
     assert "--from F.mcap" in refusal(capsys, *alone, "--at", "3")
+    assert "was driven in" in refusal(capsys, *FORK, "--scenario", "congestion")
     assert "fork before" in refusal(capsys, *FORK[:-1], "99")
     assert "no MCAP recording" in refusal(capsys, *alone, "--from", "policy.onnx")
 
