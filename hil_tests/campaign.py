@@ -39,7 +39,6 @@ from trainer.options import add_scenario
 from trainer.pictures import write_figure
 from trainer.util import cores
 
-PART_EPISODES = 50  # Of a network
 SHOWN_WRONG = 5
 COLUMNS = 3
 EXAMPLE = examples(
@@ -138,7 +137,7 @@ def run_latency(
     """Drive every network of the axes; the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
     keep = out.with_name(f"{out.stem}_rows")
-    found = sweep.drive_all(task, specs, PART_EPISODES, jobs, keep)
+    found = sweep.drive_all(task, specs, jobs, keep)
     rows = {spec: sweep.make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
     told = ("name", "title", "unit", "values", "specs")

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from trainer.experiments.plan import digest
 from trainer.scenarios import SCENARIOS
 
 VEHICLE_ID = "campaign01"
-PART_LIMIT_S = 900.0
+PART_EPISODES, PART_LIMIT_S = 50, 900.0
 ATTEMPTS = 6
 FORMAT = 3  # Raise it where the same part begins to mean another drive: kept results become void
 
@@ -88,12 +89,8 @@ Rows = Mapping[str, Found]  # The report's rows by their specification
 
 def limit_of(axis: Axis, rows: Rows, target: float) -> float | None:
     """The largest value up to which every tested one is at the target; None: not even 0 is."""
-    limit: float | None = None
-    for value in axis.values:
-        if rows[axis.spec(value)]["success"]["value"] < target:
-            return limit
-        limit = value
-    return limit
+    holds = takewhile(lambda v: rows[axis.spec(v)]["success"]["value"] >= target, axis.values)
+    return max(holds, default=None)
 
 
 def budget(axes: Sequence[Axis], rows: Rows, target: float, name: str) -> dict[str, Any]:
@@ -158,15 +155,11 @@ class Part(NamedTuple):
 
 
 def drive_all(
-    task: Task,
-    points: Sequence[str],
-    size: int,
-    jobs: int,
-    keep: Path,
+    task: Task, points: Sequence[str], jobs: int, keep: Path
 ) -> dict[str, list[dict[str, Any]]]:
     """Drive the task's episodes at every point, ``jobs`` parts at a time; the results by point.
 
-    A part has ``size`` episodes at most. What `drive_network` gives for it is kept in the directory
+    A part has PART_EPISODES at most. What `drive_network` gives for it is kept in the directory
     ``keep``, in a file named by a hash of all that decides it, and not driven again.
 
     Raises:
@@ -179,7 +172,8 @@ def drive_all(
         "scenario": task.scenario, "condition": task.condition, "environment": environment,
     }  # fmt: skip
     make_directory(keep)
-    parts = [one for point in points for one in Part(point, task.seed, task.runs).split(size)]
+    whole = (Part(point, task.seed, task.runs) for point in points)
+    parts = [one for each in whole for one in each.split(PART_EPISODES)]
     paths = {one: keep / f"{digest({**deciding, **one._asdict()})}.json" for one in parts}
     found: dict[Part, list[dict[str, Any]]] = {
         one: parse_json(read_bytes(path, "kept result"), f"kept result {path} (remove it)")

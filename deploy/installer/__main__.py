@@ -43,7 +43,7 @@ from deploy.installer.verify import (
     read_public_key,
     ssh_key,
 )
-from edge_runtime.cli import BAD_INPUT, INTERRUPTED, ArgumentParser, number
+from edge_runtime.cli import ArgumentParser, number, run_cli
 from edge_runtime.util import UserError
 
 COMMANDS = {
@@ -63,21 +63,15 @@ _CHECK_LIMIT_S = 120.0
 def main(argv: list[str]) -> int:
     """Run one command; the exit status."""
     os.umask(0o022)  # The service's user must read the release, whatever the caller's umask.
+    return run_cli(_run, argv)
+
+
+def _run(argv: list[str]) -> int:
     try:
-        try:
-            return _dispatch(_parser().parse_args(argv))
-        finally:
-            sys.stdout.flush()  # at the exit nobody could say what is wrong
-    except UserError as error:
+        return _dispatch(_parser().parse_args(argv))
+    except UnhealthyError as error:
         print(f"error: {error}", file=sys.stderr)
-        return UNHEALTHY if isinstance(error, UnhealthyError) else BAD_INPUT
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # it may be stdout that takes no more
-        print(f"error: {error.filename or 'the disk'}: {error.strerror}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("interrupted: the same command again completes it", file=sys.stderr)
-        return INTERRUPTED
+        return UNHEALTHY
 
 
 def _parser() -> argparse.ArgumentParser:

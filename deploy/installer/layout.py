@@ -240,14 +240,9 @@ def why_not_whole(folder: Path) -> str:
 
 def hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of every file below a release but `contents.json`, by path."""
-    found = {}
-    for place, _, names in os.walk(str(folder)):
-        for name in names:
-            path = Path(place, name)
-            relative = path.relative_to(folder).as_posix()
-            if relative != CONTENTS:
-                found[relative] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
+    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if not p.is_dir()}
+    found.pop(CONTENTS, None)
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()}
 
 
 def unpack_wheel(data: bytes, name: str, site: Path) -> None:

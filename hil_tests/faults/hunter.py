@@ -41,17 +41,16 @@ STANDS_WITHIN_S = 2.0
 _FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
 _IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
 _DIFFERS_MPS = 0.15
-_NO_FRAME_TO_SHOW_IT = ("silent", "frozen", "bus_off", "late")
 _REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
 """While these last, the runtime refuses to be re-armed: it would be in vain."""
 
 
 class Expect(NamedTuple):
-    """A fault of the mock: words of it in the feedback, and which frame shows it first."""
+    """A fault of the mock: words of it in the feedback, and which frame shows it first, if any."""
 
     name: str
     says: str
-    shown: Callable[[Heard], bool] = lambda frame: False
+    shown: Callable[[Heard], bool] | None = None
 
 
 def speed_mps(frame: Heard) -> float:
@@ -115,7 +114,7 @@ def _drives(monitor: CanMonitor) -> bool:
 
 
 def _known_s(expect: Expect, monitor: CanMonitor, on_s: float) -> float:
-    if expect.name in _NO_FRAME_TO_SHOW_IT:
+    if expect.shown is None:
         return max(one.seen_s for one in monitor.of(0x221) if one.seen_s <= on_s)
     for one in list(monitor.heard):
         if one.seen_s > on_s and expect.shown(one):
@@ -186,7 +185,7 @@ for _expect in _EXPECTS:
         done=f"Hunter: {FAULTS[_expect.name]}",
         name=f"hunter_{_expect.name}",
         measured="last frame in time on the bus to set-point 0"
-        if _expect.name in _NO_FRAME_TO_SHOW_IT
+        if _expect.shown is None
         else "first frame on the bus that shows it to set-point 0",
         reaction_limit_s=REACTION_LIMIT_S + (STATUS_SILENCE_S if _expect.name == "frozen" else 0.0),
         policy="full",

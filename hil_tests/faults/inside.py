@@ -26,7 +26,6 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from edge_runtime.config import BUILT_IN
 from edge_runtime.manifest import Entry, Task
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.base import VehicleReport
@@ -34,6 +33,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 
 DIRECTORY = "PHIL_FAULT_DIR"
 ENVIRONMENT = "hil_tests.faults.inside:PhilEndless-v0"
+MOCK = "hil_tests.faults.inside:FaultyMockVehicle"
 END, BRIGHT, BRAKES, VEHICLE, TASK = "end", "bright", "brakes", "vehicle", "task"
 _FULL_MPS2, _MOST_MPS = 4.0, 12.0
 _WHITE, _DARKEST_TO_BRIGHTEST = 255, 120
@@ -151,10 +151,8 @@ def step_clock_on_signals() -> None:
 
 
 def launch(package: str) -> None:
-    """Put the faults in, then be the command."""
+    """Be the command, with a clock that can be stepped."""
     step_clock_on_signals()
-    # Not __name__: see above.
-    BUILT_IN["mock"] = "hil_tests.faults.inside:FaultyMockVehicle"
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

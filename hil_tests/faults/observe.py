@@ -73,16 +73,12 @@ class Timeline:
 
 
 def unsafe_commands(
-    commands: Iterable[CommandSeen],
-    states: Mapping[Place, float],
-    by_arrival: bool = False,
-    task: Task = TASK,
+    commands: Iterable[CommandSeen], states: Mapping[Place, float], task: Task = TASK
 ) -> list[str]:
     """Why each unsafe command is one; empty where all is well.
 
     A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or that
     was to be rejected, and later than the reaction limit after the state that it answers.
-    ``by_arrival`` takes the probe's time in place of the edge's clock, where that was stepped.
     """
     found, limit_s = [], REACTION_LIMIT_S + later_s(task)
     for command in commands:
@@ -96,7 +92,8 @@ def unsafe_commands(
         elif state_s is None:
             found.append(f"{command.place}: answers no acceptable state")
         else:
-            age_s = (command.seen_s if by_arrival else command.sent_s) - state_s
+            # The edge's clock may have been stepped ahead: nothing is sent after it is seen.
+            age_s = min(command.sent_s, command.seen_s) - state_s
             if age_s > limit_s:
                 found.append(f"{command.place}: its state was {age_s:.3f} s old")
     return found

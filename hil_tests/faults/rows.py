@@ -29,7 +29,7 @@ import numpy as np
 from bridge.recording import Recording, heard_of
 from edge_runtime.tests.policies import T
 from edge_runtime.wire import SAFE_STOP, State, decode_state
-from hil_tests.faults.inside import VEHICLE
+from hil_tests.faults.inside import MOCK, VEHICLE
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
     RECOVERY_LIMIT_S,
@@ -82,12 +82,10 @@ class Row:
     """Whether the simulator's states go on through the fault: where they do not, the machine stood
     still, and the try is done again (and counted as disturbed)."""
     alone: bool = False  # Whether it needs the machine for itself
-    new_rig_each_try: bool = False
-    by_arrival: bool = False
-    """Whether the age of an answer is taken by the probe's clock (the edge's is stepped)."""
     goes_on: bool = False  # Whether the drive goes on through the fault
     counted: Literal["", "edge", "simulator"] = ""
-    """Who must have counted just the messages that a try sent to be rejected."""
+    """Who must have counted just the messages that a try sent to be rejected. The simulator tells
+    when the drive has ended: each try then has a rig of its own."""
 
 
 ROWS: list[Row] = []
@@ -128,18 +126,12 @@ def do_fault(row: Row, rig: Rig, number: int) -> Try:
     if not row.goes_on:
         return done
     end_s = time.monotonic()
-    found = Counter(done.rejected)
+    wanted = counted = Counter(done.rejected)
     if row.counted == "edge":
-        found = rig.edge_counts() - before
+        counted = rig.edge_counts() - before
     if row.counted == "simulator":
         rig.end_drive()  # It writes its counts at its end.
-        found = rig.simulator_counts()
-    return drove_on(rig, begin_s, end_s, done, found)
-
-
-def drove_on(rig: Rig, begin_s: float, end_s: float, done: Try, counted: Counter[str]) -> Try:
-    """Judge a try through which the drive was to go on, and what was counted in it."""
-    wanted = Counter(done.rejected)
+        counted = rig.simulator_counts()
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
     # Safe stops come as steadily as drives: the gaps alone would not tell.
     wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *done.wrong]
@@ -261,7 +253,7 @@ def router_restarted(rig: Rig, number: int) -> Try:
     return Try(reaction_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@drives_on(by_arrival=True)
+@drives_on()
 def clock_stepped_edge(rig: Rig, number: int) -> Try:
     """Edge's wall clock 1 h ahead and back."""
     return _stepped(rig.edge, number)
@@ -339,7 +331,7 @@ for _word, _done in (
     fault(
         "edge sends safe_stop: vehicle_fault; stays until re-armed",
         "last good feedback at the probe to safe_stop on the wire",
-        name=f"vehicle_{_word}", done=_done, rig={"vehicle": "mock"}, policy="steady", flows=True,
+        name=f"vehicle_{_word}", done=_done, rig={"vehicle": MOCK}, policy="steady", flows=True,
     )(partial(_vehicle_is, _word))  # fmt: skip
 
 
@@ -390,7 +382,7 @@ def _too_few(states: list[State]) -> list[str]:
 SHORT_S, RIDING_S = 0.4, 0.3
 """An outage through which it rides, and where in one it surely rides."""
 _LATER_S = REACTION_LIMIT_S + RIDE_S
-_VEHICLE = {"ride_s": RIDE_S, "vehicle": "mock"}
+_VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")

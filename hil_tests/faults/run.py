@@ -127,16 +127,21 @@ def run_row(
     """
     outcome, number = Outcome(), 0
     while number < tries and not ended.is_set():
-        with Rig(trust, Path(tempfile.mkdtemp(dir=work)), task, **row.rig) as rig:
+        try:
+            started = Rig(trust, Path(tempfile.mkdtemp(dir=work)), task, **row.rig)
+        except (OSError, UserError) as error:  # as where this machine has no multicast
+            outcome.failures.append(f"try {number}: {error}")
+            break
+        with started as rig:
             going = True
             while going and number < tries:
                 disturbed = outcome.disturbed
-                going = _try(row, rig, number, outcome) and not row.new_rig_each_try
+                going = _try(row, rig, number, outcome) and row.counted != "simulator"
                 if outcome.disturbed == disturbed:
                     number += 1
                     on_try(row.name)
             seen = rig.timeline
-            outcome.unsafe += unsafe_commands(seen.commands, seen.states, row.by_arrival, task)
+            outcome.unsafe += unsafe_commands(seen.commands, seen.states, task)
             if seen.unreadable:
                 outcome.unsafe.append(f"{seen.unreadable} commands that nobody would take")
         outcome.crashes += rig.crashes

@@ -174,7 +174,7 @@ def test_an_environment_that_knows_no_success_has_no_campaign(monkeypatch, tmp_p
     monkeypatch.setattr(sweep, "run_rig", lambda *_, **__: {"success_rate": None})
     task = sweep.Task(POLICY, "any", "Pendulum-v1", "nominal", 1, 1)
     with pytest.raises(UserError, match="Pendulum-v1 says of no episode whether it succeeded"):
-        sweep.drive_all(task, ["none"], 1, 1, tmp_path / "kept")
+        sweep.drive_all(task, ["none"], 1, tmp_path / "kept")
 
 
 def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):

@@ -39,18 +39,16 @@ def command(**changes):
         ({"action": [0.5, 0.5]}, "action"),
         ({"action": [float("nan")]}, "action"),
         ({"place": ("session", 0, 8)}, "no acceptable state"),
-        ({"sent_s": 10.001 + observe.REACTION_LIMIT_S}, "old"),
+        ({"sent_s": 10.001 + observe.REACTION_LIMIT_S, "seen_s": 11.0}, "old"),
     ],
 )
 def test_each_way_to_be_unsafe_is_found(changes, why):
     (found,) = observe.unsafe_commands([command(**changes)], STATES)
     assert why in found
     assert observe.unsafe_commands([command(mode="safe_stop", **changes)], STATES) == []
-    in_time = [command(), command(sent_s=10.0 + observe.REACTION_LIMIT_S)]
+    in_time = [command(), command(sent_s=10.0 + observe.REACTION_LIMIT_S, seen_s=11.0)]
     assert observe.unsafe_commands(in_time, STATES) == []
-    stepped = [command(sent_s=3610.0)]
-    assert observe.unsafe_commands(stepped, STATES, by_arrival=True) == []
-    assert observe.unsafe_commands(stepped, STATES) != []
+    assert observe.unsafe_commands([command(sent_s=3610.0)], STATES) == []  # a stepped clock
 
 
 def test_safe_stops_at_the_pace_of_drives_are_no_drive():
@@ -113,6 +111,12 @@ def test_a_slower_policy_has_more_time():
     for reaction_s, recovery_s, late in ((0.649, 1.999, 0), (0.651, 2.001, 1)):
         found = report_row(ROW, Outcome(tries=[Try(reaction_s, recovery_s)]), later_s)
         assert (found["reactions_late"], found["recoveries_late"]) == (late, late)
+
+
+def test_a_row_whose_rig_cannot_start_fails_and_ends_no_campaign(tmp_path, monkeypatch):
+    monkeypatch.setattr("hil_tests.faults.run.Rig", Mock(side_effect=UserError("no multicast")))
+    outcome = run_row(ROW, (), TASK, tmp_path, 3, lambda _: None, threading.Event())
+    assert outcome.failures == ["try 0: no multicast"]
 
 
 def test_a_campaign_that_has_ended_begins_no_try(tmp_path):
