@@ -100,20 +100,16 @@ def vehicle_action(actuators: Actuators, decision: Decision) -> np.ndarray:
     return actuators.reached(decision.feedback) if decision.feedback else actuators.stop()
 
 
-PublishScene = Callable[[Any, Scene], None]
-"""Called with the environment and what is to stand beside its own scene."""
-OnTick = Callable[[int, int, Decision], None]
-"""Called with episode, step, decision after every tick."""
-
-
 @dataclass
 class EpisodeRunner:
     """Drives one environment through a clock and keeps what the report needs."""
 
     environment: Environment
     clock: Clock
-    publish_scene: PublishScene
-    on_tick: OnTick
+    publish_scene: Callable[[Any, Scene], None]
+    """Called with the environment and what is to stand beside its own scene."""
+    on_tick: Callable[[int, int, Decision], None]
+    """Called with episode, step, decision after every tick."""
     task: Task
     origin: Origin
     """Of the drive, to be told with every scene; each episode has a seed of its own."""

@@ -27,7 +27,6 @@ import sys
 import threading
 import time
 import typing
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, NamedTuple
@@ -206,7 +205,6 @@ class RecordingWriter:
         # Each is registered once; with its schema, as a picture may have the name of a message.
         self._channel = functools.cache(self._mcap.register_channel)
         self._schema = functools.cache(self._mcap.register_schema)
-        self._counts: Counter[str] = Counter()
 
     def write(self, heard: Heard, with_view: bool = True) -> None:
         """Add one message; ``with_view`` False leaves out the copy for viewers."""
@@ -242,8 +240,7 @@ class RecordingWriter:
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
         channel_id = self._channel(topic, encoding, schema_id)
-        self._counts[topic] += 1
-        self._mcap.add_message(channel_id, now_ns, data, now_ns, self._counts[topic])
+        self._mcap.add_message(channel_id, now_ns, data, now_ns)
 
 
 def _vehicle_id(heard: Heard) -> str:

@@ -6,8 +6,8 @@ each chunk included, the checksum at the end of the data says so. Behind a broke
 one is where the record's length says; where no record begins there, the length is broken, too, and
 the next whole chunk is looked for byte by byte.
 
-Anybody may have made the file. What a chunk announces is looked at before it is unpacked, and the
-whole work is limited by the length of the file.
+Anybody may have made the file. What a chunk announces is looked at before it is unpacked, and
+reading is limited by the length of the file.
 """
 
 from __future__ import annotations
@@ -40,10 +40,6 @@ MAX_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 8 << 20  # Unpacked; ours hold little more than 1 MiB
 MAX_WORK = 200
 """Bytes read for each byte of the file, above one chunk."""
-UNPACKED_AS_READ = 64
-"""Bytes unpacked that count as one read: black pictures come to 10,000 a byte of the file."""
-RECORD_BYTES = 256
-"""What a record counts besides its bytes: taking it apart costs as much, however empty it is."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
@@ -157,10 +153,10 @@ class Recording(Condition):
         """Yield every record that can be read, a chunk as what it holds.
 
         UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
-        work than its size accounts for.
+        reading than its size accounts for.
         """
         vars(self).update(vars(Condition()), metadata={})
-        self._has_ended, self._spent_bytes = False, 0
+        self._has_ended, self._read_bytes = False, 0
         try:
             with open_regular(self.path) as self._stream:
                 self._size = self._stream.seek(0, os.SEEK_END)
@@ -215,7 +211,6 @@ class Recording(Condition):
     def _scan(self, at: int) -> int:
         while at < self._size:
             block = self._bytes(at, BLOCK_BYTES + LANDMARK_BYTES)
-            self._spend(len(block), at)
             for match in LANDMARK.finditer(block):
                 if self._read(at + match.start()) is not None:
                     return at + match.start()
@@ -227,14 +222,13 @@ class Recording(Condition):
         end = self._end(at)
         if end is None:
             return None
-        self._spend(end - at, end)
         data = self._bytes(at, end - at)
         try:
             record = next(StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records)
             # The library reads on over lengths inside of a record that do not fit.
             if _written(record) != data:
                 return None
-            parts = self._unpack(record, end) if isinstance(record, Chunk) else [record]
+            parts = self._unpack(record) if isinstance(record, Chunk) else [record]
         except TORN:
             return None
         if isinstance(record, Footer) and not self._has_its_index(record, at):
@@ -262,37 +256,31 @@ class Recording(Condition):
         crc = zlib.crc32(_written(footer)[: -MAGIC_SIZE - _CRC_BYTES], index_crc)
         return footer.summary_crc in (0, crc)
 
-    def _unpack(self, chunk: Chunk, end: int) -> list[McapRecord]:
+    def _unpack(self, chunk: Chunk) -> list[McapRecord]:
         """What a chunk holds; one of the TORN where it does not hold what it announces."""
         size = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
         # -1: the data do not say. They are then unpacked up to what the chunk says.
         if size not in (-1, chunk.uncompressed_size) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-        self._spend(chunk.uncompressed_size // UNPACKED_AS_READ, end)
-        parts = breakup_chunk(chunk, validate_crc=True)
-        self._spend(RECORD_BYTES * len(parts), end)
-        return parts
+        return breakup_chunk(chunk, validate_crc=True)
 
     def _crc32(self, start: int, end: int) -> int:
-        self._spend(max(0, end - start), end)
         crc = 0
         for at in range(start, end, BLOCK_BYTES):
             crc = zlib.crc32(self._bytes(at, min(BLOCK_BYTES, end - at)), crc)
         return crc
 
-    def _spend(self, count: int, at: int) -> None:
-        """Count bytes read or unpacked up to a place; UserError for more than damage explains."""
-        self._spent_bytes += count
-        if self._spent_bytes > MAX_CHUNK_BYTES + MAX_WORK * at:
+    def _bytes(self, at: int, count: int) -> bytes:
+        """Those bytes, fewer at the file's end; UserError for more reading than damage explains."""
+        self._stream.seek(max(0, at))
+        data = self._stream.read(max(0, min(count, self._size - at)))
+        self._read_bytes += len(data)
+        if self._read_bytes > MAX_CHUNK_BYTES + MAX_WORK * self._size:
             raise UserError(
                 f"recording {self.path} is refused: reading it takes more than"
                 f" {MAX_WORK} times its size"
             )
-
-    def _bytes(self, at: int, count: int) -> bytes:
-        """Those bytes, fewer at the file's end."""
-        self._stream.seek(max(0, at))
-        return self._stream.read(max(0, min(count, self._size - at)))
+        return data
 
 
 def _written(record: McapRecord) -> bytes:

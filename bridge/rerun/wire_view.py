@@ -10,7 +10,6 @@ import functools
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -96,13 +95,12 @@ def _show_recording(arguments: Any, sink: str) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
     file = Recording(Path(arguments.recording))
     heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
-    first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         contextlib.suppress(KeyboardInterrupt),
     ):
         log = WireLog(recording)
-        for each in chain([first] if first else [], heard):
+        for each in heard:
             log.write(each)
         if file.trouble():
             text = f"the recording {file.trouble()}; what is whole of it is shown"

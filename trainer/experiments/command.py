@@ -121,10 +121,9 @@ def run(arguments: argparse.Namespace) -> int:
     wanted = plan.units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
-    possible = [unit for unit in wanted if not plan.obstacle(unit, humans)]
-    reasons = {reason for unit in wanted if (reason := plan.obstacle(unit, humans))}
-    if reasons:
-        say(f"{len(wanted) - len(possible)} units left out: {'; '.join(sorted(reasons))}")
+    possible = [unit for unit in wanted if plan.is_possible(unit, humans)]
+    if left_out := len(wanted) - len(possible):
+        say(f"{left_out} units left out: {humans} holds no human model of their scenario")
     done, _ = store.find(possible)
     # The clock that the processes have, too.
     stop_at_s = deadline_s(arguments.max_minutes, time.time)

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bridge.report import GOAL, failed
-from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
 from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit
-from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+from trainer.experiments.run import TEST_COLUMNS, Store
 
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
@@ -396,26 +395,6 @@ def _ratio(above: BySeed, below: BySeed) -> BySeed:
 
 
 def load(store: Store, seeds: int, name: str = "all") -> Results:
-    """What there is of an experiment, or of all the paper's.
-
-    Raises UserError: a record lacks what this project writes.
-    """
+    """What there is of an experiment, or of all the paper's."""
     found, stale = store.find(plan.units_of([name], seeds))
-    for unit, record in found.items():
-        _check(unit, record, f"{store.records_file(unit.scenario)}: the record of {unit}")
-    return Results({unit: Result(unit, found[unit]) for unit in found}, seeds, stale)
-
-
-def _check(unit: Unit, record: Mapping[str, Any], named: str) -> None:
-    """Refuse a record whose columns are not there, or not of one length."""
-    tables: dict[str, tuple[Any, Collection[str]]]
-    tables = {name: (record["tests"].get(name), TEST_COLUMNS) for name in unit.conditions}
-    if unit.trained:
-        tables["training"] = record.get("training"), TRAINING_COLUMNS
-        tables["validation"] = record.get("validation"), VALIDATION_COLUMNS
-    for name, (columns, wanted) in tables.items():
-        if not isinstance(columns, dict) or not set(wanted) <= set(columns):
-            raise UserError(f"{named} lacks columns of {name}")
-        lengths = {len(columns[column]) for column in wanted}
-        if len(lengths) != 1 or lengths == {0}:
-            raise UserError(f"{named} is cut off in {name}")
+    return Results({unit: Result(unit, record) for unit, record in found.items()}, seeds, stale)

@@ -352,11 +352,9 @@ def decided(values: Mapping[str, Any], default: Any, left_out: Collection[str]) 
     }
 
 
-def obstacle(unit: Unit, humans: Path) -> str | None:
-    """Why a unit cannot be computed, in a few words; None where it can."""
-    if unit.needs_human and not (humans / unit.scenario / MODEL_FILE).is_file():
-        return f"there is no human model in {humans / unit.scenario}"
-    return None
+def is_possible(unit: Unit, humans: Path) -> bool:
+    """Whether the human model that it needs, if it does, is there."""
+    return not unit.needs_human or (humans / unit.scenario / MODEL_FILE).is_file()
 
 
 def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -105,10 +105,6 @@ class Store:
         name = plan.digest(plan.deciding(unit, self.plan, self.humans))
         return self.runs / f"{'-'.join(map(str, unit))}-{name}"
 
-    def lock(self, unit: Unit, patience_s: float = 0.0) -> AbstractContextManager[bool]:
-        """Hold a unit against other processes; gives whether that was possible."""
-        return util.held(self.run_dir(unit), patience_s)
-
     def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
         """All records of a scenario, current or not; none where there is no file.
 
@@ -135,7 +131,7 @@ class Store:
             record = records[unit.scenario].get(unit)
             if record is None:
                 continue
-            if plan.obstacle(unit, self.humans) or record["id"] != self.id(unit):
+            if not plan.is_possible(unit, self.humans) or record["id"] != self.id(unit):
                 stale.append(unit)
             else:
                 found[unit] = record
@@ -188,7 +184,7 @@ class Task:
 def compute(task: Task) -> str:
     """Compute a unit from where it stands into its record; how that ended."""
     unit, store = task.unit, task.store
-    with store.lock(unit, PATIENCE_S) as free:
+    with util.held(store.run_dir(unit), PATIENCE_S) as free:
         if not free:
             say(f"left to another process: {unit}")
             return BUSY
@@ -439,7 +435,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
     with ExitStack() as locks:
         waiting = {}
         for task in tasks:
-            if not locks.enter_context(task.store.lock(task.unit, PATIENCE_S)):
+            if not locks.enter_context(util.held(task.store.run_dir(task.unit), PATIENCE_S)):
                 ends[BUSY] += 1
             elif task.unit in task.store.find([task.unit])[0]:  # made elsewhere in the meantime
                 ends[FINISHED] += 1

@@ -23,7 +23,6 @@ LATE_ONES = 3  # So many recent failures, alone or after a late take-over, make 
 NEEDLESS_ONES, NEEDLESS_SHARE = 3, 2.0 / 3.0
 """At least so many recent episodes with take-overs, and this share of them, must be ones that the
 policy alone masters, to say that they were needless."""
-MOST_POINTS = 60  # Of a curve: every view carries it
 TYPICAL_FILE = Path(__file__).parent / "typical.json"
 
 Curve = list[tuple[float, float]]
@@ -101,12 +100,11 @@ class Coach:
         alone = self.curve[-1][1] if self.curve else None
         known = ([] if alone is None else [f"{alone:.0%}"]) + ["checking"] * self.checking
         advice = advise(list(self.episodes), alone, self._mastered) if self.learning else ""
-        thin = len(self.curve) // MOST_POINTS + 1
         return Coaching(
             advice=advice,
             said=said(cost, self.typical),
             alone=", ".join(known),
-            curve=[(round(x, 1), round(y, 3)) for x, y in self.curve[::-thin]][::-1],
+            curve=[(round(x, 1), round(y, 3)) for x, y in self.curve],
             typical=self.typical,
             human_s=cost["human_s"],
             episodes=list(self.episodes),

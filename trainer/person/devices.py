@@ -239,7 +239,7 @@ class Window:
     def poll(self, now_s: float) -> Reading:
         """Take what SDL has heard since the last call."""
         wishes: set[Wish] = set()
-        for event in pygame.event.get() if pygame.display.get_init() else ():
+        for event in pygame.event.get():
             self._hands.handle(event)
             if event.type == pygame.QUIT:
                 wishes.add("quit")
@@ -250,8 +250,6 @@ class Window:
 
     def show(self, view: View) -> None:
         """Draw everything anew."""
-        if not pygame.display.get_init():
-            return
         self._screen.fill(COLOURS["background"])
         self._scene(view)
         self._frames(view)
@@ -408,12 +406,11 @@ def _fitted(shape: tuple[int, int], room: tuple[float, float]) -> tuple[int, int
 @contextmanager
 def _quiet_stderr() -> Iterator[None]:
     """Drop what any thread writes to stderr meanwhile: without a screen, SDL writes many lines."""
-    sys.stderr.flush()
-    try:
-        kept = os.dup(2)
-    except OSError:  # It is closed anyway.
+    if sys.stderr is None:  # It is closed anyway.
         yield
         return
+    sys.stderr.flush()
+    kept = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:

@@ -31,8 +31,6 @@ from trainer.person.interface import Amount, Control, vector
 from trainer.training.learning import LearningThread
 
 TOPIC = "person/step"
-WIRE = ("phil/", "view/")
-"""Prefixes of the topics in a recording of the wire."""
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
@@ -164,11 +162,8 @@ def read_steps(path: Path) -> Iterator[Step]:
         if recording.damaged_places:
             return
         if channel.topic != TOPIC:
-            what = f"no recording of a sitting: it holds {channel.topic}"
-            if channel.topic.startswith(WIRE):
-                what = "a recording of the wire, as `bridge record` makes them: "
-                what += f"`python -m bridge view {path}` shows it"
-            raise UserError(f"{path} is {what}")
+            hint = f"`python -m bridge view {path}` shows one of the wire"
+            raise UserError(f"{path}, with {channel.topic}, is no recording of a sitting; {hint}")
         try:
             yield msgspec.msgpack.decode(message.data, type=Step)
         except msgspec.DecodeError as error:  # The chunk's checksum is right: no kill does that.

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.util import UserError
 from trainer.experiments import claims, data, report
 from trainer.experiments.guidance import best_by_rule, place_columns, typical_curves
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
@@ -326,17 +325,12 @@ def test_the_report_is_made_of_the_records_alone(store, monkeypatch):
     assert str(store.results.parent) not in page
 
 
-def test_records_of_other_settings_are_left_out_and_those_that_lack_something_refused(store):
+def test_records_of_other_settings_are_left_out(store):
     unit = Unit("left_turn", "ia_td3", NORMAL, 2)
-    record = synthetic(unit)
-    store.put(unit, {**record, "id": "of another time"})
+    store.put(unit, {**synthetic(unit), "id": "of another time"})
     results = data.load(store, 2)
     assert results.stale == [unit]
     assert not results.complete("left_turn", claims.IA, data.DISTANCE)
-    del record["validation"]["success"]
-    store.put(unit, {**record, "id": store.id(unit)})
-    with pytest.raises(UserError, match="lacks columns of validation"):
-        data.load(store, 2)
 
 
 def said(capsys, *arguments):

@@ -109,7 +109,7 @@ def test_two_processes_share_one_file_of_records_and_a_failure_is_one_units(stor
 
 def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
     monkeypatch.setattr(running, "PATIENCE_S", 0.0)
-    with store.lock(UNIT) as mine:
+    with running.util.held(store.run_dir(UNIT)) as mine:
         assert (mine, running.compute(running.Task(UNIT, store))) == (True, running.BUSY)
 
 

@@ -61,7 +61,7 @@ function see(next) {
   requestAnimationFrame(draw);
 }
 
-function enter({ scenario, controls }) {
+function enter({ scenario, controls, help }) {
   keyboard.controls = touch.controls = gamepads.controls = controls;
   gamepads.scenario = scenario;
   const { aside, along } = ways(controls);
@@ -72,6 +72,7 @@ function enter({ scenario, controls }) {
   }
   byId("pad").className = aside ? "level" : "upright";
   byId("pad").hidden = !aside && !along;
+  byId("help").replaceChildren(...help.map((text) => item(text)));
   changed(); // a key may be down already
 }
 
@@ -94,11 +95,6 @@ function draw() {
   byId("progress").textContent = view.progress;
   byId("message").textContent = view.paused ? view.message || "paused" : view.message;
   document.querySelector("[data-wish=pause]").textContent = view.paused ? "Go on" : "Pause";
-  const help = view.help.join("\n");
-  if (byId("help").dataset.text !== help) {
-    byId("help").dataset.text = help;
-    byId("help").replaceChildren(...view.help.map((text) => item(text)));
-  }
   showWho();
 }
 

@@ -62,11 +62,11 @@ WRONG = [
     (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
     (HUMAN, ("{tmp}",), "no recording in"),
     (HUMAN, ("{tmp}/file",), "is no MCAP recording"),
-    (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows it"),
+    (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows one"),
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
     (HUMAN, (MINE, "--label-every-step"), "asks the scripted expert"),
-    (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is a recording of the wire"),
+    (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is no recording of a sitting"),
 ]
 
 
