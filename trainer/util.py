@@ -104,7 +104,7 @@ def load_torch(path: Path) -> dict[str, Any]:
 
     try:
         with open_regular(path) as stream:
-            state = torch.load(stream, map_location="cpu", weights_only=True)
+            state = torch.load(stream, map_location="cpu", weights_only=True)  # noqa: TID251
         if not isinstance(state, dict):
             raise TypeError(type(state))
         return state

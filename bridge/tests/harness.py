@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +26,22 @@ from bridge.record import RecordingWriter
 from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, exit_status, wait_until
+from edge_runtime.tests.harness import (
+    PATIENCE_S,
+    CommandProcess,
+    EdgeProcess,
+    exit_status,
+    wait_until,
+)
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.wire import Command, Feedback, State, decode_state
+from edge_runtime.wire import Feedback, State, decode_state
 
 TOY = "bridge.tests.toy:BridgeToy-v0"
 SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
 SLOW_TOY = "bridge.tests.toy:BridgeToySlow-v0"
 
 
-class BridgeProcess:
-    """``python -m bridge`` with a subcommand; killed at the end of the block if need be."""
-
-    def __init__(self, *arguments: str, environment: dict[str, str] | None = None) -> None:
-        self.process: Any = subprocess.Popen(
-            [sys.executable, "-m", "bridge", *arguments], stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True, env={**os.environ, **(environment or {})},
-        )  # fmt: skip
-        self.output, self.errors = "", ""
-
-    def wait(self, timeout_s: float = 60.0) -> int:
-        """Return the exit status; ``output`` and ``errors`` hold what was printed."""
-        self.output, self.errors = self.process.communicate(timeout=timeout_s)
-        return self.process.returncode
-
-    def __enter__(self) -> BridgeProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.communicate()
+BridgeProcess = partial(CommandProcess, "bridge")
 
 
 def start_edge(endpoint, policy, *options, stderr=subprocess.PIPE) -> EdgeProcess:
@@ -70,8 +55,7 @@ def bridge_status(arguments: list[str]) -> int:
 
 
 def wait_until_driving(edge: EdgeProcess) -> None:
-    log: Any = edge.process.stderr
-    wait_until(lambda: "now=drive" in log.readline(), "the first drive")
+    wait_until(lambda: "now=drive" in edge.process.stderr.readline(), "the first drive")
 
 
 def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
@@ -87,7 +71,7 @@ def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
     wait_until(steady, "a steady drive")
 
 
-def refused(run: BridgeProcess, out: Path, *parts: str) -> None:
+def refused(run: CommandProcess, out: Path, *parts: str) -> None:
     """Assert that it ends with status 2 and one line, which holds the parts, and writes nothing."""
     assert run.wait() == 2
     (line,) = run.errors.splitlines()
@@ -101,12 +85,12 @@ def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
     return path
 
 
-def start_simulate(endpoint: str, out: Path, env: str, *options: str, **more: Any) -> BridgeProcess:
+def start_simulate(endpoint, out, env, *options, **more) -> CommandProcess:
     fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
     return BridgeProcess(*fixed, *options, **more)
 
 
-def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
+def start_record(endpoint: str, path: Path, *options: str) -> CommandProcess:
     """Start ``python -m bridge record``, and wait until there is a recording."""
     run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
     # A file is made before its first bytes are in it.
@@ -190,15 +174,6 @@ def read(path: Path) -> dict[str, Any]:
 def rerun(*arguments: str) -> str:
     command = [sys.executable, "-m", "rerun_cli", *arguments]
     return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
-
-
-def make_command(step: int, **changes: Any) -> Command:
-    """Make a valid command of session ``here``, episode 0; ``changes`` replace its fields."""
-    fields: dict[str, Any] = {
-        "session": "here", "episode": 0, "step": step, "mode": "drive", "action": [0.5],
-        "policy_id": "p", "received_ns": 1, "inference_ns": 1, "sent_ns": 1,
-    }  # fmt: skip
-    return Command(**{**fields, **changes})
 
 
 def make_feedback(step: int, **changes: Any) -> Feedback:

@@ -11,23 +11,22 @@ import pytest
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
-from bridge.ports import connect_client
 from bridge.tests.harness import (
-    SHORT_TOY,
+    SLOW_TOY,
     decoded,
-    make_command,
     make_feedback,
     make_policy,
     read,
     start_edge,
     start_simulate,
+    wait_until_driving_steadily,
 )
 from bridge.virtual_link import NO_COMMAND
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.tests.harness import PATIENCE_S, make_command, make_state, wait_until
 from edge_runtime.tests.policies import TASK, T
 from edge_runtime.util import UserError
-from edge_runtime.wire import Feedback, decode_feedback, encode
+from edge_runtime.wire import encode
 
 
 def test_what_an_action_raises_reaches_the_caller():
@@ -113,20 +112,6 @@ def test_a_command_acts_as_late_as_the_latency_says(spec, expected):
     if spec == "50ms":  # The latency that is reported is the virtual one.
         assert all(100 <= latency_ms < 150 for latency_ms in rig.clock.latencies_ms)
         assert len(rig.clock.latencies_ms) == 5
-
-
-EVERYTHING = (
-    "60ms+-40ms,tail=pareto,loss=5%,burst=3,reorder=5%,duplicate=5%,rate=2Mbit/s,outage=0.3s/2s"
-)
-
-
-@pytest.mark.parametrize("spec", ["60ms+-40ms,loss=10%", EVERYTHING])
-def test_the_same_seed_is_the_same_run_and_another_seed_another(spec):
-    first, again, other = (Rig(spec) for _ in range(3))
-    runs = [used(rig.drive(100, seed)) for rig, seed in ((first, 3), (again, 3), (other, 4))]
-    assert runs[0] == runs[1] != runs[2]
-    assert first.published == again.published != other.published
-    assert first.check.rejected == again.check.rejected
 
 
 def test_jitter_reorders_and_the_overtaken_state_is_not_waited_for():
@@ -232,6 +217,7 @@ def test_in_real_time_all_is_delayed_duplicated_and_lost_from_the_episodes_start
         assert rig.published == [step for step in range(7) for _ in range(2)]
         assert 6 <= rig.check.rejected["stale"] <= 7
         assert len(rig.clock.latencies_ms) == 7
+        assert min(rig.clock.latencies_ms) >= 10.0
 
 
 def test_in_real_time_a_stall_is_counted_and_not_caught_up():
@@ -269,10 +255,14 @@ def test_each_tick_ends_with_what_the_vehicle_did_in_it():
         began_s = time.monotonic()
         decisions = rig.drive(4)
         assert time.monotonic() - began_s >= 4 * T
+        assert rig.clock.rejected() == {}
+        for bad in (b"\xff", encode(make_feedback(0, session="stranger"))):
+            rig.clock.receive_feedback(bad)
+        wait_until(lambda: rig.clock.rejected().total() == 2, "both to be counted")
+    assert rig.clock.rejected() == {"feedback_malformed": 1, "feedback_foreign_session": 1}
     assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
     assert reasons(decisions) == [""] * 4
     assert all(0 < age_ms < 200 for age_ms in rig.clock.feedback_ages_ms)
-    assert rig.check.rejected == {}
 
 
 def test_what_a_vehicle_says_before_the_first_episode_is_in_no_report():
@@ -315,45 +305,16 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
     assert rig.clock.moving_starts == 1
 
 
-@contextlib.contextmanager
-def stranger(endpoint):
-    """Hears the vehicle's feedback, and sends it again, with more that nobody can believe.
-
-    A call says whether the vehicle has got as far as a step of the first episode.
-    """
-    key, heard = "phil/hunter01/feedback", []
-
-    def hear(sample):
-        payload = sample.payload.to_bytes()
-        feedback: Any = decode_feedback(payload)
-        if not isinstance(feedback, Feedback) or feedback.vehicle != "mock" or payload in heard:
-            return
-        heard.append(payload)
-        if feedback.session:
-            other = make_feedback(0, session="stranger", sent_ns=feedback.sent_ns + 1)
-            for bad in (payload, encode(other), b"\xff", heard[0]):
-                session.put(key, bad)
-
-    def is_at(step):
-        feedback: Any = decode_feedback(heard[-1]) if heard else make_feedback(-1)
-        return (feedback.episode, feedback.step) >= (0, step)
-
-    with contextlib.closing(connect_client(endpoint, PATIENCE_S)) as session:
-        subscriber = session.declare_subscriber(key, hear)
-        yield is_at
-        subscriber.undeclare()
-
-
-def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
+def test_the_car_does_what_the_vehicle_did(tmp_path):
     policy, endpoint = make_policy(tmp_path, "constant", 0.3), free_endpoint()
-    out = tmp_path / "report.json"
+    out, log = tmp_path / "report.json", tmp_path / "edge.log"
     options = ("--clock", "realtime", "--loop", "vehicle")
     with (
-        start_simulate(endpoint, out, SHORT_TOY, *options) as run,
-        start_edge(endpoint, policy, "--vehicle", "mock") as edge,
-        stranger(endpoint) as is_at,
+        start_simulate(endpoint, out, SLOW_TOY, *options) as run,
+        log.open("w") as errors,
+        start_edge(endpoint, policy, "--vehicle", "mock", stderr=errors) as edge,
     ):
-        wait_until(lambda: is_at(12), "the middle of the episode")
+        wait_until_driving_steadily(log, 2.0)
         edge.process.kill()
         assert run.wait() == 0, run.errors
     report = read(out)
@@ -367,9 +328,6 @@ def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
     assert vehicle["action_error"]["pedal"]["max"] > 0.1
     # A vehicle that takes pedals has no speed set-point.
     assert vehicle["speed_error_mps"] == {"rmse": None, "max": None}
-    rejected = report["rejected_by_simulator"]
-    assert set(rejected) >= {f"feedback_{r}" for r in ("malformed", "foreign_session", "stale")}
-    assert rejected["feedback_malformed"] >= 10
     # Nobody reports after a kill: the car brakes, and the report says why.
     last = report["safe_stop_events"][-1]
     assert (last["episode"], last["reason"]) == (0, NO_FEEDBACK)

@@ -19,7 +19,7 @@ from bridge.tests import harness
 from bridge.tests.test_recording import heard
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.harness import make_command, make_state
 from edge_runtime.tests.policies import TASK
 from edge_runtime.wire import encode
 
@@ -51,7 +51,7 @@ def recorded(path, task):
                 ours = {"mode": mode, "action": [step / 4, -0.5]}
                 if (episode, step) == (0, 2):
                     ours["plan"] = [[0.5, 0.5]]
-                done = harness.make_command(step, **place, **ours)
+                done = make_command(step, **place, **ours)
                 writer.write(heard("command", encode(done)))
     return path
 

@@ -38,7 +38,6 @@ from bridge.tests.harness import (
     chunks,
     flip,
     flip_chunk,
-    make_command,
     make_policy,
     messages_of,
     read,
@@ -56,7 +55,7 @@ from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.tests.harness import PATIENCE_S, make_command, make_state, wait_until
 from edge_runtime.tests.policies import SIZE, TASK
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError

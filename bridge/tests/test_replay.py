@@ -7,10 +7,10 @@ import pytest
 from bridge.messages import Heard
 from bridge.record import RecordingWriter
 from bridge.replay import Answer, Exchange, compare
-from bridge.tests.harness import BridgeProcess, bridge_status, make_command, make_policy, start_edge
+from bridge.tests.harness import BridgeProcess, bridge_status, make_policy, start_edge
 from bridge.tests.test_inbound import health
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import BLACK, WHITE, frames, make_state
+from edge_runtime.tests.harness import BLACK, WHITE, frames, make_command, make_state
 from edge_runtime.wire import encode
 
 EPOCH_NS = 1_700_000_000 * 10**9

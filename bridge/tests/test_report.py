@@ -12,7 +12,6 @@ from bridge import report as reports
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
-    make_command,
     make_feedback,
     make_policy,
     start_edge,
@@ -21,6 +20,7 @@ from bridge.tests.harness import (
 )
 from edge_runtime.__main__ import main as edge_main
 from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.harness import make_command
 
 RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
 
@@ -196,6 +196,7 @@ def test_a_speed_is_compared_with_its_set_point_at_the_same_moment():
 
 def test_what_was_not_measured_is_none():
     none = {"rmse": None, "max": None}
+    assert set(reports.quantiles([]).values()) == {None}
     report = log_of(lambda time_s: 0.5).report(["pedal"])
     assert report["speed_error_mps"] == none
     assert (report["lag_ms"]["speed"], report["scale"]) == (None, None)

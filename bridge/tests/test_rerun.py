@@ -27,7 +27,7 @@ from bridge.tests import harness
 from bridge.tests.toy import ToyEnv
 from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import HEALTH, make_state, wait_until
+from edge_runtime.tests.harness import HEALTH, make_command, make_state, wait_until
 from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
 from edge_runtime.wire import encode
@@ -221,18 +221,18 @@ def test_a_late_viewer_does_not_call_it_silence(log, events):
 
 
 def test_the_time_between_two_episodes_is_no_silence(log, events):
-    log.write_command(harness.make_command(50), 10**18)
+    log.write_command(make_command(50), 10**18)
     log.write_state(make_state(1, episode=1), 10**18 + 10**9)
     assert events == ["drive"]
 
 
 def test_a_ride_is_shown_and_no_silence(log, events):
     log.write_state(make_state(7), 10**18)
-    log.write_command(harness.make_command(7, plan=[[0.1]] * 5), 10**18)
+    log.write_command(make_command(7, plan=[[0.1]] * 5), 10**18)
     for step, ridden in ((8, 0), (9, 1), (10, 2)):
         log.write_state(make_state(step), 10**18 + (step - 7) * 10**8)
         log.write_scene(make_scene(ridden=ridden), 10**18)
-    log.write_command(harness.make_command(10), 10**18)
+    log.write_command(make_command(10), 10**18)
     assert events == ["drive", "drive: rides on the plan", "drive"]
 
 
@@ -269,7 +269,7 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(log, kept):
         sent_ns = 10**18 + step * 100 * ms
         log.write_state(make_state(step, session="here", sent_ns=sent_ns), sent_ns)
         received_ns = sent_ns + (20 + step) * ms
-        command = harness.make_command(
+        command = make_command(
             step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
         )
         log.write_command(command, received_ns)

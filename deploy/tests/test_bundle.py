@@ -411,14 +411,6 @@ def test_any_one_byte_changed_is_found(bundle):
     assert taken < 3
 
 
-@pytest.mark.parametrize("size", [0, 1, 512, -512])
-def test_a_part_of_it_or_more_is_refused(bundle, size):
-    whole = bundle.read_bytes()
-    for data in (whole[:size], whole + bytes(abs(size) + 1)):
-        bundle.write_bytes(data)
-        refused(bundle)
-
-
 def test_another_key_a_signature_for_something_else_and_none_are_refused(bundle, monkeypatch):
     data = bundle.read_bytes()
     write(bundle, data, Ed25519PrivateKey.generate())

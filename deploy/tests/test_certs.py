@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from deploy.__main__ import main
 from deploy.certs import _make_authority, _pem, _write_folder, issue, read_authority
 from edge_runtime.tests.harness import exit_status
-from edge_runtime.tls import load_tls, tls_for
+from edge_runtime.tls import load_tls
 from edge_runtime.util import UserError
 
 PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
@@ -164,15 +164,6 @@ def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
     (party / "key.pem").write_bytes(_pem(issued.key))
     with pytest.raises(UserError, match=match):
         load_tls(party)
-
-
-def test_plain_endpoints_and_certificates_do_not_go_together(made):
-    assert tls_for(None, "tcp/127.0.0.1:7447", None) is None
-    assert tls_for(made / "viewer", "tls/127.0.0.1:7447") is not None
-    with pytest.raises(UserError, match="plain text despite --tls: write tls/127"):
-        tls_for(made / "viewer", "tcp/127.0.0.1:7447")
-    with pytest.raises(UserError, match="needs certificates"):
-        tls_for(None, "tls/127.0.0.1:7447")
 
 
 def test_a_pair_fits_together_is_private_and_never_overwritten(tmp_path, capsys):

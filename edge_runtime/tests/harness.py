@@ -11,7 +11,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, List, Optional
 
 import zenoh
 
@@ -42,11 +42,13 @@ def make_state(step: int, **changes: Any) -> State:
     return State(**{**fields, **changes})
 
 
-def make_command(mode: str = "drive", step: int = 0, action: Sequence[float] = (0.5,)) -> Command:
-    return Command(
-        session="s", episode=0, step=step, mode=mode, action=list(action), policy_id="p",
-        received_ns=0, inference_ns=0, sent_ns=0,
-    )  # fmt: skip
+def make_command(step: int = 0, **changes: Any) -> Command:
+    """A valid command to drive; `changes` replace its fields."""
+    fields: Dict[str, Any] = {
+        "session": "here", "episode": 0, "step": step, "mode": "drive", "action": [0.5],
+        "policy_id": "p", "received_ns": 1, "inference_ns": 1, "sent_ns": 1,
+    }  # fmt: skip
+    return Command(**{**fields, **changes})
 
 
 HEALTH = Health(
@@ -68,31 +70,41 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
     raise AssertionError(f"not within {timeout_s} s: {what}")
 
 
-class EdgeProcess:
+class CommandProcess:
+    """``python -m`` with these arguments; killed at the end of the block if need be."""
+
     def __init__(
         self, *arguments: str, python: str = sys.executable, environment: Any = (), **options: Any
     ) -> None:
-        command = [python, "-m", "edge_runtime", "run", *arguments]
-        options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
-        self.process: subprocess.Popen = subprocess.Popen(
-            command, env={**os.environ, **dict(environment)}, **options
-        )
-        assert self.process.stdout is not None
-        self.ready_line = self.process.stdout.readline().strip()
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        words, variables = [python, "-m", *arguments], {**os.environ, **dict(environment)}
+        self.process: Any = subprocess.Popen(words, env=variables, **{**pipes, **options})
 
-    def end(self) -> int:
-        """SIGTERM, then the exit status. Afterwards `log` holds its stderr."""
-        self.process.terminate()
-        _, self.log = self.process.communicate(timeout=PATIENCE_S)
+    def wait(self, timeout_s: float = 60.0) -> int:
+        """The exit status; `output` and `errors` hold what it printed."""
+        self.output, self.errors = self.process.communicate(timeout=timeout_s)
         return self.process.returncode
 
-    def __enter__(self) -> EdgeProcess:
+    def end(self) -> int:
+        """SIGTERM, then the exit status."""
+        self.process.terminate()
+        return self.wait(PATIENCE_S)
+
+    def __enter__(self):
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             self.process.kill()
         self.process.communicate()
+
+
+class EdgeProcess(CommandProcess):
+    """An edge runtime that has printed its first line."""
+
+    def __init__(self, *arguments: str, **options: Any) -> None:
+        super().__init__("edge_runtime", "run", *arguments, **options)
+        self.ready_line = self.process.stdout.readline().strip()
 
 
 class Simulator:

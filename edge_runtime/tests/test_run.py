@@ -1,7 +1,6 @@
 """The real process against a real simulator session. Limits are loose: machines are busy."""
 
 import contextlib
-import fcntl
 import gc
 import itertools
 import json
@@ -82,7 +81,7 @@ def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulat
     begun_s = time.monotonic()
     assert edge.end() == 0
     assert time.monotonic() - begun_s < 5.0
-    assert "Traceback" not in edge.log
+    assert "Traceback" not in edge.errors
     wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
 
 
@@ -123,18 +122,8 @@ def test_a_policy_that_answers_nan_stops_and_drives_again_when_it_answers(edge_a
         assert found == ("safe_stop", "output_not_finite", [-1.0])
     assert "drive" in {command.mode for command in drive(simulator, range(9, 29))}
     assert edge.end() == 0
-    assert "reason=output_not_finite" in edge.log
-    assert "Traceback" not in edge.log
-
-
-def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
-    _, simulator = edge_and_simulator("slow")
-    assert simulator.ask(make_state(0)).mode == "drive"
-    simulator.send(make_state(1, **WHITE_FRAMES))
-    command = command_of_reason(simulator, "inference_too_long")
-    assert (command.mode, command.step) == ("safe_stop", 1)
-    assert simulator.next_command().mode == "safe_stop"
-    assert last_health(simulator, lambda h: h.deadline_misses >= 1)
+    assert "reason=output_not_finite" in edge.errors
+    assert "Traceback" not in edge.errors
 
 
 def test_bad_states_are_counted_by_reason_and_not_answered(edge_and_simulator):
@@ -242,46 +231,8 @@ def test_it_says_that_the_simulator_is_there_for_another_vehicle(make_policy):
     words = f"{endpoint} is there, and has sent no state for vehicle id hunter01"
     flags = [*make_policy().flags, "--connect", endpoint]
     with Simulator(endpoint, "hunter02"), EdgeProcess(*flags) as edge:
-        assert edge.process.stderr is not None
         assert words in next(line for line in edge.process.stderr if " waiting " in line)
         assert edge.end() == 0
-
-
-def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
-    endpoint = free_endpoint()
-    with EdgeProcess(*make_policy().flags, "--connect", endpoint):
-        for session in ("first", "second"):
-            with Simulator(endpoint) as simulator:
-                simulator.wait_for_edge()
-                assert simulator.ask(make_state(0, session=session)).session == session
-            time.sleep(3 * T)
-
-
-def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
-    settings, steps, hold = tmp_path / "edge.toml", itertools.count(), tmp_path / "hold"
-    settings.write_text(f"vehicle = 'mock'\nhold = '{hold}'\n")
-    installer = hold.open("w")
-    fcntl.flock(installer, fcntl.LOCK_EX)
-    edge, simulator = edge_and_simulator("constant", "--config", str(settings))
-
-    def feed(count):
-        for step in itertools.islice(steps, count):
-            simulator.send(make_state(step))
-            time.sleep(0.05)
-
-    feed(10)
-    assert wait_until(lambda: simulator.health[-1].accepted, "accepted states")
-    assert simulator.commands.empty()
-    # The vehicle has taken no command: its feedback names the last one.
-    assert {feedback.step for feedback in simulator.feedback} == {-1}
-    answer = simulator.query("rearm")
-    assert not answer["accepted"]
-    assert "installer" in answer["detail"]
-    installer.close()
-    feed(6)
-    assert simulator.next_command().session == "simulator-a"
-    assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
-    assert edge.end() == 0
 
 
 def test_a_vehicle_is_armed_inside_its_policys_envelope_only(edge_and_simulator):

@@ -157,7 +157,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         assert systemd.next() == "WATCHDOG=1"
         assert edge.end() == 0
         assert systemd.until("STOPPING") == "STOPPING=1"
-    lines = [json.loads(line) for line in edge.log.splitlines()]
+    lines = [json.loads(line) for line in edge.errors.splitlines()]
     assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
@@ -273,6 +273,12 @@ def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running,
         assert (said.mode, said.reason) == ("safe_stop", "policy_thread_dead")
     assert control.health().deadline_misses == 0
     assert "restart" in control._rearm()
+
+
+def test_on_hold_nobody_re_arms_it(running):
+    control, *_ = running(Notifier({}))
+    control._hold = MagicMock(**{"refusal.return_value": "the installer holds it"})
+    assert control._rearm() == "the installer holds it"
 
 
 def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):

@@ -58,14 +58,6 @@ def test_no_key_of_another_vehicle_is_in_reach_and_the_rest_is_denied():
     assert tls.rules_for_listener(["a", "a"]) == tls.rules_for_listener(["a"])
 
 
-def test_an_edge_takes_states_from_its_simulator_or_a_router_only():
-    config = tls.rules_for_edge("a")
-    assert [p["subjects"] for p in config["policies"]] == [["simulator-a"], ["router"]]
-    assert allowed(config, "simulator-a", "put", "ingress") == {"phil/a/state"}
-    assert allowed(config, "router", "query", "ingress") == {"phil/a/status", "phil/a/rearm"}
-    assert "phil/a/command" in allowed(config, "simulator-a", "put", "egress")
-
-
 def test_the_table_knows_every_topic_of_the_wire():
     columns = [column for rights in tls.ROLES.values() for column in rights[:6]]
     named = {suffix.split("/")[0] for column in columns for suffix in column}

@@ -173,7 +173,7 @@ def test_a_command_not_taken_is_a_fault_until_one_is(vehicle, runner, broken, ac
         wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "the feedback")
     vehicle.broken = ""
     # A stop is one whatever stands beside it.
-    runner.command(make_command("safe_stop", step=1, action=action))
+    runner.command(make_command(1, mode=SAFE_STOP, action=action))
     wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
     assert vehicle.asked == asked
 
@@ -181,7 +181,7 @@ def test_a_command_not_taken_is_a_fault_until_one_is(vehicle, runner, broken, ac
 def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):
     vehicle.hang()
     runner.command(make_command())
-    runner.command(make_command("safe_stop", step=1))
+    runner.command(make_command(1, mode=SAFE_STOP))
     wait_until(lambda: runner.fault(time.monotonic()) == SILENT, "the fault")
     assert vehicle.asked == []
     vehicle.go_on()
@@ -217,12 +217,12 @@ def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
 
 def test_a_stop_from_before_the_rearm_does_not_undo_it(vehicle, runner):
     vehicle.hang()
-    runner.command(make_command("safe_stop"))
+    runner.command(make_command(mode=SAFE_STOP))
     runner.enable()
-    runner.command(make_command("safe_stop", step=1), latch=False)
+    runner.command(make_command(1, mode=SAFE_STOP), latch=False)
     vehicle.go_on()
     wait_until(lambda: vehicle.asked == ["enable", "stand"], "the order of things")
-    runner.command(make_command("safe_stop"))
+    runner.command(make_command(mode=SAFE_STOP))
     wait_until(lambda: vehicle.asked == ["enable", "stand", "brake"], "a stop after it does")
 
 
@@ -249,7 +249,7 @@ def test_a_command_that_waited_too_long_moves_nothing(vehicle, runner):
     count = len(runner.heard)
     wait_until(lambda: len(runner.heard) > count + 1, "feedback again")
     assert vehicle.asked == []
-    runner.command(make_command(step=1), scenario_speed_mps=4.5)
+    runner.command(make_command(1), scenario_speed_mps=4.5)
     wait_until(lambda: vehicle.asked == ["command"], "a fresh one to be obeyed")
     assert vehicle.scenario_speed_mps == 4.5
 

@@ -137,7 +137,7 @@ def rejected(decode, fields):
     ],
 )
 def test_a_bad_command_is_rejected_by_reason(action, mode, found):
-    command = make_command(mode, action=action)
+    command = make_command(mode=mode, action=action)
     assert wire.decode_command(wire.encode(command)) == (found or command)
 
 

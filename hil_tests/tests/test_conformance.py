@@ -146,9 +146,3 @@ def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
     with chassis.process:
         status = exit_status(main, ["conformance", "--config", str(config)])
     assert status == 0, capsys.readouterr().out
-
-
-def test_no_vehicle_and_no_driver_are_one_line(capsys):
-    for words, said in (([], "name it with --vehicle"), (["--vehicle", "tank"], "'tank' is not")):
-        assert exit_status(main, ["conformance", *words]) == 2
-        assert said in capsys.readouterr().err

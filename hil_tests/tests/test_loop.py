@@ -16,6 +16,11 @@ from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes
 
+CONTRACT_KEYS = """
+scenario condition episodes policy_id seed success_rate collision_rate surviving_distance_m
+episode_reward episode_time_s lateral_acceleration_mps2 longitudinal_acceleration_mps2
+latency_ms deadline_misses safe_stops rejected
+"""
 NONE, LATE = "none", "100ms"
 BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s,rate=1Mbit/s"
 
@@ -41,6 +46,9 @@ def test_lock_step_is_the_drive_in_process_to_the_bit(tmp_path, scenario, condit
     with start_edge(endpoint, policy):
         report = simulate_undisturbed(tmp_path, endpoint, scenario, options)
     assert (report["scenario"], report["condition"]) == (scenario, condition)
+    assert set(report) >= set(CONTRACT_KEYS.split())
+    assert spec != NONE or (report["rejected"], report["missed_ticks"]) == ({}, 0)
+    assert (report["command_age_ms"]["max"] > 0.0) == (spec != NONE)  # In virtual time
     assert (report["deadline_misses"] > 0) == (spec != NONE)
     assert (report["safe_stops"] > 0) == (spec == BAD)
     for ours, theirs in zip(report["per_episode"], wanted, strict=True):

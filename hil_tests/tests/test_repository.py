@@ -46,17 +46,6 @@ DOORS = {
     "pycdr2": ROOT / "edge_runtime/vehicles/ros2/node.py",
 }
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""
-UNSAFE = re.compile(
-    r"""^(import|from)\ .*\b(pickle|cPickle|_pickle|marshal|shelve|dill|cloudpickle|joblib)\b
-    | ^(eval|exec|compile|__import__)\(
-    | ^torch\.load\((?!.*weights_only=True)
-    | ^yaml\.(load|load_all|unsafe_load|full_load)\((?!.*Loader=(\w+\.)?C?SafeLoader)
-    | \ballow_pickle=(?!False)
-    | \.(read|to)_pickle\(
-    | \bshell=(?!False)""",
-    re.VERBOSE | re.DOTALL,
-)
-"""Imports and calls, as Python writes them, that run what they read."""
 ELSEWHERE = {"ray", "pycdr2", "av", "pyarrow", "foxglove"}
 ELSEWHERE |= {"stable_baselines3", "pytest", "hypothesis"}
 """Extras, and what the peers' environment has."""
@@ -70,14 +59,9 @@ def sources(folder: str) -> list[Path]:
 
 
 @cache
-def tree_of(path: Path) -> ast.AST:
-    return ast.parse(path.read_text())
-
-
-@cache
 def imported(path: Path) -> frozenset[str]:
     names: set[str] = set()
-    for node in ast.walk(tree_of(path)):
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -85,14 +69,8 @@ def imported(path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
-def faults(tree: ast.AST) -> list[str]:
-    kinds = (ast.Import, ast.ImportFrom, ast.Call)
-    lines = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, kinds)]
-    return [line for line in lines if UNSAFE.search(line)]
-
-
 @pytest.mark.parametrize("folder", ARROWS)
-def test_a_folder_imports_only_what_stands_below_it_and_runs_nothing_that_it_reads(folder):
+def test_a_folder_imports_only_what_stands_below_it(folder):
     files = sources(folder)
     assert files
     heavy = {library for library, folders in ONLY_IN.items() if folder not in folders}
@@ -100,7 +78,6 @@ def test_a_folder_imports_only_what_stands_below_it_and_runs_nothing_that_it_rea
         neighbours = imported(path) & set(ARROWS) - {folder}
         assert neighbours <= ARROWS[folder], path
         assert not imported(path) & heavy, path
-        assert faults(tree_of(path)) == [], path
 
 
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
@@ -132,27 +109,6 @@ def test_what_drives_any_policy_knows_none_of_ours(folder):
     assert OURS.search("T = 0.1") is not None
     for path in sources(folder):
         assert OURS.search(path.read_text()) is None, path
-
-
-def test_the_checks_can_fail(tmp_path):
-    bad = tmp_path / "bad.py"
-    bad.write_text("def f():\n    from trainer import x\n    import torch.nn\n")
-    assert imported(bad) == {"trainer", "torch"}
-    for line in (
-        "import pickle", "from marshal import loads", "import cloudpickle as c", "eval(text)",
-        "exec(open(p).read())", "torch.load(p)", "torch.load(p, weights_only=False)",
-        "torch.load(p, weights_only=flag)", "np.load(p, allow_pickle=True)",
-        "numpy.load(p, allow_pickle=flag)", "yaml.load(text)",
-        "yaml.load(text, Loader=yaml.FullLoader)", "pandas.read_pickle(p)",
-        "subprocess.run(text, shell=True)",
-    ):  # fmt: skip
-        assert faults(ast.parse(f"def f():\n    {line}\n")), line
-    for line in (
-        "model.eval()", "re.compile(text)", "torch.compile(model)",
-        "torch.load(p, weights_only=True)", "np.load(p)",
-        "yaml.load(text, Loader=yaml.SafeLoader)", "subprocess.run([name])",
-    ):  # fmt: skip
-        assert not faults(ast.parse(line)), line
 
 
 LEAST_WRITING = {"edge_runtime": 2, "bridge": 6, "trainer": 7, "deploy": 4, "hil_tests": 5}

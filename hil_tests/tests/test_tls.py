@@ -139,8 +139,7 @@ def test_our_own_line_says_why(parties, endpoint, mode):
 def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, tmp_path):
     plain = endpoint.replace("tls/", "tcp/")
     with EdgeProcess(*edge_flags(plain, tmp_path)) as edge:
-        log: Any = edge.process.stderr
-        line = next(line for line in log if " waiting " in line)
+        line = next(line for line in edge.process.stderr if " waiting " in line)
         assert f"{plain} listens with TLS and wants --tls" in line
         assert edge.end() == 0
     place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
@@ -254,7 +253,7 @@ def drive_among(intruders, endpoint, flags, folder):
             loot = {name: (each.heard, each.ask()) for name, each in present.items()}
         assert run.wait() == 0, run.errors
         assert edge.end() == 0
-    return read(out), edge.log, loot
+    return read(out), edge.errors, loot
 
 
 def test_episodes_over_mutual_tls_among_intruders(parties, tmp_path):
@@ -339,7 +338,7 @@ def test_a_forged_token_of_another_vehicle_ends_no_edge(parties, tmp_path, is_th
         edge = edge or opened.enter_context(EdgeProcess(*flags))
         time.sleep(4 * SETTLE_S)  # it looks twice within a second of the link
         assert edge.end() == 0
-    assert "another" not in edge.log
+    assert "another" not in edge.errors
 
 
 @pytest.mark.parametrize("who", ["simulator-hunter01", "router"])

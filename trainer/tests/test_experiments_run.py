@@ -16,7 +16,7 @@ from trainer.evaluation import CONDITIONS
 from trainer.experiments import guidance
 from trainer.experiments import plan as planned
 from trainer.experiments import run as running
-from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
+from trainer.learner.config import ALGORITHMS
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
 from trainer.training.run import TrainingRun
@@ -215,18 +215,6 @@ class TestPlan:
         assert [unit.seed for unit in first] == sorted(unit.seed for unit in first)
         assert units[44].setting == "biased"
 
-    def test_the_settings_are_what_they_say(self, store):
-        write_human(store)
-        units = {setting: GUIDED._replace(setting=setting) for setting in planned.SETTINGS}
-        of = {name: planned.run_config(units[name], planned.PLAN, store.humans) for name in units}
-        papers = {setting for setting, *_ in planned.LINES}
-        assert (papers | set(planned.HUMANS), len(papers & set(planned.HUMANS))) == (set(of), 0)
-        assert of["one_frame"].learner.frames == 1
-        assert of["printed"].learner == PRINTED_LEARNER
-        assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
-        assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
-        assert {each.steps for each in of.values()} == {planned.PLAN.steps["left_turn"]}
-
     def test_the_table_of_guidance_has_every_row_with_every_human_and_none_of_the_papers(self):
         units = planned.units_of([planned.GUIDANCE], 5)
         assert len(set(units)) == len(units)
@@ -242,20 +230,6 @@ class TestPlan:
             assert config.human == paths.get(unit.setting, unit.scripted_human)
             row = {**ALGORITHMS[unit.algorithm].settings, **planned.TUNED.get(unit.algorithm, {})}
             assert {name: getattr(config.learner, name) for name in row} == row
-
-
-def test_the_table_of_guidance_has_its_own_humans_and_its_own_tuning(monkeypatch):
-    def config(setting):
-        unit = planned.Unit("left_turn", "phil_td3", setting, 1)
-        return planned.run_config(unit, planned.GUIDANCE_PLAN, Path("humans"))
-
-    before = [config(setting) for setting in ("good", "normal")]
-    assert config("slower").human == "trainer.human.left_turn:SlowHuman"
-    assert config("late").human == config("good").human == "expert"
-    monkeypatch.setitem(planned.TUNED, "phil_td3", {"cloning_weight": 3.0})
-    good, normal = (config(setting) for setting in ("good", "normal"))
-    assert (good.learner.cloning_weight, normal) == (3.0, before[1])
-    assert good != before[0]
 
 
 def test_a_foreign_task_is_learned_and_reported_beside_its_expert(tmp_path, one_thread):

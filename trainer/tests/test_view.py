@@ -25,7 +25,6 @@ from trainer.learner.config import LearnerConfig
 from trainer.person.recording import Recorder, packed, read_steps
 from trainer.person.tests.people import record, recorded_step
 from trainer.pictures import CURVE_FILE
-from trainer.tests.test_commands import refusal
 from trainer.tests.test_td3 import same_weights
 from trainer.tests.test_training import rows_of
 from trainer.training.config import RunConfig
@@ -197,13 +196,6 @@ def test_rerun_is_loaded_only_when_it_is_asked_for(tmp_path):
     subprocess.run(command, cwd=ROOT, check=True, timeout=120)
 
 
-def test_the_command_writes_a_recording(tmp_path, one_thread):
-    rrd = tmp_path / "run.rrd"
-    assert main(["train", "--rerun", str(rrd), "--out", str(tmp_path / "run"), *QUICK]) == 0
-    assert "/return/episode" in values_in(rrd)
-    assert [path.name for path in tmp_path.glob("*.rrd*")] == ["run.rrd"]
-
-
 BLACK = packed(np.zeros((2, 45, 80), np.uint8))
 BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
@@ -271,23 +263,3 @@ def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
     assert all(step.policy_action != step.policy_action for step in steps)
     (found,) = (entry.metrics for entry in entries if isinstance(entry, Episode))
     assert (found.human_steps, found.interventions, found.outcome) == (5, 1, "restarted")
-
-
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        ("train --out run --rerun window", "neither spawn nor serve"),
-        ("train --out run --rerun spawn", "no display"),
-        ("train --out run --rerun /dev/null/a.rrd", "/dev/null"),
-        ("view none --save a.rrd", "no recording in none"),
-        ("view drives", "no display for a window here"),
-        ("view drives --save /dev/null/a.rrd", "Not a directory"),
-    ],
-)
-def test_bad_input_is_one_line_before_anything_is_made(words, part, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    drive(tmp_path / "drives", seeds=(4,), steps=2)
-    assert part in refusal(capsys, *words.split())
-    assert [path.name for path in tmp_path.iterdir()] == ["drives"]

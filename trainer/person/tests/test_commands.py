@@ -51,6 +51,10 @@ WRONG = [
         ("--scenario", "congestion", "--policy", SHIPPED),
         "asks for congestion: ",
     ),
+    (DRIVE, ("--at", "3"), "--from F.mcap"),
+    (DRIVE, ("--from", WIRE, "--episode", "1", "--at", "99"), "fork before"),
+    (DRIVE, ("--from", WIRE, "--episode", "1", "--scenario", "congestion"), "was driven in"),
+    (DRIVE, ("--from", "{tmp}/file"), "is no MCAP recording"),
     (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
     (("drive", "--scenario", "congestion"), ("--device", "gamepad"), "none is plugged in"),
     (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
@@ -67,6 +71,12 @@ WRONG = [
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
     (HUMAN, (MINE, "--label-every-step"), "asks the scripted expert"),
     (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is no recording of a sitting"),
+    (("view", "{tmp}/none"), ("--save", "{tmp}/v.rrd"), "no recording in"),
+    (("view", MINE), ("--save", "/dev/null/v.rrd"), "Not a directory"),
+    (("view", MINE), (), "no display for a window here"),
+    (TRAIN, ("--rerun", "window"), "neither spawn nor serve"),
+    (TRAIN, ("--rerun", "spawn"), "no display"),
+    (TRAIN, ("--rerun", "/dev/null/v.rrd"), "/dev/null"),
 ]
 
 
@@ -75,6 +85,8 @@ def test_a_mistake_is_one_line_and_status_2(
     capsys, tmp_path, monkeypatch, command, more, complaint
 ):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     (tmp_path / "file").write_text("not a recording")
     (tmp_path / "bad.toml").write_text('name = "half"\n')
     record(tmp_path / "policy", [recorded_step(1, 0)])

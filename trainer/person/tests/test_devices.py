@@ -1,18 +1,16 @@
 import re
 import time
 from dataclasses import replace
-from itertools import count, product
+from itertools import product
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge import rerun
 from edge_runtime.util import UserError
-from trainer.environments import make_environment
 from trainer.person.coach import Coaching, Episode
 from trainer.person.controls import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 from trainer.person.devices import (
@@ -27,7 +25,6 @@ from trainer.person.devices import (
 from trainer.person.tests.browser import first_view
 from trainer.person.tests.people import LET_GO
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
-from trainer.tests.humans import drive
 
 FAILED = Episode(3, "collision", 0.0, 0)
 G29 = read_profile(SHIPPED / "g29.toml")
@@ -77,39 +74,6 @@ def test_the_space_bar_holds_without_driving_and_other_keys_do_nothing(code, eng
     press(hands, code)
     reading = hands.read(0.0)
     assert (reading.engaged, reading.action) == (engaged, 0.0)
-
-
-def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | None) -> int | None:
-    """The key that a hand presses which wants an action and knows what its keys give now."""
-    if abs(wanted - action) > 0.12 and abs(wanted) > 0.08:
-        return keys[wanted > action]
-    return down if abs(wanted) > 0.3 and wanted * action > 0.0 else None
-
-
-@pytest.mark.parametrize(
-    ("scenario", "keys"),
-    [("left_turn", (pygame.K_DOWN, pygame.K_UP)), ("congestion", (pygame.K_LEFT, pygame.K_RIGHT))],
-)
-def test_keys_are_enough_to_drive(scenario, keys):
-    """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
-    env = make_environment(scenario)
-    expert, periods = env.expert(), count()
-    for seed in range(6):
-        expert.reset()
-        hands, down, wanted, action = KeyboardHands(scenario), None, [0.0, 0.0], 0.0
-
-        def act(observation, hands=hands, wanted=wanted):
-            nonlocal down, action
-            wanted.append(float(expert.act(observation)[0]))
-            pressed = keys_for(wanted[-3], action, keys, down)
-            for key, pressing in ((down, False), (pressed, True)):
-                if key and pressed != down:
-                    press(hands, key, pressing)
-            down = pressed
-            action = hands.read(0.1 * next(periods)).action
-            return np.array([action], np.float32)
-
-        assert drive(env, act, seed)[1]["outcome"] == "goal"
 
 
 @pytest.fixture
@@ -177,6 +141,14 @@ def opened(monkeypatch):
 
     yield opened
     pygame.quit()
+
+
+def test_keys_come_to_the_hands_and_to_the_wishes_through_the_window(opened):
+    window = opened(1920, 1080)
+    for key in (pygame.K_DOWN, pygame.K_q):
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key))
+    reading = window.poll(0.0)
+    assert (reading.engaged, reading.wishes) == (True, {"quit"})
 
 
 def shown() -> Any:

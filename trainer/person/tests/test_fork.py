@@ -18,7 +18,7 @@ from trainer.__main__ import main as trainer
 from trainer.drivers import BEST_FILE
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
-from trainer.tests.test_commands import call, refusal
+from trainer.tests.test_commands import call
 from trainer.util import load_torch, save_torch
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]
@@ -62,14 +62,6 @@ def test_a_policy_may_drive_until_the_person_takes_over(sit_down, recorded):
     steps = list(read_steps(find_recordings([Path("rec")])[0]))
     assert np.allclose([step.action for step in steps[:3]], 0.2)
     assert [step.human for step in steps[:6]] == [False] * 4 + [True] * 2
-
-
-def test_what_is_no_fork_gets_one_line(recorded, capsys):
-    alone = ["drive", "--human", "keyboard"]
-    assert "--from F.mcap" in refusal(capsys, *alone, "--at", "3")
-    assert "was driven in" in refusal(capsys, *FORK, "--scenario", "congestion")
-    assert "fork before" in refusal(capsys, *FORK[:-1], "99")
-    assert "no MCAP recording" in refusal(capsys, *alone, "--from", "policy.onnx")
 
 
 def test_a_planted_snapshot_of_a_run_is_found_by_bisection(recorded, capsys, monkeypatch):

@@ -94,19 +94,6 @@ def test_a_sitting_is_held_until_it_is_closed_and_without_a_step_leaves_nothing_
         Recorder(tmp_path / "file")
 
 
-@pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
-def test_another_file_is_refused(tmp_path, data):
-    (tmp_path / "x.mcap").write_bytes(data)
-    os.mkfifo(tmp_path / "pipe")
-    for name, said in (
-        ("x.mcap", "is no MCAP recording"),
-        ("none.mcap", "cannot be read"),
-        ("pipe", "no regular file"),
-    ):
-        with pytest.raises(UserError, match=said):
-            list(read_steps(tmp_path / name))
-
-
 @pytest.mark.parametrize(("room", "refused"), [(500, "write"), (0, "close")])
 def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path, room, refused):
     recorder, step = Recorder(tmp_path), recorded_step(1, 0)

@@ -6,6 +6,7 @@ import pytest
 
 from bridge.report import DISCARDED, RESTARTED, STOPPED
 from trainer.drivers import constant_driver
+from trainer.person.interface import Reading
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import Pacer, drive
 from trainer.person.takeover import MAX_SLEW
@@ -40,6 +41,12 @@ def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_pat
         assert (view.applied_action, view.control) == (step.action, step.control)
     given = 0.1 * sum(step.human for step in steps)
     assert sitting.cost == {"human_s": pytest.approx(given), "takeovers": 1, "failures": 0}
+
+
+def test_a_wheel_takes_over_by_moving(tmp_path):
+    turned = Reading(-1.0, by_moving=True)
+    _, steps, *_ = drive_and_read(tmp_path, [LET_GO, turned, turned])
+    assert [step.human for step in steps[:3]] == [False, True, True]
 
 
 def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):
