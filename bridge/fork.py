@@ -404,7 +404,7 @@ def _run_fork(asked: Namespace) -> int:
         environment = stack.enter_context(closing(drive.environment(asked.env)))
         again = ForkedDrive(drive, environment, drive.steps)
         recorded = again.run() if drive.ended else None
-        if again.first_difference == drive.steps:
+        if recorded and (again.first_difference == drive.steps or recorded.steps != drive.steps):
             raise UserError(
                 f"{drive.path}: the drive cannot be rebuilt: its end is not as recorded"
             )

@@ -40,6 +40,8 @@ MAX_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 8 << 20  # Unpacked; ours hold little more than 1 MiB
 MAX_WORK = 200
 """Bytes read for each byte of the file, above one chunk."""
+RECORD_BYTES = 256
+"""What a record in a chunk counts as: taking it apart costs as much, however empty it is."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
@@ -262,7 +264,9 @@ class Recording(Condition):
         # -1: the data do not say. They are then unpacked up to what the chunk says.
         if size not in (-1, chunk.uncompressed_size) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-        return breakup_chunk(chunk, validate_crc=True)
+        parts = breakup_chunk(chunk, validate_crc=True)
+        self._read_bytes += RECORD_BYTES * len(parts)
+        return parts
 
     def _crc32(self, start: int, end: int) -> int:
         crc = 0

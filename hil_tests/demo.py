@@ -137,7 +137,7 @@ class Demo:
         )  # fmt: skip
         shutil.copy(self.run_dir / "learning_curve.png", self.directory / "learning_curve.png")
         heading("3  The actor becomes a signed policy file")
-        # Cut off from here on, no policy of another key may pass for the one that is kept.
+        # If it is cut off from here on, the policy of the earlier key must not count as kept.
         for path in (self.policy, Path(f"{self.policy}.sig")):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.keys, ignore_errors=True)

@@ -202,7 +202,7 @@ def _loopback() -> str:
 
     came = threading.Event()
     endpoint = free_endpoint()
-    with contextlib.ExitStack() as stack:  # An old Python, which is to be told so, reads it, too.
+    with contextlib.ExitStack() as stack:  # Python 3.8 must read this, to be told so.
         router = stack.enter_context(open_session(listen=endpoint, mode="router"))
         client = stack.enter_context(open_session(connect=endpoint, mode="client"))
         stack.enter_context(router.declare_subscriber("phil/doctor", lambda _: came.set()))

@@ -162,8 +162,8 @@ def _trained_in(policy: str, public_key: str | None) -> str:
         named = config.get("scenario") if isinstance(config, dict) else None
         # One of `deploy policy` names its environment itself.
         name = str(named or manifest.training.get("environment") or manifest.task)
-        if ":" in name:  # A module is imported where a person names it, not because a file does.
-            raise UserError(f"{policy} was trained in {name}, a module's: name it with --scenario")
+        if ":" in name:  # No policy file decides what is imported.
+            raise UserError(f"{policy} was trained in {name}, of a module: give --scenario {name}")
         return name
     return "left_turn"
 

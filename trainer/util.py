@@ -117,7 +117,7 @@ def load_torch(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Be the only process that trains in a directory.
+    """Be the only process of this machine that trains in a directory.
 
     It is made if it is missing, and removed again if it stays empty.
 
@@ -137,7 +137,7 @@ def claimed(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
-    """Hold a directory against other processes; gives whether that was possible in so many seconds.
+    """Hold a directory against other processes of this machine; gives whether it could in so long.
 
     It is made if it is missing. The lock is the kernel's: when a process dies, however it dies, its
     lock is gone with it.
@@ -145,7 +145,7 @@ def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
     Raises UserError: the directory cannot be made or written.
     """
     make_directory(directory)
-    check_writable(directory / "any")
+    check_writable(directory / ".held")
     end_s, descriptor = time.monotonic() + patience_s, os.open(directory, os.O_RDONLY)
     try:
         while not (mine := try_to_lock_file(descriptor)) and time.monotonic() < end_s:

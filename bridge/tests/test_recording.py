@@ -22,7 +22,7 @@ import zenoh
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Chunk, Header
+from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
 from bridge import recording as records
@@ -332,7 +332,7 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
     assert writer.messages > 0
     began_s = time.monotonic()
     assert list(listener.until_gone(4.0))  # a view's
-    assert time.monotonic() - began_s < 3.9
+    assert 1.5 < time.monotonic() - began_s < 3.9
 
 
 def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
@@ -599,6 +599,17 @@ def test_a_bomb_is_passed_over(tmp_path, unpacked, mib, said_mib, tells_size, co
     assert list(recording.messages()) == []
     assert recording.damaged_bytes == path.stat().st_size - len(MCAP0_MAGIC) - HEADER_BYTES
     assert sum(unpacked) <= most_mib * MIB
+
+
+def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
+    builder = RecordBuilder()
+    for _ in range(20_000):
+        Message(channel_id=0, log_time=0, data=b"", publish_time=0, sequence=0).write(builder)
+    data = builder.end()
+    packed = zstandard.compress(data)
+    path = crafted(tmp_path / "empty.mcap", *[(packed, len(data))] * 20)
+    with pytest.raises(UserError, match="takes more than 200 times"):
+        list(Recording(path).messages())
 
 
 class ReadCounting(io.BytesIO):

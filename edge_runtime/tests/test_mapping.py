@@ -106,6 +106,9 @@ def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, share):
 def test_no_steering_is_asked_for_that_the_wheels_do_not_reach(scale, reach):
     limit = similarity_to(CARS["congestion"], SPEC, scale).limits()["steering"]
     assert (-limit.low, limit.high) == pytest.approx((reach, reach), abs=1e-3)
+    if reach < 1.0:  # From stop to stop at the wheels' own rate
+        way_s = 2 * SPEC.max_inner_steering_rad / SPEC.max_steering_rate_radps
+        assert 2 * limit.high / limit.slew_per_s == pytest.approx(way_s)
 
 
 PEDALS, SPEEDS_MPS = st.floats(-3, 3), st.floats(-2, 2)

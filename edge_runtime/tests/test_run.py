@@ -1,6 +1,7 @@
 """The real process against a real simulator session. Limits are loose: machines are busy."""
 
 import contextlib
+import fcntl
 import gc
 import itertools
 import json
@@ -233,6 +234,33 @@ def test_it_says_that_the_simulator_is_there_for_another_vehicle(make_policy):
     with Simulator(endpoint, "hunter02"), EdgeProcess(*flags) as edge:
         assert words in next(line for line in edge.process.stderr if " waiting " in line)
         assert edge.end() == 0
+
+
+def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
+    settings, steps, hold = tmp_path / "edge.toml", itertools.count(), tmp_path / "hold"
+    settings.write_text(f"vehicle = 'mock'\nhold = '{hold}'\n")
+    installer = hold.open("w")
+    fcntl.flock(installer, fcntl.LOCK_EX)
+    edge, simulator = edge_and_simulator("constant", "--config", str(settings))
+
+    def feed(count):
+        for step in itertools.islice(steps, count):
+            simulator.send(make_state(step))
+            time.sleep(0.05)
+
+    feed(10)
+    assert wait_until(lambda: simulator.health[-1].accepted, "accepted states")
+    assert simulator.commands.empty()
+    # The vehicle has taken no command: its feedback names the last one.
+    assert {feedback.step for feedback in simulator.feedback} == {-1}
+    answer = simulator.query("rearm")
+    assert not answer["accepted"]
+    assert "installer" in answer["detail"]
+    installer.close()
+    feed(6)
+    assert simulator.next_command().session == "simulator-a"
+    assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
+    assert edge.end() == 0
 
 
 def test_a_vehicle_is_armed_inside_its_policys_envelope_only(edge_and_simulator):

@@ -275,12 +275,6 @@ def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running,
     assert "restart" in control._rearm()
 
 
-def test_on_hold_nobody_re_arms_it(running):
-    control, *_ = running(Notifier({}))
-    control._hold = MagicMock(**{"refusal.return_value": "the installer holds it"})
-    assert control._rearm() == "the installer holds it"
-
-
 def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
     monkeypatch.setattr(loop, "_HUNG_S", 0.2)
     vehicle = BrokenVehicle()

@@ -381,7 +381,7 @@ class VehicleRunner:
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
         if command.mode == SAFE_STOP:  # It brakes, whatever number is the policy's stop.
-            self._watch.command({PEDAL: -1.0}, now_s)
+            self._watch.command({**action, PEDAL: -1.0}, now_s)
         try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s, task.latch)

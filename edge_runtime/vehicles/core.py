@@ -209,7 +209,7 @@ class StreamedCore(abc.ABC):
         words = [self.words] if self.words else []
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
-            # Beyond its reach by a milliradian it is no liar.
+            # A milliradian beyond its reach would count as a lie.
             action={
                 "pedal": self._pedal(),
                 "steering": clamp(self._steering(), self.similarity.reach),

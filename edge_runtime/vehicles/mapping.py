@@ -125,12 +125,11 @@ class Similarity(NamedTuple):
 
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
-        full_rad = abs(self.spec.inner_rad(self.centre_rad(1.0)))
+        full_rad = abs(self.spec.inner_rad(self.centre_rad(self.reach)))
+        rate_per_s = self.spec.max_steering_rate_radps * self.reach / full_rad
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
-            "steering": ActionLimit(
-                -self.reach, self.reach, self.spec.max_steering_rate_radps / full_rad
-            ),
+            "steering": ActionLimit(-self.reach, self.reach, rate_per_s),
         }
 
 

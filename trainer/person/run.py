@@ -21,13 +21,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import torch
 from numpy.typing import NDArray
@@ -200,8 +199,8 @@ class PersonRun(TrainingRun):
             self.sitting.close()
 
     def quit(self) -> bool:
-        """Ask for the end of the sitting. KeyboardInterrupt where it is closed: what follows is
-        left out, and not what is still to be written.
+        """Ask for the end of the sitting. KeyboardInterrupt where it is closed already: that ends
+        the last validation, and the episode's row is written.
         """
         if self.sitting.closed:
             raise KeyboardInterrupt
@@ -248,17 +247,18 @@ class PersonRun(TrainingRun):
             self._check_alone(metrics)
             return
         self.save()
-        self.sitting.close()
-        self.behind_the_scenes.close()
-        if self.config.evaluate_every_steps:
-            runs = self.config.evaluation_runs
-            said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
-            print(said, file=sys.stderr, flush=True)
         try:
+            self.sitting.close()
+            self.behind_the_scenes.close()
+            if self.config.evaluate_every_steps:
+                runs = self.config.evaluation_runs
+                said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
+                print(said, file=sys.stderr, flush=True)
             with sigterm_as_interrupt():  # SIGHUP, too: this episode's row is to be written.
                 super()._validate(metrics, at_end)
         except KeyboardInterrupt:
-            print("validation left out", file=sys.stderr)
+            with suppress(OSError):  # The terminal may be gone.
+                print("validation left out", file=sys.stderr)
 
     def _check_alone(self, metrics: EpisodeMetrics) -> None:
         """Take the validation that is done, into this episode's row, and begin one that is due."""
@@ -378,9 +378,7 @@ class BehindTheScenes:
         weights = {name: value.numpy() for name, value in check.actor.state_dict().items()}
         seeds = list(check.seeds.values())
         try:
-            # A script that trains must not be run again there, as spawn would do.
-            script = patch.dict(sys.modules, __main__=ModuleType("__main__"))
-            with interrupts_blocked(), script:
+            with interrupts_blocked(), _without_script():
                 self._begun = check, self._process.submit(_validate, self._config, weights, seeds)
         except BrokenExecutor:
             self._begun = None  # It was killed; `take` has said so.
@@ -406,6 +404,17 @@ class BehindTheScenes:
         """End the process at once, whatever it does."""
         for process in list((self._process._processes or {}).values()):
             process.kill()
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """A process that is spawned meanwhile does not run the script again that trains here."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def _start_validating() -> None:

@@ -16,7 +16,7 @@ from trainer.evaluation import CONDITIONS
 from trainer.experiments import guidance
 from trainer.experiments import plan as planned
 from trainer.experiments import run as running
-from trainer.learner.config import ALGORITHMS
+from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
 from trainer.training.run import TrainingRun
@@ -214,6 +214,18 @@ class TestPlan:
         assert {unit.setting for unit in first} == {planned.NORMAL}
         assert [unit.seed for unit in first] == sorted(unit.seed for unit in first)
         assert units[44].setting == "biased"
+
+    def test_the_settings_are_what_they_say(self, store):
+        write_human(store)
+        units = {setting: GUIDED._replace(setting=setting) for setting in planned.SETTINGS}
+        of = {name: planned.run_config(units[name], planned.PLAN, store.humans) for name in units}
+        papers = {setting for setting, *_ in planned.LINES}
+        assert (papers | set(planned.HUMANS), len(papers & set(planned.HUMANS))) == (set(of), 0)
+        assert of["one_frame"].learner.frames == 1
+        assert of["printed"].learner == PRINTED_LEARNER
+        assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
+        assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
+        assert {each.steps for each in of.values()} == {planned.PLAN.steps["left_turn"]}
 
     def test_the_table_of_guidance_has_every_row_with_every_human_and_none_of_the_papers(self):
         units = planned.units_of([planned.GUIDANCE], 5)

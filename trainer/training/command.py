@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--config",
         metavar="F.toml",
         help="take options and settings from this file, as a run's own config.toml; options on "
-        "the command line win",
+        "the command line win, but no setting may come from both",
     )
     what.add_argument(
         "--set",
@@ -309,9 +309,9 @@ def _take_config(arguments: argparse.Namespace) -> list[str]:
     path, given = Path(arguments.config), getattr(arguments, "given", ())
     values = _flat(read_toml(path, "config"))
     both = {"preset": _preset_names(arguments.preset)} if "preset" in given else {}
-    rows = {arguments.algorithm, values.get("algorithm", arguments.algorithm)}
+    rows = {arguments.algorithm, str(values.get("algorithm", arguments.algorithm))}
     if len(rows) == 2 and "algorithm" in given:
-        both["algorithm"] = set().union(*(find_algorithm(str(row)).settings for row in rows))
+        both["algorithm"] = set().union(*(find_algorithm(row).settings for row in rows))
     for option, names in both.items():
         if clash := [name for name in values if name in names]:
             raise UserError(f"config {path} sets {clash[0]}, and so does --{option}: leave one out")
