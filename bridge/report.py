@@ -194,8 +194,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterat
 def summary_line(report: Mapping[str, Any]) -> str:
     """Return the report in one line for a terminal.
 
-    Ticks without a new command are not in it: those of a stop are told as that, and of the others
-    the latency tells.
+    Ticks without a new command are left out: safe stops and latency show them.
     """
     latency = report["latency_ms"]
     times = "no command came"

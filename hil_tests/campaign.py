@@ -260,7 +260,7 @@ def draw_axes(swept: Found) -> Figure:
         panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
         panel.grid(alpha=0.3)
         target = swept["budget"]["target_success"]
-        panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
+        panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{100 * target:g}%")
         panel.set_ylim(-0.03, 1.03)
     for panel in panels[len(axes) :]:
         panel.set_visible(False)

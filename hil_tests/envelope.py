@@ -85,6 +85,7 @@ Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
 def network(at: Point) -> LatencySpec:
     """The network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
+    outage_s = min(outage_s, OUTAGE_EVERY_S - AXES["outage_s"][1])  # One must end.
     spread_ms, has_bursts, loss = jitter_ms or tail_ms, burst >= 1.0, min(loss, MOST_LOSS_PERCENT)
     settings: dict[str, Any] = {
         "delay_ms": max(delay_ms, JITTER_FLOOR * spread_ms),
@@ -177,7 +178,7 @@ class Search:
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
         """The largest step that holds, the smallest beyond it that breaks, and both networks.
 
-        None where none breaks. Where one breaks and the most does not, it is looked for below it.
+        None where none breaks. It lies below the least step known to break.
         """
         inside = self.holds_up_to(ray, most)
         names = {k: str(network(ray(k))) for k in range(inside + 1, most + 1)}

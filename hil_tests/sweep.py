@@ -97,7 +97,7 @@ def budget(axes: Sequence[Axis], rows: Rows, target: float, name: str) -> dict[s
     """Each axis's limit, whether it is only the end of what was tested, and the sentence."""
     limits = {axis.name: limit_of(axis, rows, target) for axis in axes}
     open_ended = {axis.name: limits[axis.name] == axis.values[-1] for axis in axes}
-    goal, parts, missed = f"{target:.0%} success", [], []
+    goal, parts, missed = f"{100 * target:g}% success", [], []
     for axis in axes:
         limit = limits[axis.name]
         if limit is None:

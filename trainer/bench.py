@@ -85,8 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
     effort = QUICK if arguments.quick else FULL
     with ProgressBar("bench", effort.ticks) as bar:
         report = measure(effort, lambda done: bar.advance({"last": done}))
-    show(report)
     write_json_out(arguments.out, report)
+    show(report)
     return 0
 
 

@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     detail = [asdict(result) for result in found.episodes]
     write_json_out(arguments.out, {**found.report, "per_episode": detail})
     distance_m, reward = found.report["surviving_distance_m"], found.report["episode_reward"]
-    success = "" if found.success_rate is None else f"success {found.success_rate:.0%}, "
+    success = "" if found.success_rate is None else f"success {found.success_rate:.1%}, "
     print(
         f"{counted(arguments.runs, 'episode')}: {success}return {reward['mean']:.2f}, "
         f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"

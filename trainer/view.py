@@ -315,8 +315,8 @@ class Shown:
 
 def _shown(env: Any) -> Any:
     """The scene, or what the environment draws where it has none; None where it draws nothing."""
-    scene = env.scene()
-    with suppress(UserError):
+    with suppress(Exception):  # Of any kind: it is somebody else's code, and the training goes on.
+        scene = env.scene()
         return env.render() if scene is None else scene
     return None
 
@@ -348,8 +348,8 @@ class TrainingLog:
     def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
         self._recording, self._episodes = recording, episodes
         self._driver = ""
-        self._ground: tuple[Any, ...] = ()
-        """What is drawn of the ground: recordings may be of several scenarios."""
+        self._ground: Any = False
+        """What is drawn: a road's lines, a picture (True) or nothing; recordings hold several."""
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
         draw.style_lines(recording, LINES)
@@ -377,21 +377,25 @@ class TrainingLog:
                 self._recording.log("driver", rr.StateChange(state=driver))
         if entry.frames is not None:
             self._stand_at(steps[-1])
-            if isinstance(entry.scene, dict):
-                self._draw_road(read_scene(entry.scene))
-            elif entry.scene is not None:
-                self._recording.log("road", rr.Image(entry.scene, color_model="RGB"))
+            self._draw_scene(entry.scene)
             if entry.frames.shape == FRAMES_SPACE.shape:
                 for name, frame in zip(("before", "now"), entry.frames, strict=True):
                     self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
 
-    def _draw_road(self, scene: SeenScene) -> None:
-        ground = (scene.roads, scene.path, scene.goal)
+    def _draw_scene(self, scene: Any) -> None:
+        """A road with its cars, a picture, or nothing, in the place of what was there."""
+        road = read_scene(scene) if isinstance(scene, dict) else None
+        ground = (road.roads, road.path, road.goal) if road else scene is not None
         if ground != self._ground:
             self._ground = ground
-            self._recording.send_blueprint(make_blueprint(scene, self._episodes))
-            draw.draw_ground(self._recording, scene)
-        draw.draw_cars(self._recording, scene, DRIVERS.get(self._driver, HUMAN))
+            self._recording.log("road", rr.Clear(recursive=True))
+            if road:
+                self._recording.send_blueprint(make_blueprint(road, self._episodes))
+                draw.draw_ground(self._recording, road)
+        if road:
+            draw.draw_cars(self._recording, road, DRIVERS.get(self._driver, HUMAN))
+        elif scene is not None:
+            self._recording.log("road", rr.Image(scene, color_model="RGB"))
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics
@@ -410,7 +414,7 @@ class TrainingLog:
                 self._recording.log(path, rr.Scalars(value))
         self._recording.log("status", _status(metrics))
         self._recording.reset_time()
-        flush(self._recording)  # A viewer that is gone takes everything without a word.
+        flush(self._recording)  # Only a flush notices that a viewer has gone.
 
     def _columns(self, path: str, steps: Sequence[int], values: Any) -> None:
         """Log many numbers in one call: a call for each would cost as much as this one."""

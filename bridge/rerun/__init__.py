@@ -1,4 +1,4 @@
-"""What bridge and trainer show in rerun alike: the colours of every view, and where it goes.
+"""What all rerun views share: their colours, and where a view goes.
 
 It goes to a window, a local web page, or a file. Window and page are rerun's viewer as a process of
 its own, on loopback: by itself it would bind all interfaces.
@@ -156,8 +156,7 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
             except RuntimeError as error:
                 raise UserError(f"cannot write {path}: {error}") from None
             recording.disconnect()  # Writes the footer.
-            # No part takes a whole one's place; but ^C is the ordinary way to end one.
-            if not (target.exists() and isinstance(sys.exc_info()[1], Exception)):
+            if not (target.exists() and sys.exc_info()[1]):  # No part takes a whole one's place.
                 os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)

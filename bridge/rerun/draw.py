@@ -19,11 +19,11 @@ from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colo
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
 MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
-NEAR_M = 20.0  # From the path; whoever is farther away comes into the picture when it matters
+NEAR_M = 20.0  # Cars farther from the path than this do not widen the view
 ALL_OF_IT = rrb.TimeRange(
     start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
 )
-"""Of the time axis. Otherwise rerun moves the axis with the cursor, and the beginning out of it."""
+"""The whole time axis; otherwise rerun scrolls it with the cursor."""
 PICTURE_INTERVAL_S = 0.1
 """Ten a second are as many as a control period makes, and plenty for an eye."""
 
@@ -41,7 +41,7 @@ def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
 
 
 def draw_cars(recording: rr.RecordingStream, scene: SeenScene, ego_colour: Colour) -> None:
-    """Draw the cars; the ego car's colour may say what it does, or by whose will."""
+    """Draw the cars; the ego car's colour may say what it does, or who decides."""
     for name, ego in (("traffic", False), ("ego", True)):
         path, colour = f"road/{name}", ego_colour if ego else APPLIED
         cars = [car for car in scene.vehicles if car.ego == ego]

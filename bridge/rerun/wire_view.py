@@ -95,10 +95,7 @@ def _show_recording(arguments: Any, sink: str) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
     file = Recording(Path(arguments.recording))
     heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
-    with (
-        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
-        contextlib.suppress(KeyboardInterrupt),
-    ):
+    with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
         log = WireLog(recording)
         for each in heard:
             log.write(each)
@@ -108,7 +105,8 @@ def _show_recording(arguments: Any, sink: str) -> None:
         if sink == SERVE:
             flush(recording)
             print("all of it is there; ^C ends", flush=True)
-            wait_to_be_told()
+            with contextlib.suppress(KeyboardInterrupt):
+                wait_to_be_told()
 
 
 @contextlib.contextmanager

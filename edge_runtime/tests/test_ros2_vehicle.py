@@ -56,6 +56,16 @@ def test_a_clock_set_back_counts_after_the_next_enable():
     assert rig.core.state is State.ENABLED
 
 
+def test_a_clock_set_back_is_believed_once_nothing_is_driven():
+    rig = Ros2Rig().driving()
+    rig.talks = False
+    for tick in range(1, 40):
+        rig.core.hear(tick, 0.0, 0.0, rig.now_s)
+        rig.step(1, PEDAL)
+    assert rig.core.cause is Event.SILENT
+    assert rig.core.standing(rig.now_s) == []  # Else no re-arm would ever be taken.
+
+
 def test_odometry_without_stamps_is_believed_by_its_arrival():
     core = Ros2Core(Ros2Settings(), LEFT_TURN)
     core.enable(0.0)

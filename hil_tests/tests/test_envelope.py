@@ -142,6 +142,8 @@ def test_bursts_come_on_top_of_the_loss():
     way = network({"loss_percent": 10.0, "burst_messages": 3.0}).up
     assert way.bad_share == pytest.approx(BURST_PERCENT / 100)
     assert network({"burst_messages": 0.5}) == network({})
+    longest = network({"outage_s": 4.0})  # Each must end, to be read back.
+    assert parse_spec(str(longest)) == longest
     assert network({"loss_percent": 100.0, "burst_messages": 3.0}).up.loss_percent > 99.0
 
 

@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import msgspec
 import numpy as np
 import pytest
+import rerun as rr
 import torch
 from rerun.chunk import RrdReader
 
@@ -111,14 +112,20 @@ def test_interventions_are_on_the_time_line_with_their_reasons(shown):
     assert (view.LINES["action/policy"], view.LINES["action/applied"]) == (POLICY, APPLIED)
 
 
-def looking_on(kept):
-    run: Any = SimpleNamespace(steps=40, env=SimpleNamespace(scene=lambda: {"roads": []}))
+def looking_on(kept, scene=lambda: {"roads": []}):
+    run: Any = SimpleNamespace(steps=40, env=SimpleNamespace(scene=scene))
     return Watcher(run, kept.append)
 
 
 def control_period():
     action = np.array([0.5], np.float32)
     return Seen(np.zeros((2, 45, 80), np.uint8), -action, None, action, speed_mps=3.0)
+
+
+def test_a_scene_that_fails_is_not_shown_and_ends_no_training():
+    kept: list[Any] = []
+    looking_on(kept, scene=lambda: 1 / 0).on_step(control_period())
+    assert kept[0].scene is None
 
 
 def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
@@ -255,6 +262,18 @@ def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_p
     scenes = [entry.scene is not None for entry in entries if isinstance(entry, Steps)]
     assert scenes == [False] * 15 + [True] * 15
     assert shown.without_road == 1
+
+
+def test_what_is_known_no_more_is_not_shown_any_more(monkeypatch):
+    drawn: list[Any] = []
+    monkeypatch.setattr(rr.RecordingStream, "log", lambda _, *what, **__: drawn.append(what))
+    log = view.TrainingLog(rr.RecordingStream("t"), [])
+    entry, frames = view.StepEntry(0, 0.0, 0.0, 1.0, None), np.zeros((2, 45, 80), np.uint8)
+    drawn.clear()
+    for scene in ({"vehicles": []}, None, np.zeros((4, 4, 3), np.uint8)):
+        log.draw(Steps([entry], frames, scene))
+    cleared = [what for what in drawn if what[0] == "road"]
+    assert [type(what[1]) for what in cleared] == [rr.Clear, rr.Clear, rr.Clear, rr.Image]
 
 
 def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):

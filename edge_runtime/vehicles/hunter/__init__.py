@@ -44,7 +44,7 @@ _JOIN_S = 0.5
 
 DEFAULT_BUS = "socketcan:can0"
 _SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
-# Without a bit rate: the first has it from `ip link`, the others know none.
+# These take none: socketcan's is set by `ip link`, virtual has none.
 _WITHOUT_BITRATE = ("socketcan", "virtual")
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 

@@ -138,7 +138,9 @@ class Ros2Core(StreamedCore):
         """
         if 0 < stamp_ns <= self._stamp_ns:
             self.stale += 1
-            return
+            # While nothing is driven, a clock set back is believed; a repetition is not.
+            if self.state in (State.ENABLING, State.ENABLED) or stamp_ns == self._stamp_ns:
+                return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
         if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:

@@ -202,7 +202,7 @@ def _pictures(frames: Tensor) -> tuple[int, int, int, int]:
 def _forward(
     frames: Tensor, parameters: tuple[Tensor, ...], saved: tuple[Tensor | None, ...]
 ) -> Tensor:
-    """The features; ``saved`` (hidden, winners1, winners2) is filled unless it is of None."""
+    """The features; ``saved`` (hidden, winners1, winners2) are filled, unless None."""
     library = load()
     assert library is not None
     weight1, bias1, weight2, bias2 = parameters

@@ -60,6 +60,7 @@ export class Link {
       this.on.echo(message);
     } else if (message.kind === "view") {
       this.seen = message.number;
+      this.changed(); // The next view waits for this word.
       this.on.view(message);
     } else {
       this.over = true;
@@ -86,7 +87,7 @@ export class Link {
     if (this.dirty || now - this.saidMs >= HEARTBEAT_MS) this.say();
   }
 
-  // A hold counts only after hands off. What is held when a page is first there was pressed for it;
+  // A hold counts only after hands off. A hold when the page first connects counts;
   // after a lost connection the hands themselves must let go.
   greet() {
     this.send(OFF);
