@@ -270,7 +270,8 @@ def test_what_is_known_no_more_is_not_shown_any_more(monkeypatch):
     log = view.TrainingLog(rr.RecordingStream("t"), [])
     entry, frames = view.StepEntry(0, 0.0, 0.0, 1.0, None), np.zeros((2, 45, 80), np.uint8)
     drawn.clear()
-    for scene in ({"vehicles": []}, None, np.zeros((4, 4, 3), np.uint8)):
+    scenes: tuple[Any, ...] = ({"vehicles": []}, None, np.zeros((4, 4, 3), np.uint8))
+    for scene in scenes:
         log.draw(Steps([entry], frames, scene))
     cleared = [what for what in drawn if what[0] == "road"]
     assert [type(what[1]) for what in cleared] == [rr.Clear, rr.Clear, rr.Clear, rr.Image]
