@@ -237,7 +237,6 @@ class WireLog:
         self._told, self._reason = "", ""
         self._episode: tuple[str, int] | None = None  # The newest one seen
         self._heard_command_ns = 0
-        self._camera = ""  # The first array of pictures
         self._plan_periods = 0
         self._sent_ns: dict[Place, int] = {}
         self._answered_ns: dict[Place, int] = {}
@@ -358,12 +357,13 @@ class WireLog:
         """Its images, the newest last, and few numbers as lines."""
         if self._layout is None or self._layout.refusal(state.observation) is not None:
             return
+        has_camera = False
         for name, array in self._layout.arrays(state.observation).items():
             images = images_of(array)
             if images is not None:
                 # The layout has views for the first camera; a person may add those of others.
-                root = "frames" if (self._camera or name) == name else f"frames/{name}"
-                self._camera = self._camera or name
+                root = f"frames/{name}" if has_camera else "frames"
+                has_camera = True
                 for place, image in zip(("now", "before"), images[::-1], strict=False):
                     model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
                     self._recording.log(f"{root}/{place}", rr.Image(image, color_model=model))

@@ -166,6 +166,7 @@ class StreamedCore(abc.ABC):
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
+        self._reach = similarity.reach  # Worked out once: reports come with every frame.
         self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
         self.follow_period(MIN_PERIOD_S)
         self._wish: Optional[Wish] = None  # None: stand
@@ -212,7 +213,7 @@ class StreamedCore(abc.ABC):
             # A milliradian beyond its reach would count as a lie.
             action={
                 "pedal": self._pedal(),
-                "steering": clamp(self._steering(), self.similarity.reach),
+                "steering": clamp(self._steering(), self._reach),
             },
             speed_mps=speed_mps,
             self_braking=self.state is not State.ENABLED,

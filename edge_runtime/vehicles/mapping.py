@@ -125,11 +125,12 @@ class Similarity(NamedTuple):
 
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
-        full_rad = abs(self.spec.inner_rad(self.centre_rad(self.reach)))
-        rate_per_s = self.spec.max_steering_rate_radps * self.reach / full_rad
+        reach = self.reach
+        full_rad = abs(self.spec.inner_rad(self.centre_rad(reach)))
+        rate_per_s = self.spec.max_steering_rate_radps * reach / full_rad
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
-            "steering": ActionLimit(-self.reach, self.reach, rate_per_s),
+            "steering": ActionLimit(-reach, reach, rate_per_s),
         }
 
 
