@@ -88,6 +88,8 @@ MEASURED = {
     "cost/human_s": (HUMAN, "total_human_s"),
     "cost/takeovers": (draw.ORANGE, "total_takeovers"),
     "cost/failures": (draw.PURPLE, "total_failures"),
+    "cost/human_s_to_90": (draw.GREY, "human_s_to_90"),
+    "cost/human_s_to_98": (draw.BLUE, "human_s_to_98"),
 }
 """Line -> its colour, and the field of an episode's metrics."""
 LINES = {

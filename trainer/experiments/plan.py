@@ -103,7 +103,7 @@ LABELS = {
     "pvp_td3": "PVP-TD3",
     "pvp4real_td3": "PVP4Real-TD3",
     "ppl_td3": "PPL-TD3",
-    "rlpd_td3": "RLPD-TD3 (HIL-SERL)",
+    "rlpd_td3": "RLPD-TD3",
     "phil_gated": "PHIL-TD3, the robot asks",
     EXPERT: "scripted expert",
     HUMAN_MODEL: "human model",

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
-from statistics import median_low
+from statistics import median_high
 from typing import Any
 
 import numpy as np
@@ -247,7 +247,8 @@ def _cost(results: Results) -> Iterator[str]:
     yield (
         "Environment steps, and seconds that the human drove, until the policy alone reaches "
         f"{LEARNED:.0%} or {WELL:.0%} of its validation drives: median of the seeds, the least and "
-        "the most of them (∞: never), and how many get there. The rest are means. Validation lost "
+        "the most of them (∞: never), and how many get there if not all do. The rest are means. "
+        "Validation lost "
         f"at the end: the mean of the last {data.END_STEPS:,} steps against the best, which chance "
         "makes better, too."
     )
@@ -280,14 +281,17 @@ def table(
 def until(level: float, what: str) -> Cell:
     """A cost until the policy alone reached a level: median, least and most of the seeds.
 
-    A seed that never does costs more than any other. In brackets, how many do.
+    A seed that never does costs more than any other. In brackets, how many do if not all.
     """
 
     def cell(found: Sequence[Result]) -> str:
         costs = [getattr(cost, what) if (cost := one.until(level)) else np.inf for one in found]
         there = int(np.isfinite(costs).sum())
-        unguided = what in HUMAN_COSTS and not ALGORITHMS[found[0].unit.algorithm].guided
-        return f"{spread(costs)} ({there})" if there and not unguided else "–"
+        if what in HUMAN_COSTS and not ALGORITHMS[found[0].unit.algorithm].guided:
+            return "–"
+        if not there:
+            return "never"
+        return spread(costs) + (f" ({there} of {len(costs)})" if there < len(costs) else "")
 
     return cell
 
@@ -298,11 +302,11 @@ def mean(number: Callable[[Result], float], digits: int = 0) -> Cell:
 
 
 def spread(numbers: Sequence[float]) -> str:
-    """Median (of an even number the lower middle), least and most, as in "12 [8, ∞]".
+    """Median (of an even number the upper middle), least and most, as in "12 [8, ∞]".
 
     Of five, 15 of 16 times the true median lies between the least and the most.
     """
-    ends = (f"{number:,.0f}" for number in (median_low(numbers), min(numbers), max(numbers)))
+    ends = (f"{number:,.0f}" for number in (median_high(numbers), min(numbers), max(numbers)))
     middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
     return f"{middle} [{least}, {most}]"
 

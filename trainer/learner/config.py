@@ -98,7 +98,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     # authors do not explore; here the validations were higher on average where it does.
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
-    # RLPD (2302.02948) with interventions, as HIL-SERL (2410.21845): no cloning, no penalty.
+    # RLPD (2302.02948) with interventions, after HIL-SERL (2410.21845): no cloning, no penalty.
     # Layer normalisation in the critics all rows have. Two critics, not ten. If the human prevents
     # every failure, the critics see none, and rate every action good. One update of the actor a
     # step.

@@ -102,7 +102,7 @@ class Coach:
         advice = advise(list(self.episodes), alone, self._mastered) if self.learning else ""
         return Coaching(
             advice=advice,
-            said=said(cost, self.typical),
+            said=said(cost, self.curve, self.typical),
             alone=", ".join(known),
             curve=[(round(x, 1), round(y, 3)) for x, y in self.curve],
             typical=self.typical,
@@ -136,16 +136,20 @@ def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[i
     return ""
 
 
-def said(cost: Mapping[str, float], typical: Curve) -> str:
-    """What the person has given so far, and after how long a scripted human was done."""
+def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
+    """What the person has given so far; after how much of it the policy alone had learned, and
+    after how much of a scripted human's.
+    """
     given = (
         f"{cost['human_s']:.0f} s at the wheel, {counted(int(cost['takeovers']), 'take-over')}, "
         f"{counted(int(cost['failures']), 'failure')}."
     )
-    there = next((human_s for human_s, success in typical if success >= LEARNED), None)
-    if there is None:
-        return given
-    return f"{given} A scripted human: {LEARNED:.0%} after {there:.0f} s."
+    there = [
+        f"{whose} after {next(human_s for human_s, success in its if success >= LEARNED):.0f} s"
+        for whose, its in (("yours", curve), ("a scripted human's", typical))
+        if any(success >= LEARNED for _, success in its)
+    ]
+    return f"{given} {LEARNED:.0%} alone: {', '.join(there)}." if there else given
 
 
 def typical_curve(scenario: str, algorithm: str) -> Curve:

@@ -11,7 +11,15 @@ from bridge.report import COLLISION, GOAL
 from trainer.drivers import MODEL_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.data import Result, Results
-from trainer.experiments.plan import CONSTANT, FULL_PATH_M, HUMAN_MODEL, QUICK, SCENARIOS, Unit
+from trainer.experiments.plan import (
+    CONSTANT,
+    EXPERT,
+    FULL_PATH_M,
+    HUMAN_MODEL,
+    QUICK,
+    SCENARIOS,
+    Unit,
+)
 from trainer.experiments.run import Store
 from trainer.human.model import HumanModel, HumanModelConfig
 
@@ -24,10 +32,10 @@ SKILLS = {
     "phil_td3": 0.99, "ia_td3": 0.9, "hi_td3": 0.8, "per_td3": 0.4, HUMAN_MODEL: 0.93,
     "phil_td_only": 0.85, "phil_q_advantage_only": 0.9, "phil_advantage_0.1": 0.88,
     "phil_advantage_100": 0.97, "rd2_td3": 0.7, "rd2_phil": 0.92, "phil_without_cloning": 0.8,
-    "phil_without_shaping": 0.9, CONSTANT: 0.3,
+    "phil_without_shaping": 0.9, CONSTANT: 0.3, EXPERT: 1.0,
 }  # fmt: skip
 FACTORS = {
-    "normal": 1.0, "one_frame": 0.85, "random": 0.97, "biased": 0.9, "printed": 0.5, "good": 1.0
+    "normal": 1.0, "one_frame": 0.85, "random": 0.97, "biased": 0.9, "printed": 0.5
 }  # fmt: skip
 BUDGET = 6_000
 
@@ -62,7 +70,7 @@ def without_times(store: Store, unit: Unit) -> dict[str, Any]:
 
 def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
     """The record of a unit that learns to its skill, the more skilled the sooner."""
-    skill = SKILLS[unit.algorithm] * FACTORS[unit.setting]
+    skill = SKILLS[unit.algorithm] * FACTORS.get(unit.setting, 1.0)
     random = np.random.default_rng([unit.seed, *"".join(unit[:3]).encode()])
     full_m = FULL_PATH_M[unit.scenario]
     tests = {}

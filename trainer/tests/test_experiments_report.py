@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.experiments import claims, data, report
-from trainer.experiments.guidance import best_by_rule, place_columns, typical_curves
+from trainer.experiments.guidance import (
+    best_by_rule,
+    forgiven,
+    learns,
+    outcomes,
+    place_columns,
+    typical_curves,
+)
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
@@ -96,6 +103,9 @@ class TestData:
         assert itself == ["0.0 [0.0, 0.0]", "0 [0, 0]", "0 of 3"]
         alone = place_columns(results_of(units[3:], SEEDS)).values()
         assert [cell(hi) for cell in alone] == ["–", "–", "0 of 0"]
+        for one in phil:
+            one.record["validation"]["success"] = [0.0] * 12
+        assert [cell(hi) for cell in place_columns(results).values()][1:] == ["–", "0 of 3"]
 
     @pytest.mark.parametrize(
         ("cheaper", "behind", "default"),
@@ -120,6 +130,32 @@ class TestData:
                 fails = ours and behind and (condition, unit.scenario) == ("variant", "congestion")
                 record["tests"][condition]["outcome"] = ["collision" if fails else "goal"] * 60
         assert best_by_rule(results, ["hi_td3"]) == default
+
+    def test_a_row_forgives_a_human_beside_whom_it_still_succeeds(self):
+        rows, humans = ("phil_td3", "hi_td3"), ("good", "slower")
+        units = [Unit("left_turn", *each, 1) for each in product(rows, humans)]
+        results = results_of(units, 1)
+        for unit, record in ((unit, results.found[unit].record) for unit in units):
+            fails = unit.algorithm == "hi_td3" and unit.setting == "slower"
+            failed = [6, 24][fails]  # of 60
+            outcomes_ = ["collision"] * failed + ["goal"] * (60 - failed)
+            record["tests"]["nominal"]["outcome"] = outcomes_
+            record["validation"]["success"] = [1.0] * 12
+        said = forgiven(results)
+        assert said.endswith(": PHIL-TD3. Less beside some: HI-TD3 (slower 60.0).")
+        assert [learns(results, row) for row in ("phil_td3", "ppl_td3")] == [True, False]
+
+    def test_a_row_is_held_against_the_human_that_guided_it(self):
+        units = [Unit("left_turn", *each) for each in (
+            ("phil_td3", "slower", 1), ("phil_td3", "late", 1),
+            ("expert", "slower", 0), ("expert", "good", 0),
+        )]  # fmt: skip
+        results = results_of(units, 1)
+        rewards = dict(zip(units, (5.0, 5.0, 3.0, 9.0), strict=True))
+        for unit, reward in rewards.items():
+            results.found[unit].record["tests"]["nominal"]["reward"] = [reward] * 60
+        (cell,) = [cell for title, cell in outcomes(results).items() if "return" in title]
+        assert [cell([results.found[unit]]) for unit in units] == ["2.00", "-4.00", "-6.00", "0.00"]
 
     def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
         assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0
@@ -277,7 +313,7 @@ def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     # The policy alone is above 98 % in the validation after 1,500 steps: the human has given both
     # of the first two episodes by then, all that there is.
-    until = ["1,500 [1,500, 1,500] (1)", *["123 [123, 123] (1)"] * 2]
+    until = ["1,500 [1,500, 1,500]", *["123 [123, 123]"] * 2]
     costs = ["10.0", "10.0", "1,234", "56", "7", "6,000"]
     assert cells[1:] == ["left turn", "1", *until, *costs]
 
@@ -289,8 +325,10 @@ def test_a_seed_that_never_learned_costs_more_than_any_other():
         columns = results.found[unit].record["validation"]
         columns["success"] = [float(unit.seed < 3 and n >= unit.seed) for n in range(12)]
     found = results.of("left_turn", claims.PHIL)
-    assert report.until(0.9, "steps")(found) == "1,520 [1,020, ∞] (2)"
-    assert report.until(0.9, "steps")(found[2:]) == "–"
+    assert report.until(0.9, "steps")(found) == "1,520 [1,020, ∞] (2 of 3)"
+    assert report.until(0.9, "steps")(found[1:]) == "∞ [1,520, ∞] (1 of 2)"
+    assert report.until(0.9, "steps")(found[:2]) == "1,520 [1,020, 1,520]"
+    assert report.until(0.9, "steps")(found[2:]) == "never"
     assert report.spread([-0.3, -3.0, np.inf]) == "0 [-3, ∞]"
 
 

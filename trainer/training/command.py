@@ -301,6 +301,8 @@ def _summary(run_dir: Path, period_s: float) -> str:
     amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
     steps = counted(found["human_steps"], "step")
     human = f"{counted(found['takeovers'], 'take-over')} with {steps}, {found['human_s']:.0f} s"
+    for level, there in found["until"].items():
+        human += f" ({there['human_s']:.0f} until {float(level):.0%} alone)" if there else ""
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 

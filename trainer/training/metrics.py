@@ -64,6 +64,8 @@ class EpisodeMetrics:
     total_human_s: float = 0.0  # Simulated seconds that the human drove since the run began
     total_takeovers: int = 0
     total_failures: int = 0  # Episodes that missed the goal since then, whoever drove
+    human_s_to_90: float = NAN  # That total when the policy alone first reached 90 % in validation
+    human_s_to_98: float = NAN
     exploration_std: float = 0.0
     critic_loss: float = NAN
     policy_loss: float = NAN
@@ -105,6 +107,8 @@ class MetricsWriter:
         write_atomic(str(self.path), text.getvalue().encode())
         self._period_s, self._spent = period_s, spent(kept, period_s)
         self._failures = sum(self._spent["failures"].values())
+        there = totals(kept, period_s).get("until", {})
+        self._human_s_to = {level: it["human_s"] for level, it in there.items() if it}
         self._file = self.path.open("a", newline="")
         self._csv = csv.DictWriter(self._file, NAMES)
         self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=from_episode)
@@ -116,6 +120,12 @@ class MetricsWriter:
         self._failures += failed(metrics.outcome)
         metrics.total_human_s = round(self._spent["human_s"], 6)
         metrics.total_takeovers, metrics.total_failures = self._spent["takeovers"], self._failures
+        for level in LEARNED:
+            if metrics.validation_success >= level - 1e-9:
+                self._human_s_to.setdefault(f"{level:g}", metrics.total_human_s)
+        metrics.human_s_to_90, metrics.human_s_to_98 = (
+            self._human_s_to.get(f"{level:g}", NAN) for level in LEARNED
+        )
         row = asdict(metrics)
         try:
             self._csv.writerow(row)
