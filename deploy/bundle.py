@@ -424,10 +424,16 @@ def build_edge_wheel(folder: Path) -> Path:
 
 
 def pip(*arguments: str) -> None:
-    """Run pip. Raises UserError with the last line that begins with ERROR."""
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments]
+    """Run pip; on a terminal with its own progress.
+
+    Raises UserError with the last line that begins with ERROR.
+    """
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": str(_EPOCH_S)}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    shown = sys.stderr if sys.stderr.isatty() else subprocess.DEVNULL
+    done = subprocess.run(
+        command, stdout=shown, stderr=subprocess.PIPE, text=True, check=False, env=environment
+    )
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")]
         raise UserError(f"pip {arguments[0]}: {(lines or ['failed'])[-1]}")

@@ -256,5 +256,5 @@ def why_no_state(
     if not is_linked():
         _, refusal = look(connect, tls)
         if not is_linked():  # it may have come meanwhile
-            return refusal or f"{connect} gives no link yet"
+            return f"{connect}: {refusal or 'no link yet'}"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

@@ -26,11 +26,11 @@ from trainer.human.guide import Action, Expert, Reason
 from trainer.learner.replay import Layout
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.environment import Scene
+from trainer.util import PERIOD_S
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 MOST_STEPS = 1000  # Of an episode whose environment has no end of its own
-PERIOD_S = 0.1  # Of an environment that does not say how long a step is
 
 
 class Condition(NamedTuple):
@@ -52,11 +52,18 @@ CONDITIONS = {
 """Only the first is trained and validated in."""
 
 
-def make_environment(name: str, condition: str = "nominal", printed_reward: bool = False) -> Any:
+def make_environment(
+    name: str,
+    condition: str = "nominal",
+    printed_reward: bool = False,
+    period_s: float | None = None,
+) -> Any:
     """The environment of a scenario's word, a gymnasium id or ``module:id``.
 
     The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
-    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight.
+    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. In an
+    environment that does not say how long a step is it takes ``period_s``, and a line says so;
+    None where it does not matter.
 
     Raises UserError: no such environment, or one that nothing here could drive.
     """
@@ -64,7 +71,7 @@ def make_environment(name: str, condition: str = "nominal", printed_reward: bool
     if name not in SCENARIOS:
         if printed_reward:
             raise UserError(f"printed_reward is the paper's, and {name} is none of its scenarios")
-        return Adapted(bridge.make_environment(name, scene), name)
+        return Adapted(bridge.make_environment(name, scene), name, period_s)
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
         scenario.config = scenario.config.with_printed_reward()
@@ -158,11 +165,13 @@ class Adapted:
     goal_m = float("nan")
     biased_action = 1.0
 
-    def __init__(self, env: gymnasium.Env[Any, Any], name: str) -> None:
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], name: str, period_s: float | None = None
+    ) -> None:
         self.env, self.scenario = env, name
         self.unwrapped: Any = env.unwrapped
         self.observation_space = env.observation_space
-        task = bridge.describe(env, PERIOD_S)
+        task = bridge.describe(env, period_s or PERIOD_S)
         self.layout = _layout(task, isinstance(env.observation_space, Dict))
         self.control_period_s = task.control_period_s
         self.action_names = tuple(row.name for row in task.action)
@@ -179,7 +188,8 @@ class Adapted:
         try:
             bridge.describe(env)
         except UserError:
-            _say_once(f"{name} does not say how long a step is: {PERIOD_S} s is taken")
+            if period_s is not None:
+                _say_once(f"{name} does not say how long a step is: {period_s} s is taken")
         self._last = np.zeros(len(task.action), np.float32)
 
     def reset(

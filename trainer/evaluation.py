@@ -24,6 +24,7 @@ from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, limited_threads
 from trainer.training.delayed import VehicleEnd
+from trainer.util import PERIOD_S
 
 EXAMPLE = examples(
     "python -m trainer evaluate expert --runs 20",
@@ -133,8 +134,13 @@ def evaluate(
     if seed < 0:
         raise UserError(f"seed must be at least 0: {seed}")
     policy, spec = fspath(policy), parse_spec(latency)
-    scenario = scenario_of(scenario or _trained_in(policy, public_key))
-    env = make_environment(scenario, condition)
+    trained_in, period_s = _trained_in(policy, public_key)
+    if scenario is None and ":" in trained_in and policy.endswith(".onnx"):
+        # No policy file decides what is imported.
+        where = f"{trained_in}, of a module: give --scenario {trained_in}"
+        raise UserError(f"{policy} was trained in {where}")
+    scenario = scenario_of(scenario or trained_in)
+    env = make_environment(scenario, condition, period_s=period_s)
     driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     goals = 0
     # The last bits must not depend on the machine's cores.
@@ -151,21 +157,23 @@ def evaluate(
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
 
-def _trained_in(policy: str, public_key: str | None) -> str:
-    """The scenario of a run, a human model or a policy file; of anything else the left turn."""
+def _trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
+    """The scenario of a run, a human model or a policy file, and how long a step was there.
+
+    Of anything else the left turn.
+    """
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
-            return str(read_json(Path(policy) / name, "config").get("scenario"))
-    if policy.endswith(".onnx"):
-        manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
-        config = manifest.training.get("config")
-        named = config.get("scenario") if isinstance(config, dict) else None
-        # One of `deploy policy` names its environment itself.
-        name = str(named or manifest.training.get("environment") or manifest.task)
-        if ":" in name:  # No policy file decides what is imported.
-            raise UserError(f"{policy} was trained in {name}, of a module: give --scenario {name}")
-        return name
-    return "left_turn"
+            known = read_json(Path(policy) / name, "config")
+            return str(known.get("scenario")), known.get("period_s", PERIOD_S)
+    if not policy.endswith(".onnx"):
+        return "left_turn", PERIOD_S
+    manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
+    config = manifest.training.get("config")
+    named = config.get("scenario") if isinstance(config, dict) else None
+    # One of `deploy policy` names its environment itself.
+    name = str(named or manifest.training.get("environment") or manifest.task)
+    return name, manifest.control_period_s
 
 
 class Drive:

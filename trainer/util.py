@@ -27,6 +27,7 @@ import numpy as np
 from edge_runtime.files import check_writable, make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
 
+PERIOD_S = 0.1  # Of an environment that does not say how long a step is
 CPU_INFO = Path("/proc/cpuinfo")
 WRITTEN = ("results/paper", "results/guidance")
 """What the experiments write themselves. Human models, which decide trainings, count as source."""

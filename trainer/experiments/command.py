@@ -35,8 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NAME",
         choices=[*EXPERIMENTS, ALL, STATUS, REPORT, GUIDANCE, TYPICAL],
-        help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need; {STATUS}: how much is "
-        f"done; {REPORT}: draw the figures and judge the claims from what is done; {GUIDANCE}: "
+        help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need, and report; {STATUS}: "
+        f"how much is done; {REPORT}: draw the figures and judge the claims from what is done; "
+        f"{GUIDANCE}: "
         "compute and report the table of human guidance, which is not the paper's, or with "
         f"{STATUS} how much of it is done; "
         f"{TYPICAL}: write the curves that a person's coach shows, from both tables' records",
@@ -136,6 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{len(done)} of {len(wanted)} units were there already{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
-    if names == [GUIDANCE] and store.find(possible)[0]:
-        print(f"wrote {write_guidance(store, arguments.seeds)}")
+    if store.find(possible)[0]:
+        write = write_guidance if names == [GUIDANCE] else write_report
+        print(f"wrote {write(store, arguments.seeds)}")
     return 1 if ends[FAILED] else 0

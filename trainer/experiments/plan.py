@@ -335,7 +335,7 @@ NOT_DECIDING = ("device", "threads", "checkpoint_every", "human", "snapshots")
 
 LATER = (
     "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
-    "delay_known",
+    "delay_known", "period_s",
     "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
     "foresight", "preference_beta",
 )  # fmt: skip

@@ -40,7 +40,7 @@ from trainer.person.interface import (
 from trainer.person.recording import Recorder, Step, packed
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
-from trainer.util import Purpose, episode_seed
+from trainer.util import PERIOD_S, Purpose, episode_seed
 
 EXAMPLE = examples(
     "python -m trainer drive --human keyboard --out runs/drives",
@@ -102,7 +102,7 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
         if asked.at or asked.episode is not None or asked.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        return make_environment(asked.scenario or "left_turn"), seed_of
+        return make_environment(asked.scenario or "left_turn", period_s=PERIOD_S), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario)
     name = scenario_of(asked.scenario or recorded.origin.environment)

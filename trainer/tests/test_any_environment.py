@@ -315,7 +315,25 @@ def test_before_its_first_command_a_car_behind_a_network_has_hands_off():
     assert outer(env.action_range, action).tolist() == [0.0, 0.0]
 
 
-def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
+@pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])
+def test_a_step_that_has_no_length_of_its_own_takes_the_period_that_is_asked_for(
+    words, period_s, tmp_path, capsys
+):
+    command = ["train", "--scenario", f"{__name__}:test/Dark-v0", "--out", str(tmp_path / "run")]
+    short = ["--episodes", "1", "--algorithm", "per_td3", "--set", "evaluate_every_steps=0"]
+    assert main([*command, *short, *words]) == 0
+    said = f"Dark-v0 does not say how long a step is: {period_s} s is taken"
+    assert said in capsys.readouterr().err
+    export(tmp_path / "run", tmp_path / "p.onnx")
+    assert (
+        load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest.control_period_s == period_s
+    )
+    for policy in (tmp_path / "run", tmp_path / "p.onnx"):
+        found = evaluate(policy, scenario=f"{__name__}:test/Dark-v0", runs=1)
+        assert found.report["episode_time_s"]["mean"] == pytest.approx(12 * period_s)
+
+
+def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     env = make_environment(ROVER)
     env.reset(seed=0)
     for expert in (expert_of(env), expert_of(env, f"{__name__}:Careful")):
@@ -332,7 +350,6 @@ def test_experts_rows_and_keys_are_found_by_name(capsys, monkeypatch):
         controls_of(f"{__name__}:test/Dark-v0")
     with pytest.raises(UserError, match="draws no picture"):
         make_environment(f"{__name__}:test/Dark-v0").render()
-    assert "Dark-v0 does not say how long a step is: 0.1 s is taken" in capsys.readouterr().err
     controls = controls_of(ROVER)
     assert controls.rest == pytest.approx((-0.5, -1.0))
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)

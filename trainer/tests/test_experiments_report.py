@@ -397,6 +397,18 @@ def test_without_its_human_a_unit_is_left_out(capsys, tmp_path):
     assert "0 of 16 units were there already" in out
 
 
+def test_an_experiment_ends_with_its_data_figures_and_verdicts(tmp_path, capsys):
+    more = ("--quick", "--scenario", "left_turn", "--runs", tmp_path)
+    status, out, _ = said(capsys, "floor", *more)
+    results = tmp_path / "quick/results"
+    assert (status, out.splitlines()[-1]) == (0, f"wrote {results / 'README.md'}")
+    assert len((results / "left_turn.jsonl").read_text().splitlines()) == 1
+    page = (results / "README.md").read_text()
+    assert "constant actions in the left turn is" in page
+    assert "| [fig7](#fig7" in page
+    assert (results / "fig7.png").stat().st_size > 1000
+
+
 def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
     store = store_in(tmp_path)
     write_human(store)

@@ -40,7 +40,7 @@ from trainer.pictures import write_learning_curve
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import claimed
+from trainer.util import PERIOD_S, claimed
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
@@ -97,6 +97,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="change a setting, as often as you like; without a value: list all with their "
         "defaults and meanings",
+    )
+    what.add_argument(
+        "--period",
+        action=_Set,
+        dest="set",
+        type=lambda text: f"period_s={text}",
+        default=[],
+        metavar="SECONDS",
+        help=f"seconds of a step, for an environment that does not say (default: {PERIOD_S})",
     )
     options.add_latency(what, "the network between policy and vehicle, also in validation")
     guide = parser.add_argument_group("the human")

@@ -7,7 +7,7 @@ from typing import Any
 
 from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
-from trainer.util import FROM_ONE, SHARE, check_ranges
+from trainer.util import FROM_ONE, PERIOD_S, SHARE, check_ranges
 
 MOST_THREADS = 1024
 """More than a machine could use. Torch dies where the system has fewer than it asks for."""
@@ -64,6 +64,8 @@ class RunConfig:
     """Share of the human's actions that are replaced by wrong ones (section VII-E: one third)."""
     poor_guidance: str = RANDOM
     """How they are wrong: ``random`` (the paper's), or ``biased``, always the same."""
+    period_s: float = PERIOD_S
+    """Seconds of a step, in an environment that does not say."""
     printed_reward: bool = False
     """Weight 1 on the term of eq. 31 or 32, as the equations are printed, instead of the scenario's
     own (``LeftTurnConfig.speed_weight``, ``CongestionConfig.steer_weight``)."""

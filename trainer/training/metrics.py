@@ -238,7 +238,9 @@ class Trials:
             for run in range(config.evaluation_runs)
         ]
         self.envs = [
-            make_environment(config.scenario, printed_reward=config.printed_reward)
+            make_environment(
+                config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
+            )
             for _ in self._seeds[: None if config.scenario in SCENARIOS else MOST_ENVIRONMENTS]
         ]
 

@@ -88,7 +88,9 @@ class TrainingRun:
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
+        self.env = make_environment(
+            config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
+        )
         if self.algorithm.foresight:
             check_foresight(self.env)
         self._copied = self.env  # the bare environment: a person's run wraps `self.env` later
