@@ -171,7 +171,7 @@ class Adapted:
         self.env, self.scenario = env, name
         self.unwrapped: Any = env.unwrapped
         self.observation_space = env.observation_space
-        task = bridge.describe(env, period_s or PERIOD_S)
+        task = bridge.describe(env, PERIOD_S if period_s is None else period_s)
         self.layout = _layout(task, isinstance(env.observation_space, Dict))
         self.control_period_s = task.control_period_s
         self.action_names = tuple(row.name for row in task.action)

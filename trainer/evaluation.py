@@ -23,6 +23,7 @@ from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, limited_threads
+from trainer.training.config import period_of
 from trainer.training.delayed import VehicleEnd
 from trainer.util import PERIOD_S
 
@@ -134,12 +135,11 @@ def evaluate(
     if seed < 0:
         raise UserError(f"seed must be at least 0: {seed}")
     policy, spec = fspath(policy), parse_spec(latency)
-    trained_in, period_s = _trained_in(policy, public_key)
-    if scenario is None and ":" in trained_in and policy.endswith(".onnx"):
+    named, period_s = trained_in(policy, public_key)
+    if scenario is None and ":" in named and policy.endswith(".onnx"):
         # No policy file decides what is imported.
-        where = f"{trained_in}, of a module: give --scenario {trained_in}"
-        raise UserError(f"{policy} was trained in {where}")
-    scenario = scenario_of(scenario or trained_in)
+        raise UserError(f"{policy} was trained in {named}, of a module: give --scenario {named}")
+    scenario = scenario_of(scenario or named)
     env = make_environment(scenario, condition, period_s=period_s)
     driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     goals = 0
@@ -157,7 +157,7 @@ def evaluate(
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
 
-def _trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
+def trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
     """The scenario of a run, a human model or a policy file, and how long a step was there.
 
     Of anything else the left turn.
@@ -165,7 +165,7 @@ def _trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
             known = read_json(Path(policy) / name, "config")
-            return str(known.get("scenario")), known.get("period_s", PERIOD_S)
+            return str(known.get("scenario")), period_of(known)
     if not policy.endswith(".onnx"):
         return "left_turn", PERIOD_S
     manifest = load_policy(policy, public_key, allow_unsigned=True).manifest

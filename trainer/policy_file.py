@@ -25,8 +25,7 @@ from edge_runtime.util import UserError, read_json
 from trainer.drivers import load_actor
 from trainer.environments import entries_of, make_environment, task_of
 from trainer.learner.networks import Actor
-from trainer.training.config import CONFIG_FILE
-from trainer.util import PERIOD_S
+from trainer.training.config import CONFIG_FILE, period_of
 
 EXAMPLE = examples(
     "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key"
@@ -105,7 +104,7 @@ def export_policy(
 
     Raises UserError: the file would not do what the network does.
     """
-    env = make_environment(label["scenario"], period_s=training.get("period_s", PERIOD_S))
+    env = make_environment(label["scenario"], period_s=period_of(training))
     network = _InOwnUnits(actor, env.action_range).eval()
     observations = real_observations(label["scenario"], PARITY_OBSERVATIONS)
     task = task_of(env)

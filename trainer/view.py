@@ -70,7 +70,10 @@ EPISODES = (
     Plot("loss", "Losses, means of an episode"),
     Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
     Plot("human", "The human's share of the steps", (-0.05, 1.05)),
-    Plot("cost", "So far: the human's seconds, take-overs, failures"),
+    Plot(
+        "cost",
+        "So far: the human's seconds, take-overs, failures; its seconds until 90 and 98 % alone",
+    ),
 )
 SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
 """The plots of recorded sittings, which hold nothing of a learner."""

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seeds",
         type=whole_number(1, MOST_SEEDS),
         default=plan.DEFAULT_SEEDS,
-        help="trainings of each algorithm in each setting",
+        help="trainings of each algorithm in each setting; the page tells of these alone",
     )
     what.add_argument(
         "--scenario",

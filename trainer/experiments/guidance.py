@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, product
 from pathlib import Path
-from statistics import median_high
+from statistics import mean, median_high
 from typing import Any
 
 import numpy as np
@@ -95,10 +95,12 @@ def _introduction(results: Results, store: Store) -> Iterator[str]:
         "# The fair table of human guidance",
         "",
         "What does each way of learning from a human cost the human, and what comes of it? Every "
-        f"row has the same scenes, human and budget of environment steps ({budgets}). **Every "
-        "human here is a script or a model of one: no person's cost is claimed.** Seconds are "
-        "simulated ones in which the human drove. Watching is not in them: the human watches all "
-        "the time, and beside the robot that asks for the first 500 steps.",
+        f"row has the same scenes, human and budget of environment steps ({budgets}); [what each "
+        "learns from](#what-the-rows-are). Left turn and congestion are ours, hill is a car that "
+        "is too weak for its hill, racetrack is highway-env's. **Every human here is a script or "
+        "a model of one: no person's cost is claimed.** Seconds are simulated ones in which the "
+        "human drove. Watching is not in them: the human watches all the time, with *the robot "
+        "asks* the first 500 steps.",
         "",
         f"`{report.COMMAND} {plan.GUIDANCE}` computes what is missing and writes this page. "
         f"{len(results.found)} of {wanted} trainings and tests are there.",
@@ -129,7 +131,7 @@ def _in_short(results: Results) -> Iterator[str]:
         told = (cell(found[task]) if found[task] else "–" for task, cell in cells.values())
         compared = row in plan.HELPED and row != PHIL
         rows.append((Line(row).name, *told, _less(_both_scenes(results, row)) if compared else "–"))
-    yield from markdown_table(("", *cells, "less than PHIL-TD3"), rows)
+    yield from markdown_table(("", *cells, "pairs with less than PHIL-TD3"), rows)
     late = [row for row in plan.ROWS if not learns(results, row)]
     names = ", ".join(Line(row).name for row in late)
     yield from (
@@ -141,6 +143,8 @@ def _in_short(results: Results) -> Iterator[str]:
         forgiven(results),
         "",
         f"![What each row cost the human, and what came of it]({plan.GUIDANCE}.png)",
+        "",
+        "A dot is a seed, the bar their middle (above) or mean (below), red is PHIL-TD3.",
         "",
     )
 
@@ -180,18 +184,18 @@ def forgiven(results: Results) -> str:
     return (
         f"- **Who forgives.** At least {LEARNED:.0%} success, on average, beside each of [the "
         f"humans in the left turn](#which-row-forgives-which-human): {', '.join(good) or 'no row'}."
-        + f" Less beside some: {'; '.join(less)}."
-        * bool(less)
+        + (f" Less beside some: {'; '.join(less)}." if less else "")
     )
 
 
 def _forgiveness(results: Results) -> Iterator[str]:
     yield from ("## Which row forgives which human", "", "In the left turn, the humans are:")
     yield ""
-    yield from (f"- {data.words(name)}: {human.meaning}" for name, human in plan.HUMANS.items())
+    for name, human in plan.HUMANS.items():
+        counts = sorted({len(its) for its in _beside(results, name)}) or [0]
+        seeds = " to ".join(map(str, {counts[0]: "", counts[-1]: ""}))
+        yield f"- {data.words(name)}: {human.meaning} ({seeds} seeds)"
     yield from ("", *_beside_each(results, "success, nominal, %", _success("nominal")))
-    if missing := [data.words(human) for human in plan.HUMANS if not _beside(results, human)]:
-        yield f"Not yet computed: {', '.join(missing)}."
 
 
 def _beside(results: Results, human: str) -> list[list[Result]]:
@@ -229,14 +233,13 @@ def _all_numbers(results: Results, store: Store) -> Iterator[str]:
         "0.1 s (hill: 1/30, racetrack: 0.2). The two tasks that are not ours have three seeds, "
         "and neither variant nor dense traffic.",
         "",
-        "How the processors multiplied, which changes the bits of a training and no setting: "
-        f"{report.computed_in(results, lines, TASKS)}.",
+        f"Computed in {report.computed_in(results, lines, TASKS)}: the same settings, other bits.",
         "",
         f"What a training cost, with {plan.HUMANS[plan.GOOD].meaning}:",
         "",
         *report.table(results, product(TASKS, rows), COSTS),
         "What came of it, the policy alone. Lost at the end: how far the validations of the last "
-        f"{data.END_STEPS:,} steps are below the best one, which chance makes better, too. The "
+        f"{data.END_STEPS:,} steps are below the best one; the best of many is partly luck. The "
         "last column is the return less that of the human; of a human itself, less the expert's.",
         "",
         *report.table(results, product(TASKS, [*rows, *humans]), outcomes(results), True),
@@ -246,7 +249,7 @@ def _all_numbers(results: Results, store: Store) -> Iterator[str]:
         "",
     )
     columns = {**COSTS, **outcomes(results)}
-    for title in ("seeds", S_TO_LEARNED, "failed episodes", "lost at the end, points", RETURN):
+    for title in (S_TO_LEARNED, "failed episodes", "lost at the end, points", RETURN):
         yield from _beside_each(results, title, columns[title])
 
 
@@ -288,10 +291,10 @@ def _place(results: Results) -> Iterator[str]:
         "The rule, made before the trainings of this table and after those that tuned its rows: "
         "PHIL-TD3 stays what `trainer train` trains by default unless a row needs less of the "
         f"human to {LEARNED:.0%} in {ENOUGH} of the {PAIRS} pairs of the left turn and the "
-        f"congestion ({plan.DEFAULT_SEEDS} seeds each), and its success is behind PHIL-TD3's in "
-        "none of nominal, noise and variant there, by an interval below 0. Of several such rows it "
-        "is the one with the least human seconds (this sentence came after the first 68 units, and "
-        "has decided nothing). However small a pair's difference is, it counts.",
+        f"congestion ({plan.DEFAULT_SEEDS} seeds each), and the row's success is behind "
+        "PHIL-TD3's in none of nominal, noise and variant there, by an interval below 0. Of "
+        "several such rows it is the one with the least human seconds (this sentence came after "
+        "the first 68 units, and has decided nothing). However small a pair's difference is, it counts.",
         "",
     )
     rivals = [row for row in plan.HELPED if row != PHIL]
@@ -306,7 +309,7 @@ def _verdict(results: Results) -> str:
     fewest = min(len(_both_scenes(judged, row)) for row in rivals)
     if fewest < PAIRS:
         return f"The default cannot be judged yet: of one row {fewest} of {PAIRS} pairs are there."
-    return f"By the rule it is {Line(best_by_rule(judged, rivals)).name}."
+    return f"By the rule the default is {Line(best_by_rule(judged, rivals)).name}."
 
 
 def best_by_rule(results: Results, rivals: Sequence[str]) -> str:
@@ -419,7 +422,8 @@ def draw(results: Results) -> Figure:
     panels = figure.subplots(2, len(TASKS), sharey=True)
     heights = -np.arange(len(plan.ROWS))
     for (above, below), task in zip(panels.T, TASKS, strict=True):
-        costs, shares = ([], [])  # type: tuple[list[list[float]], list[list[float]]]
+        costs: list[list[float]] = []
+        shares: list[list[float]] = []
         for row in plan.ROWS:
             found = results.of(task, Line(row, plan.GOOD))
             its = (one.until(LEARNED) for one in found if row in plan.HELPED)
@@ -427,13 +431,16 @@ def draw(results: Results) -> Figure:
             shares.append([100.0 * one.mean("nominal", data.SUCCESS) for one in found])
         most = max((s for s in chain(*costs) if np.isfinite(s)), default=1.0)
         never = 1.15 * most
-        _dots(above, heights, [[min(s, never) for s in each] for each in costs])
+        _dots(above, heights, [[min(s, never) for s in each] for each in costs], median_high)
+        above.text(
+            0.02 * most, heights[plan.ROWS.index("per_td3")], "no human", va="center", fontsize=8
+        )
         above.axvline(1.08 * most, color="0.6", lw=0.8, ls=":")
         above.text(never, 0.8, "never", ha="center", fontsize=8)
         above.set(title=data.words(task), xlim=(0.0, 1.25 * most))
         above.set_xticks([tick for tick in above.get_xticks() if tick <= most])
-        above.set_xlabel(f"human s to {LEARNED:.0%}", fontsize=9)
-        _dots(below, heights, shares)
+        above.set_xlabel(f"seconds of the human until {LEARNED:.0%} alone", fontsize=9)
+        _dots(below, heights, shares, mean)
         below.set(xlim=(-4.0, 104.0))
         below.set_xlabel("success, nominal tests, %", fontsize=9)
     for panel in panels[:, 0]:
@@ -442,12 +449,18 @@ def draw(results: Results) -> Figure:
     return figure
 
 
-def _dots(panel: Axes, heights: NDArray[np.int64], rows: Sequence[Sequence[float]]) -> None:
-    """A dot for each number of a row, a bar for their median."""
+def _dots(
+    panel: Axes,
+    heights: NDArray[np.int64],
+    rows: Sequence[Sequence[float]],
+    middle: Callable[[Sequence[float]], float],
+) -> None:
+    """A dot for each number of a row, beside one another, and a bar for their middle."""
     panel.grid(axis="x", alpha=0.3)
     for row, height, numbers in zip(plan.ROWS, heights, rows, strict=True):
         colour = "C3" if row == PHIL else "C0"
         panel.axhline(height, color="0.93", lw=0.8, zorder=0)
-        panel.plot(numbers, [height] * len(numbers), "o", ms=5, alpha=0.55, mew=0, color=colour)
         if numbers:  # None where a row has no human
-            panel.plot([median_high(numbers)] * 2, [height - 0.3, height + 0.3], lw=2, color=colour)
+            places = height + np.linspace(0.2, -0.2, len(numbers))
+            panel.plot(numbers, places, "o", ms=4, alpha=0.55, mew=0, color=colour)
+            panel.plot([middle(numbers)] * 2, [height - 0.35, height + 0.35], lw=2, color=colour)

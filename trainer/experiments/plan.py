@@ -19,7 +19,7 @@ from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.model import MODEL_FILE
 from trainer.learner.config import ALGORITHMS, FASTER, Algorithm
 from trainer.training.config import BIASED as BIASED_GUIDANCE
-from trainer.training.config import PRESETS, RunConfig
+from trainer.training.config import LATER, PRESETS, RunConfig
 
 FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}  # Scenario -> distance from start to goal
 SCENARIOS = tuple(FULL_PATH_M)
@@ -333,18 +333,12 @@ ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every", "human", "snapshots")
 """Fields of a run's config that do not decide its result; the human model's contents do."""
 
-LATER = (
-    "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
-    "delay_known", "period_s",
-    "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
-    "foresight", "preference_beta",
-)  # fmt: skip
-"""Fields of a run's config and of an algorithm's row that came after the first records. At their
-default they are left out of the id, so that older records keep theirs."""
-
 
 def decided(values: Mapping[str, Any], default: Any, left_out: Collection[str]) -> dict[str, Any]:
-    """The fields of a config or a row that decide, with ``default`` as the dataclass makes it."""
+    """The fields of a config or a row that decide, with ``default`` as the dataclass makes it.
+
+    Later ones at their default are left out of the id, so that older records keep theirs.
+    """
     return {
         name: decided(value, default.learner, ()) if name == "learner" else value
         for name, value in values.items()

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from bridge.progress import ProgressBar
 from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
@@ -499,8 +500,10 @@ def write_report(
     results = data.load(store, seeds, name)
     if not results.found:
         raise UserError(f"there are no results to report in {store.results}")
-    for title, draw in figures.items():
-        write_figure(draw(results), store.results / f"{title}.png")
+    with ProgressBar("report", len(figures)) as bar:
+        for title, draw in figures.items():
+            write_figure(draw(results), store.results / f"{title}.png")
+            bar.advance({"drawn": title})
     path = store.results / "README.md"
     write_atomic(path, ("\n".join(page(results, store)) + "\n").encode())
     return path

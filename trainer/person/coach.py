@@ -144,12 +144,12 @@ def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
         f"{cost['human_s']:.0f} s at the wheel, {counted(int(cost['takeovers']), 'take-over')}, "
         f"{counted(int(cost['failures']), 'failure')}."
     )
-    there = [
-        f"{whose} after {next(human_s for human_s, success in its if success >= LEARNED):.0f} s"
-        for whose, its in (("yours", curve), ("a scripted human's", typical))
-        if any(success >= LEARNED for _, success in its)
-    ]
-    return f"{given} {LEARNED:.0%} alone: {', '.join(there)}." if there else given
+    after = {
+        whose: next((human_s for human_s, success in its if success >= LEARNED), None)
+        for whose, its in (("you", curve), ("a scripted human", typical))
+    }
+    there = [f"after {human_s:.0f} s of {who}" for who, human_s in after.items() if human_s]
+    return f"{given} The policy alone: {LEARNED:.0%} {', '.join(there)}." if there else given
 
 
 def typical_curve(scenario: str, algorithm: str) -> Curve:

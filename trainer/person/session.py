@@ -23,6 +23,7 @@ from edge_runtime.cli import add_public_key, examples, positive, quit_on_signals
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
 from trainer.environments import Adapted, make_environment, scenario_of
+from trainer.evaluation import trained_in
 from trainer.human.guide import Action, Driver, Observation
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.coach import Coach, Episode
@@ -102,7 +103,10 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
         if asked.at or asked.episode is not None or asked.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        return make_environment(asked.scenario or "left_turn", period_s=PERIOD_S), seed_of
+        period_s = PERIOD_S
+        if asked.policy is not None:
+            _, period_s = trained_in(asked.policy, asked.public_key)
+        return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario)
     name = scenario_of(asked.scenario or recorded.origin.environment)

@@ -331,6 +331,10 @@ def test_a_step_that_has_no_length_of_its_own_takes_the_period_that_is_asked_for
     for policy in (tmp_path / "run", tmp_path / "p.onnx"):
         found = evaluate(policy, scenario=f"{__name__}:test/Dark-v0", runs=1)
         assert found.report["episode_time_s"]["mean"] == pytest.approx(12 * period_s)
+    config = tmp_path / "run/config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "period_s": "long"}))
+    with pytest.raises(UserError, match=r"period_s .* is no number: 'long'"):
+        evaluate(tmp_path / "run", scenario=f"{__name__}:test/Dark-v0", runs=1)
 
 
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):

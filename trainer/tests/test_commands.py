@@ -75,6 +75,8 @@ TOLD = [
     ("plot one two --out c.png", "one holds no metrics"),
     ("plot one two", "several runs go into one picture"),
     ("experiment fig99", "invalid choice"),
+    ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
+    ("train --out x --period 0", "argument --period"),
     ("experiment fig7 --seeds 0", "--seeds"),
     ("experiment report status", "stand alone"),
     ("experiment fig7 --ray auto --device cuda", "on processors"),
@@ -204,7 +206,8 @@ def test_changed_settings_are_named_as_they_are_given(config):
     ) in refused(values)
     given = GIVEN.replace("keyboard", "expert").split()
     assert "is not a checkpoint of this project" in refused({**values, "human": "expert"}, *given)
-    del values["learner"]["gamma"], values["averaged_actor"]
+    # What came later had its default.
+    del values["learner"]["gamma"], values["averaged_actor"], values["period_s"]
     err = refused(values, *GIVEN.split())
     assert "no averaged_actor (now True), no gamma (now 0.95): repeat" in err
 

@@ -18,6 +18,7 @@ from trainer.experiments import plan as planned
 from trainer.experiments import run as running
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
+from trainer.training.config import LATER
 from trainer.training.metrics import METRICS_FILE
 from trainer.training.run import TrainingRun
 
@@ -181,7 +182,7 @@ class TestIds:
         ids.append(id_of())
         assert len(set(ids)) == len(ids)
         # What came after the first records decides where it is used only.
-        later = set(planned.LATER)
+        later = set(LATER)
         for setting, names in (("normal", set()), ("late", {"late_from_s", "late_to_s"})):
             found = planned.deciding(GUIDED._replace(setting=setting), TINY, store.humans)
             assert later & {*found["config"], *found["switches"]} == names

@@ -90,7 +90,7 @@ def test_the_view_holds_the_run(shown):
         "/priority/human": "human_priority", "/priority/policy": "policy_priority",
         "/success/validation": "validation_success", "/cost/human_s": "total_human_s",
         "/cost/takeovers": "total_takeovers", "/cost/failures": "total_failures",
-        "/cost/human_s_to_90": "human_s_to_90",
+        "/cost/human_s_to_90": "human_s_to_90", "/cost/human_s_to_98": "human_s_to_98",
     }.items():  # fmt: skip
         said = zip(ends, (row[column] for row in metrics), strict=True)
         expected = {int(end): float(value) for end, value in said if value != "nan"}

@@ -22,7 +22,7 @@ from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from bridge.rerun import check_sink
-from edge_runtime.cli import INTERRUPTED, examples, quit_on_signals
+from edge_runtime.cli import INTERRUPTED, examples, positive_number, quit_on_signals
 from edge_runtime.util import UserError, counted, read_json, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
@@ -37,7 +37,7 @@ from trainer.person.interface import (
     check_person_options,
 )
 from trainer.pictures import write_learning_curve
-from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
+from trainer.training.config import CONFIG_FILE, LATER, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 from trainer.util import PERIOD_S, claimed
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--period",
         action=_Set,
         dest="set",
-        type=lambda text: f"period_s={text}",
+        type=lambda text: f"period_s={positive_number(text)}",
         default=[],
         metavar="SECONDS",
         help=f"seconds of a step, for an environment that does not say (default: {PERIOD_S})",
@@ -310,8 +310,9 @@ def _summary(run_dir: Path, period_s: float) -> str:
     amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
     steps = counted(found["human_steps"], "step")
     human = f"{counted(found['takeovers'], 'take-over')} with {steps}, {found['human_s']:.0f} s"
-    for level, there in found["until"].items():
-        human += f" ({there['human_s']:.0f} until {float(level):.0%} alone)" if there else ""
+    alone = [f"{float(level):.0%} alone after {there['human_s']:.0f}"
+             for level, there in found["until"].items() if there]  # fmt: skip
+    human += f" ({', '.join(alone)})" if alone and found["human_steps"] else ""
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
@@ -417,6 +418,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
     saved, wanted = _flat(read_json(path, "run config")), _flat(asdict(config))
+    saved = {name: SETTINGS[name] for name in LATER if name in SETTINGS} | saved
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []

@@ -2,9 +2,11 @@
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.util import FROM_ONE, PERIOD_S, SHARE, check_ranges
@@ -16,8 +18,17 @@ RANGES = {
     SHARE: ("guided_share", "poor_guidance_share", "missed_share"),
     (0, 2**63 - 1): ("seed",),
     (0, MOST_THREADS): ("threads",),
+    (MIN_PERIOD_S, MAX_PERIOD_S): ("period_s",),
 }
 """What these numbers may be; all others are at least 0."""
+LATER = (
+    "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
+    "delay_known", "period_s",
+    "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
+    "foresight", "preference_beta",
+)  # fmt: skip
+"""Fields of a run's config and of an algorithm's row that came after the first records. A run or a
+record without one had its default."""
 CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
 """A run's settings in its directory; the first with the source's revision, the second for
 ``--config``."""
@@ -133,6 +144,14 @@ class RunConfig:
             "episode": episode,
             **known,
         }
+
+
+def period_of(config: Mapping[str, Any]) -> float:
+    """How long a step was in a saved run, s; UserError where its config is damaged."""
+    period_s = config.get("period_s", PERIOD_S)
+    if not isinstance(period_s, int | float):
+        raise UserError(f"period_s of the run's config is no number: {period_s!r}")
+    return period_s
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)

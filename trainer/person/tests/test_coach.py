@@ -47,9 +47,9 @@ def test_what_was_given_stands_beside_what_is_typical():
     given = "42 s at the wheel, 1 take-over, 2 failures."
     assert said(cost, [], []) == said(cost, [], [(10.0, 0.89)]) == given
     there = [(10.0, 0.5), (28.3, 0.9), (30.0, 0.8)]
-    assert said(cost, [], there) == f"{given} 90% alone: a scripted human's after 28 s."
-    both = "yours after 41 s, a scripted human's after 28 s"
-    assert said(cost, [(20.0, 0.0), (41.4, 0.9)], there) == f"{given} 90% alone: {both}."
+    assert said(cost, [], there) == f"{given} The policy alone: 90% after 28 s of a scripted human."
+    both = "after 41 s of you, after 28 s of a scripted human"
+    assert said(cost, [(20.0, 0.0), (41.4, 0.9)], there) == f"{given} The policy alone: 90% {both}."
 
 
 def test_the_shipped_curves_rise_in_both_scenarios_and_no_other_has_any():
