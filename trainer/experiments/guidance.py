@@ -294,7 +294,8 @@ def _place(results: Results) -> Iterator[str]:
         f"congestion ({plan.DEFAULT_SEEDS} seeds each), and the row's success is behind "
         "PHIL-TD3's in none of nominal, noise and variant there, by an interval below 0. Of "
         "several such rows it is the one with the least human seconds (this sentence came after "
-        "the first 68 units, and has decided nothing). However small a pair's difference is, it counts.",
+        "the first 68 units, and has decided nothing). However small a pair's difference is, it "
+        "counts.",
         "",
     )
     rivals = [row for row in plan.HELPED if row != PHIL]
