@@ -17,6 +17,7 @@ from trainer.environments import CONDITIONS
 from trainer.experiments import plan
 from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit
 from trainer.experiments.run import TEST_COLUMNS, Store
+from trainer.training.metrics import is_reached
 
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
@@ -245,7 +246,7 @@ class Result:
         """What it cost until the policy alone reached ``level`` in validation; None: never."""
         columns = self.record["validation"]
         steps = zip(columns["at_step"], columns["success"], strict=True)
-        there = [step for step, success in steps if success >= level - 1e-9]
+        there = [step for step, success in steps if is_reached(level, success)]
         return self._costs_at(there[0]) if there else None
 
     def given(self) -> Numbers:

@@ -29,6 +29,7 @@ from trainer.training import metrics
 
 TASKS = (*plan.SCENARIOS, *plan.FOREIGN)
 PHIL = "phil_td3"
+RIVALS = tuple(row for row in plan.HELPED if row != PHIL)
 PAIRS = len(plan.SCENARIOS) * plan.DEFAULT_SEEDS
 ENOUGH = 9  # Of these pairs: an equal row has so many by chance in one of 93 cases
 MOST_EPISODES = 100  # In which a row is to learn
@@ -129,8 +130,8 @@ def _in_short(results: Results) -> Iterator[str]:
     for row in plan.ROWS:
         found = {task: results.of(task, Line(row, plan.GOOD)) for task in TASKS}
         told = (cell(found[task]) if found[task] else "–" for task, cell in cells.values())
-        compared = row in plan.HELPED and row != PHIL
-        rows.append((Line(row).name, *told, _less(_both_scenes(results, row)) if compared else "–"))
+        less = _less(_both_scenes(results, row)) if row in RIVALS else "–"
+        rows.append((Line(row).name, *told, less))
     yield from markdown_table(("", *cells, "pairs with less than PHIL-TD3"), rows)
     late = [row for row in plan.ROWS if not learns(results, row)]
     names = ", ".join(Line(row).name for row in late)
@@ -153,8 +154,13 @@ def _nominal(found: Sequence[Result]) -> float:
     return 100.0 * float(np.mean([one.mean("nominal", data.SUCCESS) for one in found]))
 
 
+def _fewer(pairs: Sequence[tuple[float, float]]) -> int:
+    """In how many pairs a row needs less of the human than PHIL-TD3."""
+    return sum(own < phil for own, phil in pairs)
+
+
 def _less(pairs: Sequence[tuple[float, float]]) -> str:
-    return f"{sum(own < other for own, other in pairs)} of {len(pairs)}"
+    return f"{_fewer(pairs)} of {len(pairs)}"
 
 
 def learns(results: Results, row: str) -> bool:
@@ -192,8 +198,8 @@ def _forgiveness(results: Results) -> Iterator[str]:
     yield from ("## Which row forgives which human", "", "In the left turn, the humans are:")
     yield ""
     for name, human in plan.HUMANS.items():
-        counts = sorted({len(its) for its in _beside(results, name)}) or [0]
-        seeds = " to ".join(map(str, {counts[0]: "", counts[-1]: ""}))
+        counts = [len(its) for its in _beside(results, name)] or [0]
+        seeds = " to ".join(map(str, sorted({min(counts), max(counts)})))
         yield f"- {data.words(name)}: {human.meaning} ({seeds} seeds)"
     yield from ("", *_beside_each(results, "success, nominal, %", _success("nominal")))
 
@@ -285,7 +291,7 @@ def _place(results: Results) -> Iterator[str]:
         "With the same human: each row less PHIL-TD3, pair by pair of seeds; of the human's "
         "seconds the median, the least and the most. ∞: the row never gets there; -∞: PHIL-TD3 "
         "never does; a pair in which neither does counts as 0. "
-        f"{len(plan.HELPED) - 1} rows are compared in {len(TASKS)} tasks: one or two of so many "
+        f"{len(RIVALS)} rows are compared in {len(TASKS)} tasks: one or two of so many "
         "intervals leave 0 out by chance.",
         "",
         "The rule, made before the trainings of this table and after those that tuned its rows: "
@@ -298,19 +304,17 @@ def _place(results: Results) -> Iterator[str]:
         "counts.",
         "",
     )
-    rivals = [row for row in plan.HELPED if row != PHIL]
-    lines = [Line(row, plan.GOOD) for row in rivals]
+    lines = [Line(row, plan.GOOD) for row in RIVALS]
     yield from report.table(results, product(TASKS, lines), place_columns(results))
     yield from (_verdict(results), "")
 
 
 def _verdict(results: Results) -> str:
-    rivals = [row for row in plan.HELPED if row != PHIL]
     judged = replace(results, seeds=plan.DEFAULT_SEEDS)
-    fewest = min(len(_both_scenes(judged, row)) for row in rivals)
+    fewest = min(len(_both_scenes(judged, row)) for row in RIVALS)
     if fewest < PAIRS:
         return f"The default cannot be judged yet: of one row {fewest} of {PAIRS} pairs are there."
-    return f"By the rule the default is {Line(best_by_rule(judged, rivals)).name}."
+    return f"By the rule the default is {Line(best_by_rule(judged, RIVALS)).name}."
 
 
 def best_by_rule(results: Results, rivals: Sequence[str]) -> str:
@@ -328,7 +332,7 @@ def _takes_its_place(results: Results, row: str) -> bool:
     lines = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
     over = (results.differences(scene, *lines, data.SUCCESS) for scene in data.PAPER_SCENES)
     behind = any(data.mean_estimate(points.values()).high < 0.0 for points in over)
-    return sum(own < its for own, its in _both_scenes(results, row)) >= ENOUGH and not behind
+    return _fewer(_both_scenes(results, row)) >= ENOUGH and not behind
 
 
 def _both_scenes(results: Results, row: str) -> list[tuple[float, float]]:
@@ -387,8 +391,8 @@ def _estimate(number: Callable[[Result], float], digits: int = 0) -> Cell:
     """The mean of what is never below 0, and so is its interval."""
 
     def cell(found: Sequence[Result]) -> str:
-        mean = data.mean_estimate(number(one) for one in found if one.unit.trained)
-        return mean._replace(low=max(mean.low, 0.0) if mean.size > 1 else mean.low).text(digits)
+        its = data.mean_estimate(number(one) for one in found if one.unit.trained)
+        return its._replace(low=max(its.low, 0.0) if its.size > 1 else its.low).text(digits)
 
     return cell
 
@@ -433,9 +437,9 @@ def draw(results: Results) -> Figure:
         most = max((s for s in chain(*costs) if np.isfinite(s)), default=1.0)
         never = 1.15 * most
         _dots(above, heights, [[min(s, never) for s in each] for each in costs], median_high)
-        above.text(
-            0.02 * most, heights[plan.ROWS.index("per_td3")], "no human", va="center", fontsize=8
-        )
+        for row, height in zip(plan.ROWS, heights, strict=True):
+            if row not in plan.HELPED:
+                above.text(0.02 * most, height, "no human", va="center", fontsize=8)
         above.axvline(1.08 * most, color="0.6", lw=0.8, ls=":")
         above.text(never, 0.8, "never", ha="center", fontsize=8)
         above.set(title=data.words(task), xlim=(0.0, 1.25 * most))

@@ -121,7 +121,7 @@ class MetricsWriter:
         metrics.total_human_s = round(self._spent["human_s"], 6)
         metrics.total_takeovers, metrics.total_failures = self._spent["takeovers"], self._failures
         for level in LEARNED:
-            if metrics.validation_success >= level - 1e-9:
+            if is_reached(level, metrics.validation_success):
                 self._human_s_to.setdefault(f"{level:g}", metrics.total_human_s)
         metrics.human_s_to_90, metrics.human_s_to_98 = (
             self._human_s_to.get(f"{level:g}", NAN) for level in LEARNED
@@ -182,6 +182,11 @@ LEARNED = (0.9, 0.98)
 """Success of the policy alone, in validation, at which one asks what it has cost."""
 
 
+def is_reached(level: float, success: float) -> bool:
+    """Whether a success rate is at a level, but for the last bits of a mean."""
+    return success >= level - 1e-9
+
+
 def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     """What these episodes have cost: steps, the human's effort, failures by their outcome."""
     human_steps = sum(int(row["human_steps"]) for row in rows)
@@ -217,7 +222,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
         validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
     until = {}
     for level in LEARNED:
-        there = [number for success, number in measured if success >= level - 1e-9]
+        there = [number for success, number in measured if is_reached(level, success)]
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
