@@ -14,6 +14,7 @@ from pathlib import Path
 from bridge.report import failed
 from edge_runtime.util import counted
 from trainer.training.metrics import LEARNED as LEVELS
+from trainer.training.metrics import is_reached
 
 LEARNED, WELL = LEVELS
 """Success of the policy alone from which the person only watches, and from which all is done."""
@@ -117,9 +118,9 @@ def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[i
     ``alone`` is the newest success of the policy alone, 0 to 1, where it is known; ``mastered``:
     episode -> whether the policy alone reaches the goal in it today.
     """
-    if alone is not None and alone >= WELL:
+    if alone is not None and is_reached(WELL, alone):
         return f"The policy alone reaches {alone:.0%}: you may stop here."
-    if alone is not None and alone >= LEARNED:
+    if alone is not None and is_reached(LEARNED, alone):
         return f"The policy alone reaches {alone:.0%}: watch only."
     late = sum(episode.unattended for episode in episodes)
     if late >= LATE_ONES:
@@ -145,7 +146,7 @@ def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
         f"{counted(int(cost['failures']), 'failure')}."
     )
     after = {
-        whose: next((human_s for human_s, success in its if success >= LEARNED), None)
+        whose: next((human_s for human_s, success in its if is_reached(LEARNED, success)), None)
         for whose, its in (("you", curve), ("a scripted human", typical))
     }
     there = [f"after {human_s:.0f} s of {who}" for who, human_s in after.items() if human_s]
