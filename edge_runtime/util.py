@@ -125,7 +125,9 @@ def ending_signals() -> Set[int]:
 
 
 def take_signals(
-    numbers: Iterable[int], handler: Callable[[int, Any], Any], undo: contextlib.ExitStack
+    numbers: Iterable[int],
+    handler: Union[Callable[[int, Any], Any], signal.Handlers],
+    undo: contextlib.ExitStack,
 ) -> None:
     """Let `handler` have these signals until `undo` closes. Nothing outside of the main thread."""
     if threading.current_thread() is threading.main_thread():

@@ -43,8 +43,8 @@ from deploy.installer.verify import (
     read_public_key,
     ssh_key,
 )
-from edge_runtime.cli import ArgumentParser, number, run_cli
-from edge_runtime.util import UserError
+from edge_runtime.cli import SIGNALS, ArgumentParser, number, run_cli
+from edge_runtime.util import UserError, take_signals
 
 COMMANDS = {
     "install": (
@@ -116,7 +116,7 @@ def _dispatch(arguments: argparse.Namespace) -> int:
         return 0
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    for one in (signal.SIGTERM, signal.SIGINT):
+    for one in SIGNALS:
         signal.signal(one, signal.default_int_handler)
     installer = Installer(layout, service, Limits(arguments.health_limit, arguments.settle))
     if command == "install":
@@ -291,7 +291,10 @@ class Installer:
             # not served yet.
             served = layout.served.is_file() and layout.served.read_text() == version
             good = before if before != version or served else earlier
-            self._go_back(version, good, earlier)
+            with contextlib.ExitStack() as undisturbed:
+                # A second one would leave the board without a service.
+                take_signals(SIGNALS, signal.SIG_IGN, undisturbed)
+                self._go_back(version, good, earlier)
             raise UnhealthyError(
                 f"release {version} was not healthy as a service,"
                 f" {f'went back to {good}' if good else 'nothing is installed'}: {why}"

@@ -483,6 +483,22 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
 
 
+def test_a_second_signal_while_it_goes_back_changes_nothing(layout, monkeypatch):
+    service = Service(layout, KeyboardInterrupt())
+
+    def start(release: Path) -> None:
+        service.runs = release.name
+        if release.name == OLD:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(service, "start", start)
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
+        installer.Installer(layout, service).activate(NEW, is_new=True)
+    assert (layout.linked("current"), service.runs) == (OLD, OLD)
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
 @pytest.mark.parametrize("error", [UnhealthyError("it ended"), KeyboardInterrupt()])
 def test_the_running_release_installed_again_stays_whatever_happens(layout, monkeypatch, error):
     layout.link("previous", OLD)
