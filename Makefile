@@ -29,7 +29,7 @@ install: $(STAMP)  ## the virtual environment with the locked dependencies
 doctor:  ## what this machine can and cannot do, and how to get the rest
 	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
 
-pictures: $(STAMP)  ## every picture of the READMEs, into docs
+pictures: $(STAMP)  ## the pictures of docs, all but the film
 	$(BIN)/python -m hil_tests pictures --out docs
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
@@ -37,7 +37,7 @@ demo: $(STAMP)  ## train with a human's guidance, export, and drive through a se
 
 # Tests often wait for processes, so that two cores serve three workers. A test's networks are small:
 # where each process computes with all cores, threads only wait for each other.
-test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
+test: $(STAMP)  ## with real processes and real Zenoh sessions; all but Ray's and the board's
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes

@@ -190,7 +190,7 @@ class DirectionSpec:
 SETTINGS = {row.metadata["name"]: row for row in fields(DirectionSpec)}
 """Name in a specification -> field, whose metadata hold how it is read, and an example."""
 GRAMMAR = (
-    "none, 50ms+-10ms, or settings "
+    "none, 50ms+-10ms, or settings such as "
     + ",".join(f"{name}={row.metadata['example']}" for name, row in SETTINGS.items())
     + ", each also with up. or down. before it"
 )

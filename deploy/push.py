@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("bundle", metavar="BUNDLE.tar", help="of `python -m deploy bundle`")
     add("--trust", metavar="KEY.pub", default=key, help=trust)
     add("--root", metavar="DIR", default=DEFAULT_ROOT, help="where on the board")
-    add("--service", metavar="WAY", choices=WAYS, help="who runs it there")
+    add("--service", choices=WAYS, help="who runs it there")
     add("--no-sudo", action="store_true", help="the user there needs no sudo")
     add("--dry-run", action="store_true", help="print each step and do nothing")
 

@@ -79,7 +79,7 @@ EXAMPLE = examples("python -m hil_tests doctor --only basics vehicle")
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    groups = f"of {', '.join(GROUPS)}"
+    groups = f"of {', '.join(GROUPS)} (default: all)"
     parser.add_argument("--only", metavar="GROUP", nargs="+", default=GROUPS, help=groups)
 
 

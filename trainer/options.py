@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
+from bridge.environments import scenarios
 from bridge.network import GRAMMAR
 from edge_runtime.cli import not_negative, positive_number, whole_number
 from edge_runtime.util import UserError
-from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS
 
 Group = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -24,8 +24,7 @@ DEVICES = ("cpu", "cuda")
 
 def add_scenario(parser: Group, known: str = "") -> None:
     """``--scenario``; ``known``: what says it where it is None, in words."""
-    words = ", ".join(SCENARIOS)
-    what = f"what is driven: {words}, a gymnasium id, or module:id"
+    what = f"what is driven: {', '.join(scenarios())}, a gymnasium id, or module:id"
     what += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=what)

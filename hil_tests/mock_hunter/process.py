@@ -112,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add, bits = parser.add_argument, "firmware's fault bits"
     add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
-    add("--model", default="hunter-2.0", choices=list(MODELS))
+    add("--model", default="hunter-2.0", choices=list(MODELS), help="which Hunter")
     add("--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help=bits)
     append: Any = {"action": "append", "default": []}
     add("--set", type=_setting, metavar="NAME=VALUE", help="a parameter's value", **append)

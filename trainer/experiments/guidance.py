@@ -229,8 +229,9 @@ def _all_numbers(results: Results, store: Store) -> Iterator[str]:
         "Numbers are means of the training seeds with their 95 % interval. One seed has none; a "
         "width of 0 says only that these few seeds agree. What it took to a level is the median "
         "of the seeds (of an even number the upper middle), the least and the most of them (∞: "
-        "never), and how many get there if not all do. A level counts as reached in the first "
-        f"validation that shows it. Validations are {store.plan.evaluate_every_steps} steps apart, "
+        "never), and how many get there if not all do; *never* if none does. A level counts as "
+        "reached in the first validation that shows it. "
+        f"Validations are {store.plan.evaluate_every_steps} steps apart, "
         f"of {store.plan.evaluation_runs} drives (racetrack: {slow.evaluate_every_steps}, "
         f"{slow.evaluation_runs}): a finer difference in steps means nothing, and a policy that "
         "swings gets there by luck sooner. The actor that is tested is the best in them by "
@@ -239,7 +240,8 @@ def _all_numbers(results: Results, store: Store) -> Iterator[str]:
         "0.1 s (hill: 1/30, racetrack: 0.2). The two tasks that are not ours have three seeds, "
         "and neither variant nor dense traffic.",
         "",
-        f"Computed in {report.computed_in(results, lines, TASKS)}: the same settings, other bits.",
+        "The trainings' arithmetic (the same settings, other bits): "
+        f"{report.computed_in(results, lines, TASKS)}.",
         "",
         f"What a training cost, with {plan.HUMANS[plan.GOOD].meaning}:",
         "",
@@ -270,8 +272,8 @@ def _what_the_rows_are() -> Iterator[str]:
         "(../../trainer/README.md#the-fair-table-of-human-guidance). A row has settings of its own "
         "where ours would not fit what it learns from, or where three trainings of each row, on a "
         "seed that is not in the table, [chose others](../README.md#what-the-settings-of-the-"
-        "experiments-were-chosen-by). `trainer train --algorithm NAME` has them. What was chosen "
-        "for a row of the paper's experiments is in this table alone, and wants `--set`.",
+        "experiments-were-chosen-by). `trainer train --algorithm NAME` has them. Those of the last "
+        "column are used in this table only: `trainer train` needs `--set NAME=VALUE`.",
         "",
     )
     yield from markdown_table(
