@@ -14,7 +14,14 @@ import numpy as np
 from bridge.network import parse_spec
 from edge_runtime.controller import limit_action, neutral_action, shared_limits
 from edge_runtime.util import UserError
-from trainer.environments import entries_of, expert_of, inner, make_environment, task_of
+from trainer.environments import (
+    check_trained_in,
+    entries_of,
+    expert_of,
+    inner,
+    make_environment,
+    task_of,
+)
 from trainer.human.guide import Action, Driver, Observation
 from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.learner.networks import Actor
@@ -112,18 +119,16 @@ def load_driver(
             raise UserError(f"{policy} is for {found}, and {env.scenario} asks for {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
-        actor, about = load_human_model(path)
+        actor, about = load_human_model(path, env)
         policy_id = f"human:{path.name}"
     elif path.is_dir():
-        actor, about = load_actor(path)
+        actor, about = load_actor(path, env)
         policy_id = f"run:{path.name}:{about['episode']}"
     else:
         raise UserError(
             f"{policy} is no policy: expected an .onnx file, a training run, "
             "a human model's directory, the word expert, module:Class of one, or constant:ACTION"
         )
-    if about["scenario"] != env.scenario:
-        raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
     aware = _awareness(env, about)
     if aware and not knows_delay:
         raise UserError(f"{policy} sees the actions on their way: only trainer evaluate shows them")
@@ -136,11 +141,13 @@ def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
     return DelayAware(env, parse_spec(spec)) if spec else None
 
 
-def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
+def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     """A run's actor: the best on the validation seeds, or the last one where none was validated.
 
     The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
-    knows a delay, ``known_latency``, too.
+    knows a delay, ``known_latency``, too. ``env`` is by default the one that it names.
+
+    Raises UserError: no run there, or one in another environment than ``env``.
     """
     there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
     path = next((path for path in there if path.is_file()), None)
@@ -153,7 +160,8 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
         if "known_latency" in state:
             label["known_latency"] = state["known_latency"]
-        env = make_environment(label["scenario"])
+        env = env or make_environment(label["scenario"])
+        check_trained_in(env, run_dir, label["scenario"])
         aware = _awareness(env, label)
         space = aware.space if aware else env.observation_space
         first = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -82,6 +83,12 @@ def scenario_of(name: str) -> str:
     """The word of a scenario of ours that is named by its id; any other name as it is."""
     words = {environment_id: word for word, environment_id in SCENARIOS.items()}
     return words.get(name.rpartition(":")[2], name)
+
+
+def check_trained_in(env: Any, policy: Path, scenario: str) -> None:
+    """Raise UserError where a policy is of another environment; no file decides what is made."""
+    if scenario != env.scenario:
+        raise UserError(f"{policy} was trained in {scenario}, not in {env.scenario}")
 
 
 def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]]:

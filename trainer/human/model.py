@@ -11,7 +11,7 @@ from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
-from trainer.environments import make_environment
+from trainer.environments import check_trained_in
 from trainer.human.guide import Driver
 from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
 from trainer.util import FROM_ONE, Purpose, check_ranges, load_torch, random_stream, save_torch
@@ -133,13 +133,13 @@ class HumanModel(Driver):
         save_torch(directory / MODEL_FILE, state)
 
 
-def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
-    """The network of a HUMAN_DIR and what is known of it; UserError: no human model there."""
+def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
+    """The network of a HUMAN_DIR and what is known of it; UserError: no human model of ``env``."""
     path = directory / MODEL_FILE
     state = load_torch(path)
     try:
-        space = make_environment(state["scenario"]).observation_space
-        actor = Actor(state["action_size"], state["frames"], space)
+        check_trained_in(env, directory, state["scenario"])
+        actor = Actor(state["action_size"], state["frames"], env.observation_space)
         actor.load_state_dict(state.pop("actor"))
     except (AttributeError, LookupError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} is not a human model of this project") from error

@@ -79,7 +79,7 @@ class Coach:
             given_s += human_s
             known = int(row["episode"]), row["outcome"], human_s, int(row["interventions"])
             self.episodes.append(Episode(*known))
-            if row["validation_success"] not in ("", "nan"):
+            if row.get("validation_success", "") not in ("", "nan"):
                 self.curve.append((given_s, float(row["validation_success"])))
 
     def to_check(self) -> list[int]:
@@ -149,7 +149,8 @@ def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
         whose: next((human_s for human_s, success in its if is_reached(LEARNED, success)), None)
         for whose, its in (("you", curve), ("a scripted human", typical))
     }
-    there = [f"after {human_s:.0f} s of {who}" for who, human_s in after.items() if human_s]
+    known = ((who, human_s) for who, human_s in after.items() if human_s is not None)
+    there = [f"after {human_s:.0f} s of {who}" for who, human_s in known]
     return f"{given} The policy alone: {LEARNED:.0%} {', '.join(there)}." if there else given
 
 

@@ -216,7 +216,7 @@ class Window:
                 pygame.font.init()
                 width, height = pygame.display.get_desktop_sizes()[0]
                 room = min(SCREEN_SHARE * width, SIZE[0]), min(SCREEN_SHARE * height, SIZE[1])
-                size = _fitted(SIZE, room)
+                size = _fitted(SIZE, room).size
                 self._window = pygame.display.set_mode(size, pygame.RESIZABLE)
         except pygame.error as error:
             pygame.quit()
@@ -259,13 +259,12 @@ class Window:
         for row, line in enumerate((*self.help, view.progress)):
             colour = "text" if row < len(self.help) else "dim"
             self._text(line, (MARGIN, 588 + 21 * row), colour)
-        room = self._window.get_size()
-        size = _fitted(SIZE, room)
+        place = _fitted(SIZE, self._window.get_size())
         drawn = self._screen
-        if size != SIZE:
-            drawn = pygame.transform.smoothscale(drawn, size)
+        if place.size != SIZE:
+            drawn = pygame.transform.smoothscale(drawn, place.size)
         self._window.fill(COLOURS["background"])
-        self._window.blit(drawn, ((room[0] - size[0]) // 2, (room[1] - size[1]) // 2))
+        self._window.blit(drawn, place)
         pygame.display.flip()
 
     def close(self) -> None:
@@ -279,7 +278,7 @@ class Window:
             self._screen.blit(_surface(shown), (0, 0))
         elif view.picture is not None:
             surface = _surface(view.picture)
-            size = _fitted(surface.get_size(), SCENE_SIZE)
+            size = _fitted(surface.get_size(), SCENE_SIZE).size
             self._screen.blit(pygame.transform.smoothscale(surface, size), (0, 0))
 
     def _frames(self, view: View) -> None:
@@ -397,10 +396,9 @@ def _surface(picture: NDArray[np.uint8]) -> Any:
     return pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
 
 
-def _fitted(shape: tuple[int, int], room: tuple[float, float]) -> tuple[int, int]:
-    """The largest size of that shape that fits into the room; both are width and height."""
-    scale = min(room[0] / shape[0], room[1] / shape[1])
-    return max(int(shape[0] * scale), 1), max(int(shape[1] * scale), 1)
+def _fitted(shape: tuple[int, int], room: tuple[float, float]) -> Any:
+    """The largest rectangle of that shape in the middle of the room; both are width and height."""
+    return pygame.Rect((0, 0), shape).fit((0, 0), room)
 
 
 @contextmanager

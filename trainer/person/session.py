@@ -112,7 +112,8 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
     name = scenario_of(asked.scenario or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
-    return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed
+    period_s = recorded.task.control_period_s
+    return (env if is_ours else Adapted(env, name, period_s)), lambda number: recorded.origin.seed
 
 
 def drive(

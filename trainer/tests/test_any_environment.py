@@ -5,6 +5,8 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import gymnasium
@@ -13,6 +15,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict
 
+from bridge import environments as bridge
+from bridge.fork import RecordedEpisode
+from bridge.messages import Origin
 from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
@@ -34,6 +39,7 @@ from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import Layout, ReplayBuffer
 from trainer.learner.td3 import TD3Learner
+from trainer.person import session
 from trainer.person.controls import controls_of, keyboard_of
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
@@ -313,6 +319,19 @@ def test_before_its_first_command_a_car_behind_a_network_has_hands_off():
     end = VehicleEnd(env, parse_spec("300ms"), 0, seen)
     action = end.tick(seen, lambda _: np.ones(2, np.float32))
     assert outer(env.action_range, action).tolist() == [0.0, 0.0]
+
+
+def test_a_person_drives_on_at_the_period_that_a_drive_was_recorded_with(monkeypatch):
+    dark = f"{__name__}:test/Dark-v0"
+    origin = Origin(
+        session="s", environment=dark, condition="nominal", seed=3, standing=False,
+        clock="lockstep", loop="policy", latency="none",
+    )  # fmt: skip
+    task = bridge.describe(bridge.make_environment(dark), 0.5)
+    recorded = RecordedEpisode(Path("drive.mcap"), "v", 0, origin, 0, task, began_ns=0)
+    monkeypatch.setattr(session, "find_fork", lambda *_: (recorded, 0))
+    asked: Any = SimpleNamespace(recording="drive.mcap", scenario=dark)
+    assert session._environment(asked)[0].control_period_s == 0.5
 
 
 @pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])

@@ -14,6 +14,7 @@ from trainer import drivers
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import CONDITIONS, Drive, drive_episodes, drive_together, evaluate
+from trainer.human.model import MODEL_FILE
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 
@@ -30,6 +31,16 @@ def test_an_actor_is_loaded_with_the_frames_that_it_was_trained_on(tmp_path, fra
     driver, policy_id = load_driver(str(tmp_path), make_environment("congestion"))
     assert policy_id.startswith("run:")
     assert driver.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
+
+
+@pytest.mark.parametrize("name", [BEST_FILE, MODEL_FILE])
+def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name):
+    (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    label = {"scenario": "planted:Env-v0", "algorithm": "phil_td3", "seed": 0, "episode": 3}
+    save_torch(tmp_path / name, {**label, "actor": Actor().state_dict()})
+    with pytest.raises(UserError, match="trained in planted:Env-v0, not in left_turn"):
+        load_driver(str(tmp_path), make_environment("left_turn"))
 
 
 def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it():

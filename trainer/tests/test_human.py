@@ -67,7 +67,7 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     frames = np.full((2, 45, 80), 70, np.uint8)
     assert models[0].act(frames) == models[1].act(frames)
     models[0].save(tmp_path, {"scenario": "left_turn"})
-    actor, about = load_human_model(tmp_path)
+    actor, about = load_human_model(tmp_path, make_environment("left_turn"))
     assert about["demonstrations"] == models[0].demonstrations
     with torch.no_grad():
         assert actor(torch.from_numpy(frames)[None])[0].numpy() == models[0].act(frames)

@@ -10,7 +10,14 @@ from edge_runtime.util import UserError
 from trainer.__main__ import main
 from trainer.pictures import moving_average
 from trainer.tests.test_commands import call, refusal
-from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics, totals
+from trainer.training.metrics import (
+    ALWAYS,
+    NAMES,
+    EpisodeMetrics,
+    MetricsWriter,
+    read_metrics,
+    totals,
+)
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
 HEAD = ",".join(NAMES) + "\r\n"
@@ -58,6 +65,13 @@ def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
     MetricsWriter(tmp_path, 1).close()
     (kept,) = read_metrics(tmp_path)
     assert (list(kept), kept["validation_reward"], kept["steps"]) == (NAMES, "", "1.5")
+
+
+def test_a_run_without_any_column_that_may_be_missing_has_its_totals(tmp_path):
+    names = [*ALWAYS, "outcome"]
+    (tmp_path / "metrics.csv").write_text(f"{','.join(names)}\r\n{row(0, names)}\r\n", newline="")
+    found = totals(read_metrics(tmp_path), 0.1)
+    assert (found["episodes"], found["validation"], found["updates"]) == (1, {}, 0)
 
 
 def test_what_the_human_gave_until_the_policy_alone_had_learned_is_kept_after_a_resume(tmp_path):

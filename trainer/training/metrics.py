@@ -213,7 +213,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     measured = [
         (float(row["validation_success"]), number)
         for number, row in enumerate(rows)
-        if row["validation_success"] not in ("", "nan")
+        if row.get("validation_success", "") not in ("", "nan")
     ]
     validation = {}
     if measured:
@@ -226,7 +226,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
-        "updates": int(rows[-1]["updates"] or 0),
+        "updates": int(rows[-1].get("updates") or 0),
         **spent(rows, period_s),
         "validation": validation,
         "until": until,

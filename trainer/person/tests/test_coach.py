@@ -50,6 +50,7 @@ def test_what_was_given_stands_beside_what_is_typical():
     assert said(cost, [], there) == f"{given} The policy alone: 90% after 28 s of a scripted human."
     both = "after 41 s of you, after 28 s of a scripted human"
     assert said(cost, [(20.0, 0.0), (41.4, 0.9)], there) == f"{given} The policy alone: 90% {both}."
+    assert said(cost, [(0.0, 0.9)], []) == f"{given} The policy alone: 90% after 0 s of you."
 
 
 def test_the_shipped_curves_rise_in_both_scenarios_and_no_other_has_any():
