@@ -15,7 +15,7 @@ import numpy as np
 from edge_runtime import safety as rules
 from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
-from edge_runtime.wire import DRIVE, SAFE_STOP, State, is_foreign
+from edge_runtime.wire import DRIVE, SAFE_STOP, Command, State, is_foreign
 
 if TYPE_CHECKING:
     from edge_runtime.link_quality import LinkQuality
@@ -104,6 +104,23 @@ class Order(NamedTuple):
     inference_ns: int
     plan: Union[List[List[float]], msgspec.UnsetType] = msgspec.UNSET
     ridden: bool = False
+
+    def command(self, policy_id: str, sent_ns: int) -> Command:
+        """As it goes out."""
+        state = self.answers.state
+        return Command(
+            session=state.session,
+            episode=state.episode,
+            step=state.step,
+            mode=self.mode,
+            action=self.action,
+            policy_id=policy_id,
+            received_ns=self.answers.arrived_ns,
+            inference_ns=self.inference_ns,
+            sent_ns=sent_ns,
+            reason=self.reason,
+            plan=self.plan,
+        )
 
 
 class Controller:

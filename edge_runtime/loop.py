@@ -27,7 +27,7 @@ from edge_runtime.link import Link
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
-from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Command, Health, Reason, Rejection, State
+from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Reason, Rejection, State
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     import numpy as np
@@ -262,20 +262,7 @@ class ControlLoop:
         self._log_transition()
         if order is None or (self._hold is not None and self._hold.is_on()):
             return
-        state = order.answers.state
-        command = Command(
-            session=state.session,
-            episode=state.episode,
-            step=state.step,
-            mode=order.mode,
-            action=order.action,
-            policy_id=self._policy.policy_id,
-            received_ns=order.answers.arrived_ns,
-            inference_ns=order.inference_ns,
-            sent_ns=time.time_ns(),
-            reason=order.reason,
-            plan=order.plan,
-        )
+        command = order.command(self._policy.policy_id, time.time_ns())
         if not order.ridden:
             self._link.send("command", command)
             if self._link_quality:
@@ -284,7 +271,7 @@ class ControlLoop:
             # The end of an episode is no fault; and a stop that is repeated between the re-arm
             # and the first fresh state must not take back what the re-arm has given.
             ends = order.reason == Event.FINAL.value or self._controller.safety.rearmed
-            self._vehicle.command(command, state.speed_mps, latch=not ends)
+            self._vehicle.command(command, order.answers.state.speed_mps, latch=not ends)
 
     def _log_transition(self) -> None:
         safety = self._controller.safety

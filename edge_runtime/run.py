@@ -149,7 +149,9 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             vehicle.control_period_s = period_s
             name, its_limits = vehicle.name, vehicle.limits
         limits = shared_limits(policy.manifest.action, its_limits)
-        ride, quality, armed = None, None, config.armed_at_start
+        ride, quality = None, None
+        # On hold its vehicle must get nothing, and nobody sees what follows when the hold ends.
+        armed = config.armed_at_start and config.hold is None
         if config.ride_through.max_s:
             from edge_runtime.ride import Ride
 

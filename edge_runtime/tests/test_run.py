@@ -258,8 +258,11 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
     assert "installer" in answer["detail"]
     installer.close()
     feed(6)
-    assert simulator.next_command().session == "simulator-a"
-    assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
+    # Nobody has seen what the vehicle would do: it waits for its operator, armed at start or not.
+    assert simulator.next_command().reason == "not_armed"
+    assert simulator.query("rearm")["accepted"]
+    feed(6)
+    assert wait_until(lambda: simulator.feedback[-1].mode == "drive", "a drive at the vehicle")
     assert edge.end() == 0
 
 
