@@ -14,6 +14,7 @@ import io
 import json
 import math
 import re
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -96,6 +97,13 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
     def render(self) -> Any:
         """What it draws."""
         return self._do(self.env.render)
+
+    def close(self) -> None:
+        """Close it; a fault in that is said, and costs nobody what was driven."""
+        try:
+            self._do(self.env.close)
+        except UserError as error:
+            print(error, file=sys.stderr)
 
     def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         try:

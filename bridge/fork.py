@@ -332,11 +332,7 @@ class ForkedDrive(LockStepClock):
         else:
             output, _ = infer(policy, policy.layout.arrays(state.observation))
         order = self._controller.finish(output, 0, self._now_s)
-        return order and Command(
-            session=state.session, episode=state.episode, step=state.step, mode=order.mode,
-            action=order.action, policy_id=policy.policy_id, received_ns=state.sent_ns,
-            inference_ns=0, sent_ns=state.sent_ns, reason=order.reason, plan=order.plan,
-        )  # fmt: skip
+        return order and order.command(policy.policy_id, state.sent_ns)
 
     def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.messages import images_of
+from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
 from bridge.replay import Answer, RecordedDrive, key_of, without_repetitions
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
@@ -94,8 +94,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     columns, bounds = _numbers(drive, task, rate)
     features = {key: _feature(values) for key, values in columns.items()}
     features["action"]["names"] = [row.name for row in task.action]
-    zeros = {name: np.zeros(row.shape, row.dtype) for name, row in task.observation.items()}
-    plain = [name for name, array in zeros.items() if images_of(array) is None]
+    plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
     layout = Layout(task)
     for name in task.observation:
         arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))

@@ -149,19 +149,18 @@ def images_of(array: np.ndarray) -> np.ndarray | None:
     return array.reshape(-1, *last)
 
 
-def decode_scene(payload: bytes) -> Scene | None:
-    """Return the scene; None if the payload is not one (a viewer has nothing better to do)."""
+def decode_scene(payload: bytes) -> Scene | wire.Rejection:
+    """The scene, or that it is none."""
+    rejected = wire.Rejection(wire.Reason.MALFORMED, "not a scene")
     if len(payload) > MAX_STATE_BYTES:
-        return None
+        return rejected
     try:
         scene = _DECODER.decode(payload)
-        if scene.origin is not None and scene.origin.seed < 0:
-            return None
         if scene.task is not None:
             check_task(scene.task)  # Whoever sent it, a viewer reads states by it.
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
-        return None
-    return scene
+        return rejected
+    return rejected if scene.origin is not None and scene.origin.seed < 0 else scene
 
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {
@@ -171,7 +170,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "health": wire.decode_health,
     "scene": decode_scene,
 }
-"""Topic -> decoder; for what is not valid it returns a ``Rejection``, for a scene None."""
+"""Topic -> decoder; for what is not valid it returns a ``Rejection``."""
 
 
 class Pace:

@@ -22,7 +22,6 @@ import contextlib
 import enum
 import functools
 import io
-import os
 import sys
 import threading
 import time
@@ -48,7 +47,6 @@ from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import (
-    behind_link,
     check_writable,
     lock_file,
     make_directory,
@@ -152,9 +150,8 @@ class ViewerCopies:
 
     def _view(self, heard: Heard) -> None:
         message = DECODERS[heard.topic](heard.payload)
-        if message is None or isinstance(message, wire.Rejection):
-            why = message.detail if message else "not a scene"
-            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")
+        if isinstance(message, wire.Rejection):
+            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {message.detail}")
             return
         try:
             self._copy(heard, heard.topic, message)
@@ -399,12 +396,9 @@ def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
     return entry_name
 
 
-KEPT = ".damaged"  # Ends the name under which a damaged recording is kept beside the repaired one
-
-
 def _add_repair_arguments(parser: Any) -> None:
-    text = "the recording; where more than a torn end is left out of it, the file as it was is"
-    parser.add_argument("recording", metavar="F.mcap", help=f"{text} kept as F.mcap{KEPT}")
+    text = "the recording; one that is damaged, not only cut off, needs --out"
+    parser.add_argument("recording", metavar="F.mcap", help=text)
     out = "write here instead of over the recording itself; it must not exist yet"
     parser.add_argument("--out", metavar="G.mcap", type=new_recording, help=out)
 
@@ -437,32 +431,13 @@ def _run_repair(arguments: Any) -> int:
                     " it with one"
                 )
             return 0
-        kept = _write(data, recording, arguments.out)
+        if arguments.out is None and recording.is_damaged:
+            stays = "it stays as it is; --out G.mcap takes what is whole"
+            raise UserError(f"{source} {recording.trouble()}: {stays}")
+        write_atomic(arguments.out or source, data)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
-    print(f"wrote {arguments.out or source}: {found}{left_out}{kept}")
+    print(f"wrote {arguments.out or source}: {found}{left_out}")
     return 0
-
-
-def _write(data: bytes, recording: Recording, out: str | None) -> str:
-    """Write the new file, over the recording or to ``out``; say where the old one is kept."""
-    if out is not None or not recording.is_damaged:
-        write_atomic(out or recording.path, data)
-        return ""
-    file = behind_link(recording.path)
-    kept = file.with_name(file.name + KEPT)
-    try:
-        os.link(file, kept)
-    except OSError as error:
-        # A repair that was killed leaves its link.
-        if not (kept.exists() and kept.samefile(file)):
-            why = f"{kept} exists" if kept.exists() else f"cannot make {kept}: {error.strerror}"
-            raise UserError(f"{why}; name another file with --out") from None
-    try:
-        write_atomic(file, data)
-    except UserError:  # Nothing was replaced. (After an interrupt nobody knows: it stays.)
-        kept.unlink()
-        raise
-    return f"; the file as it was: {kept}"
 
 
 def _rewrite(recording: Recording) -> tuple[bytes, int]:

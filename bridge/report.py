@@ -23,7 +23,6 @@ GOAL, FAILED = "goal", "failed"
 UNKNOWN = "ended"
 """An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
 COLLISION = "collision"
-OUTCOMES = (GOAL, COLLISION, "timeout", "off_road")
 STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
 DISCARDED = "discarded"
 """The person threw it away: it is shown, and nothing learns from it."""
@@ -39,7 +38,7 @@ def failed(outcome: str) -> bool:
 class EpisodeResult:
     """One driven episode.
 
-    `outcome` is one of OUTCOMES for this repository's environments; another environment may
+    `outcome` is as in the contract for this repository's environments; another environment may
     report its own word, FAILED or UNKNOWN. Accelerations are the mean of |a| over the episode's
     steps. `actions` holds for each step the action that the environment was given, as floats.
     """
@@ -358,23 +357,12 @@ class TrackingLog:
         lags_ms = {name: lag_ms(series) for name, series in actions.items()}
         return {
             "name": self.vehicle,
-            "scale": self._scale(),
             "samples": sum(len(episode.feedback) for episode in self._episodes),
             "speed_error_mps": errors(speed),
             "action_error": {name: errors(series) for name, series in actions.items()},
             "lag_ms": {"speed": lag_ms(speed), **lags_ms},
             "faults": dict(self.faults),
         }
-
-    def _scale(self) -> float | None:
-        """Metres of the vehicle for one of the scenario, from where that is told best: at speed."""
-        told = [
-            (abs(f.scenario_speed_mps), f.speed_mps / f.scenario_speed_mps)
-            for episode in self._episodes
-            for f in episode.feedback
-            if f.scenario_speed_mps
-        ]
-        return max(told, key=lambda row: row[0])[1] if told else None
 
 
 def _series(

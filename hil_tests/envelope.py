@@ -38,9 +38,10 @@ from multiprocessing import get_context
 from typing import Annotated, Any
 
 import msgspec
+import onnx
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
-from bridge.policy_file import network_of_file
+from bridge.policy_file import network_of
 from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
@@ -362,7 +363,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--confidence", type=inner, default=0.95, help="of each axis's limit")
     add("--seed", type=count, default=0, help="of the first drive")
     add("--jobs", type=count, default=0, help="processes that drive; 0: one a core")
-    confirms = "drive just inside and outside of this file's edges, with fresh seeds"
+    confirms = "drive just inside and outside of this file's edges, with fresh seeds; scene and "
+    confirms += "promise are the file's"
     add("--confirm", metavar="F.json", help=confirms)
     add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
 
@@ -384,7 +386,7 @@ def run(arguments: argparse.Namespace) -> int:
         "promised_success": known.promised_success if known else arguments.promise,
         "confidence": told.confidence, "seed": arguments.seed,
         "control_period_s": environment.control_period_s,
-        "network": network_of_file(policy) if policy.endswith(".onnx") else "",
+        "network": network_of(onnx.load(policy)) if policy.endswith(".onnx") else "",
     }  # fmt: skip
     task = (jobs, policy, env, condition, arguments.public_key)
     with cli.sigterm_as_interrupt(), Drivers(*task) as drivers:

@@ -259,9 +259,8 @@ class WireLog:
         if heard.topic not in DECODERS:
             return
         message = DECODERS[heard.topic](heard.payload)
-        if message is None or isinstance(message, wire.Rejection):
-            why = message.detail if message else "not a scene"
-            self._event(f"unreadable {heard.topic}: {why}", rr.TextLogLevel.ERROR)
+        if isinstance(message, wire.Rejection):
+            self._event(f"unreadable {heard.topic}: {message.detail}", rr.TextLogLevel.ERROR)
         else:
             getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
 

@@ -191,7 +191,6 @@ def test_a_speed_is_compared_with_its_set_point_at_the_same_moment():
     report = log.report([])
     assert report["lag_ms"] == {"speed": pytest.approx(200, abs=1e3 * reports.LAG_STEP_S)}
     assert report["speed_error_mps"]["max"] == pytest.approx(2 * math.sin(0.2), abs=0.01)
-    assert report["scale"] == pytest.approx(0.25)
 
 
 def test_what_was_not_measured_is_none():
@@ -199,7 +198,7 @@ def test_what_was_not_measured_is_none():
     assert set(reports.quantiles([]).values()) == {None}
     report = log_of(lambda time_s: 0.5).report(["pedal"])
     assert report["speed_error_mps"] == none
-    assert (report["lag_ms"]["speed"], report["scale"]) == (None, None)
+    assert report["lag_ms"]["speed"] is None
     nothing = reports.TrackingLog().report(["pedal"])
     assert nothing["action_error"] == {"pedal": none}
     assert nothing["lag_ms"] == {"speed": None, "pedal": None}

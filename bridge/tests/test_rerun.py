@@ -30,7 +30,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import HEALTH, make_command, make_state, wait_until
 from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
-from edge_runtime.wire import encode
+from edge_runtime.wire import Rejection, encode
 
 
 def test_a_car_that_heads_down_the_picture_is_long_in_y():
@@ -355,13 +355,13 @@ def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is
     environment.reset(seed=1)
     stamps = messages.Scene(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
     scene = messages.decode_scene(messages.encode_scene(environment.scene(), stamps))
-    assert scene is not None
+    assert isinstance(scene, messages.Scene)
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
     assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
     plain = messages.SeenCar(x=5.0, y=2.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
     seen = {"vehicles": [{name: getattr(plain, name) for name in plain.__struct_fields__[:5]}]}
     scene = messages.decode_scene(messages.encode_scene(seen, stamps))
-    assert scene is not None
+    assert isinstance(scene, messages.Scene)
     assert scene.vehicles == [plain]
     for payload in (b"", b"\xc1", b"\x80", bytes(70_000)):
-        assert messages.decode_scene(payload) is None
+        assert isinstance(messages.decode_scene(payload), Rejection)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import EntryPoint
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -249,6 +250,15 @@ def test_what_an_environment_raises_is_one_line_with_its_place(monkeypatch):
     where = r"failed in step: TypeError: .* \(toy.py, line \d+\)$"
     with pytest.raises(UserError, match=f"^environment BridgeToy-v0 {where}"):
         made.step(np.zeros(1, np.float32))
+
+
+def test_what_an_environment_raises_as_it_is_closed_costs_nobody_the_report(monkeypatch, capsys):
+    made = make_environment(TOY)
+    gone = Mock(side_effect=RuntimeError("the viewer is gone"), __name__="close")
+    monkeypatch.setattr(made.unwrapped, "close", gone)
+    made.close()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "environment BridgeToy-v0 failed in close: RuntimeError: the viewer is gone" in line
 
 
 def test_what_an_environment_does_not_know_may_be_none(environment, monkeypatch):

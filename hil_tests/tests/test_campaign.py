@@ -214,7 +214,6 @@ def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it(tmp_path):
             break
     vehicle = report["vehicle"]
     assert (report["loop"], vehicle["name"], vehicle["moving_starts"]) == ("vehicle", "hunter", 0)
-    assert vehicle["scale"] == pytest.approx(0.25)
     assert vehicle["samples"] > 20
     assert vehicle["speed_error_mps"]["max"] > 0.01
     assert 0.0 < vehicle["lag_ms"]["speed"] < 1000.0
