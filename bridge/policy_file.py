@@ -112,6 +112,11 @@ def network_of(model: onnx.ModelProto) -> str:
     return hashlib.sha256(model.graph.SerializeToString(deterministic=True)).hexdigest()
 
 
+def network_of_file(path: str) -> str:
+    """The same of a file."""
+    return network_of(onnx.load(path))
+
+
 def make_policy(
     model: bytes,
     task: Task,

@@ -38,10 +38,9 @@ from multiprocessing import get_context
 from typing import Annotated, Any
 
 import msgspec
-import onnx
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
-from bridge.policy_file import network_of
+from bridge.policy_file import network_of_file
 from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
@@ -386,7 +385,7 @@ def run(arguments: argparse.Namespace) -> int:
         "promised_success": known.promised_success if known else arguments.promise,
         "confidence": told.confidence, "seed": arguments.seed,
         "control_period_s": environment.control_period_s,
-        "network": network_of(onnx.load(policy)) if policy.endswith(".onnx") else "",
+        "network": network_of_file(policy) if policy.endswith(".onnx") else "",
     }  # fmt: skip
     task = (jobs, policy, env, condition, arguments.public_key)
     with cli.sigterm_as_interrupt(), Drivers(*task) as drivers:

@@ -5,7 +5,7 @@ import onnx
 import pytest
 import torch
 
-from bridge.policy_file import network_of
+from bridge.policy_file import network_of_file
 from deploy.certs import write_key_pair
 from edge_runtime.link_quality import ACCURACY, LinkQuality
 from edge_runtime.policy import check_graph, load_policy
@@ -93,7 +93,7 @@ def test_an_envelope_goes_into_the_export_of_the_network_that_it_was_measured_wi
     envelope = {
         "policy_id": "as it was measured", "env": "left_turn", "condition": "nominal",
         "promised_success": 0.95, "confidence": 0.95, "limits": limits, "joint": 1.0,
-        "control_period_s": 0.1, "network": network_of(onnx.load(path)),
+        "control_period_s": 0.1, "network": network_of_file(path),
     }  # fmt: skip
     write_policy(export_policy(make_actor(), LABEL, {}, envelope).model, path, None)
     assert LinkQuality(load_policy(path, allow_unsigned=True).manifest).limits == limits
