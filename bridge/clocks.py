@@ -29,8 +29,8 @@ from bridge.inbound import CommandCheck, FeedbackCheck
 from bridge.network import Direction, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
+    BRAKE_PERIODS,
     COMMAND_WINDOW,
-    SILENCE_PERIODS,
     Arrival,
     CommandHold,
     Decision,
@@ -53,7 +53,7 @@ class _Clock:
         self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
     ) -> None:
         self._period_s = task.control_period_s
-        self._silence_s = SILENCE_PERIODS * self._period_s
+        self._silence_s = BRAKE_PERIODS * self._period_s
         self._window_s = COMMAND_WINDOW * task.control_period_s
         self._observation_bytes = Layout(task).size
         self.latencies_ms: list[float] = []

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import msgspec
 
-from bridge.virtual_link import ROUNDING_S, SILENCE_PERIODS, UNKNOWN_SAFE_STOP, Decision
+from bridge.virtual_link import BRAKE_PERIODS, ROUNDING_S, UNKNOWN_SAFE_STOP, Decision
 from edge_runtime.manifest import Action, Task
 from edge_runtime.wire import (
     DRIVE,
@@ -153,7 +153,7 @@ class FeedbackCheck:
         """The last that could be read, of whatever session: it tells that a vehicle is there."""
         self.heard_s = 0.0
         self._commands = commands
-        self._actions, self._silence_s = task.action, SILENCE_PERIODS * task.control_period_s
+        self._actions, self._silence_s = task.action, BRAKE_PERIODS * task.control_period_s
         self._met = False
         self._newest: Feedback | None = None
         self._newest_s = self._received_s = 0.0

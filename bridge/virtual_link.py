@@ -33,7 +33,7 @@ from edge_runtime.safety import (
 )
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Feedback
 
-SILENCE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
+BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
 COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
 ROUNDING_S = 1e-9
 """Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
@@ -66,7 +66,7 @@ class CommandHold:
     """The newest command of one episode, and its age; ``period_s`` is T."""
 
     def __init__(self, now_s: float, period_s: float) -> None:
-        self._period_s, self._silence_s = period_s, SILENCE_PERIODS * period_s
+        self._period_s, self._silence_s = period_s, BRAKE_PERIODS * period_s
         self.newest: Command | None = None
         self._heard_s = now_s
         self._driven_s = now_s

@@ -34,7 +34,7 @@ from bridge.rerun import (
     open_sink,
 )
 from bridge.rerun.draw import Plot
-from bridge.virtual_link import SILENCE_PERIODS
+from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt, whole_number
 from edge_runtime.commands import link_words
@@ -281,7 +281,7 @@ class WireLog:
         if self._episode != place[:2]:
             # For a viewer that comes late, or in a new episode, no command was due before.
             self._episode, self._heard_command_ns = place[:2], arrived_ns
-        periods = SILENCE_PERIODS + self._plan_periods
+        periods = BRAKE_PERIODS + self._plan_periods
         silent = arrived_ns - self._heard_command_ns > periods * self._timeline.period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
