@@ -19,6 +19,7 @@ from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Reason, Rejection
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 2
 MIN_PERIOD_S, MAX_PERIOD_S = 0.01, 1.0
+MAX_ACTIONS = 600  # so that a command fits its 64 KiB with a plan: 11 rows of 9 bytes a number
 DTYPES = ("uint8", "int32", "int64", "float32", "bool")
 OVERHEAD_BYTES = 4096  # What a state holds besides its observation, at most
 _HEADS_BYTES = 10  # MessagePack's, of a name and its bytes, at most
@@ -153,6 +154,8 @@ def check_task(task: Task) -> None:
     if not names or len(set(names)) != len(names):
         found = f"an action twice: {', '.join(names)}" if names else "no action"
         raise UserError(f"the manifest names {found}")
+    if len(names) > MAX_ACTIONS:
+        raise UserError(f"the manifest names {len(names)} actions; {MAX_ACTIONS} at most")
     for row in task.action:
         if not (row.low < row.high and math.isfinite(row.low) and math.isfinite(row.high)):
             found = f"the range of {row.name} is {row.low} to {row.high}"

@@ -218,6 +218,7 @@ def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypat
         ({"actions": (action("x", stop=1.5),)}, "safe stop of x is 1.5, outside"),
         ({"actions": (action("x", slew_per_s=0.0),)}, "slew_per_s of x is 0.0"),
         ({"actions": (PEDAL, PEDAL)}, "names an action twice: pedal, pedal"),
+        ({"actions": [action(f"a{i}") for i in range(601)]}, "names 601 actions; 600 at most"),
     ],
 )
 def test_manifest_and_graph_must_agree(plain, options, match):
