@@ -54,7 +54,6 @@ UNITS = Path(__file__).parent / "systemd"
 HOLD = "../../state/hold"  # Seen from a release's folder: what the installer locks while it judges
 _OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
 _DIGITS = 8
-_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 _MAIN = (
     "import sys\n\nif sys.version_info < (3, 8):\n"
     '    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")\n'
@@ -325,10 +324,6 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
         given.strip(),
     ]
     text = "\n".join(lines).rstrip() + "\n"
-    with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
-        file.write(text)
-        file.flush()
-        load_config(file.name, {})
     return config, text
 
 
@@ -342,7 +337,7 @@ def build_installer() -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
         for name, text in members.items():
-            info = zipfile.ZipInfo(name, _FIRST_DAY)
+            info = zipfile.ZipInfo(name)  # of 1980, so that the same files give the same bytes
             info.external_attr = 0o100644 << 16
             archive.writestr(info, text)
     return packed.getvalue()

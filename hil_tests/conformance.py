@@ -63,17 +63,14 @@ def run(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
-    verdicts, told = bench.verdicts, 0
     judge = threading.Thread(target=_judge, args=(bench,), daemon=True)
     judge.start()
     try:
         while judge.is_alive() and bench.calls_for_s <= HANG_S:
             judge.join(LOOKS_EVERY_S)
-            told = _tell(verdicts, told)
         if judge.is_alive():
             bench.is_over = True
-            verdicts.append(f"{bench.called}() has not come back after {HANG_S:g} s")
-        _tell(verdicts, told)
+            bench.say(f"{bench.called}() has not come back after {HANG_S:g} s")
     finally:
         bench.is_over = True  # After ^C nothing may be asked of it once it is closed.
         judge.join(CALL_S if bench.calls_for_s > HANG_S else HANG_S)
@@ -81,18 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
             if not judge.is_alive():
                 bench.vehicle.close()
         log.close()
-    kept, untried = verdicts.count(""), len(RULES) - len(verdicts)
+    kept, untried = bench.verdicts.count(""), len(RULES) - len(bench.verdicts)
     rest = f", {untried} not tried" if untried else ""
-    print(f"{bench.vehicle.name}: {kept} rules kept, {len(verdicts) - kept} broken{rest}")
+    print(f"{bench.vehicle.name}: {kept} rules kept, {len(bench.verdicts) - kept} broken{rest}")
     return 0 if kept == len(RULES) else BROKEN
-
-
-def _tell(verdicts: list[str], told: int) -> int:
-    """Print the verdicts after the first ``told``; how many are told then."""
-    for rule, words in list(zip(RULES, verdicts, strict=False))[told:]:
-        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
-        told += 1
-    return told
 
 
 def _judge(bench: Bench) -> None:
@@ -105,7 +94,7 @@ def _judge(bench: Bench) -> None:
             words = f"{type(error).__name__}: {error}"
         if bench.is_over:
             return
-        bench.verdicts.append(words)
+        bench.say(words)
 
 
 class Bench:
@@ -120,6 +109,12 @@ class Bench:
         self.called, self._called_s = "", math.inf  # The call under way, and since when
         self.verdicts: list[str] = []  # What is wrong by each rule that was tried; empty: nothing
         self.is_over = False
+
+    def say(self, words: str) -> None:
+        """Note and print what is wrong by the next rule; empty: nothing."""
+        rule = list(RULES)[len(self.verdicts)]
+        self.verdicts.append(words)
+        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
 
     @property
     def calls_for_s(self) -> float:
