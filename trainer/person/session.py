@@ -348,9 +348,9 @@ class Sitting:
     def close(self) -> None:
         """Close the person's devices and the recording; a second call does nothing."""
         self.closed = True
-        self.person.close()
         self._write_last_step()
         self.recorder.close()
+        self.person.close()
 
     @property
     def _to_end(self) -> bool:

@@ -68,10 +68,12 @@ INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
 
 
-@LOGGER.addFilter
 def _is_ours(record: logging.LogRecord) -> bool:
     """Whether it is an error of the cockpit's, and not of a client that speaks no HTTP to it."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
+LOGGER.addFilter(_is_ours)
 
 
 def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
@@ -341,7 +343,8 @@ def _page_files(phone_url: str | None) -> dict[str, bytes]:
         picture = segno.make(phone_url).svg_data_uri(scale=4)
         found["index.html"] = found["index.html"].replace(
             b"<!-- phone -->",
-            f'<details id="phone"><summary>On a phone in this network</summary>'
+            '<details id="phone"><summary>On a phone in this network: then close this page, or '
+            "the phone only watches</summary>"
             f'<img alt="the address as a QR code" src="{picture}" /><code>{phone_url}</code>'
             "</details>".encode(),
         )

@@ -20,8 +20,8 @@ export function showCoach(coach) {
   byId("alone").textContent = coach.alone;
   byId("given").textContent = coach.said;
   if (!byId("coach").hidden) drawCurves(byId("curve"), coach);
-  const head = row(["", "", "you, s", "take-overs"], "th");
-  const rows = coach.episodes.toReversed().map(({ number, outcome, human_s, takeovers }) =>
+  const head = row(["episode", "outcome", "you, s", "take-overs"], "th");
+  const rows = [...coach.episodes].reverse().map(({ number, outcome, human_s, takeovers }) =>
     row([number, outcome, human_s.toFixed(1), takeovers], "td", outcome));
   byId("episodes").replaceChildren(head, ...rows);
 }

@@ -1,8 +1,8 @@
 // The cockpit: joins the hands, the link to the trainer, and what is drawn.
 
 import { showCoach } from "./coach.js";
-import { Gamepads } from "./gamepad.js";
-import { Keyboard, list, Pad, ways } from "./hands.js";
+import { FIELDS, Gamepads } from "./gamepad.js";
+import { Keyboard, list, OFF, Pad, ways } from "./hands.js";
 import { Link } from "./link.js";
 import { drawFrames, drawPicture, drawScene, History } from "./scene.js";
 
@@ -13,7 +13,7 @@ const STALE_MS = 1000; // without a new view the trainer is busy, and says so
 const WHO = {
   waiting: ["Nobody drives yet", "the trainer is starting"],
   lost: ["Connection lost", "you have let go; looking for the trainer"],
-  over: ["The sitting is over", "everything is saved"],
+  over: ["The sitting is over", "the trainer's terminal says what is saved"],
   policy: ["The policy drives", "hold a key, the pad or a button to take over"],
   human: ["You drive", "let go to hand control back"],
   returning: ["Handing back", "the action returns to the policy's"],
@@ -27,18 +27,25 @@ let refused = false; // held since before the connection, or the wheel, was this
 const changed = () => link?.changed();
 const keyboard = new Keyboard(changed, (word) => wish(word));
 const touch = new Pad(byId("pad"), byId("knob"), changed);
-const choices = ["plus", "minus", "dead", "full", "invert", "hold"].map((id) => [id, byId(id)]);
+const choices = Object.keys(FIELDS).map((id) => [id, byId(id)]);
 const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed);
-// A finger goes before a key, a key before a device that may only lie there.
+// A finger goes before a key, a key before a device that may only lie there. To a hidden page the
+// browser tells nothing new of any of them.
 const hands = {
-  now: () => [touch, keyboard, gamepads].map((hand) => hand.now()).find((said) => said.engaged)
-    ?? gamepads.now(),
+  now: () => document.hidden ? OFF
+    : [touch, keyboard, gamepads].map((hand) => hand.now()).find((said) => said.engaged)
+      ?? gamepads.now(),
 };
 const history = new History(byId("history"));
 const frames = [...document.querySelectorAll("#frames canvas")];
 const link = new Link(hands, { view: see, echo: hearEcho, state: showState });
 let lastMs = performance.now();
 setInterval(step, STEP_MS);
+// Without the focus, or under a menu, a page hears no key or button come up.
+for (const gone of ["blur", "pagehide", "contextmenu", "visibilitychange"]) {
+  addEventListener(gone, () => [touch, keyboard].forEach((hand) => hand.release()));
+}
+addEventListener("visibilitychange", () => view && show());
 
 function step() {
   const now = performance.now();
@@ -58,7 +65,13 @@ function see(next) {
   view = next;
   viewMs = performance.now();
   history.add(view);
-  requestAnimationFrame(draw);
+  show();
+}
+
+// A hidden page gets no animation frame, and is not to draw all that it missed at once.
+function show() {
+  if (document.hidden) link.drew(view.number);
+  else requestAnimationFrame(draw);
 }
 
 function enter({ scenario, controls, help }) {
@@ -77,6 +90,7 @@ function enter({ scenario, controls, help }) {
 }
 
 function draw() {
+  link.drew(view.number);
   if (document.body.dataset.link !== "live") return;
   document.body.dataset.control = view.control;
   if (view.scene) drawScene(byId("scene"), view);

@@ -6,7 +6,14 @@
 import { list, mix, OFF, shares, ways } from "./hands.js";
 
 const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
+const WHEEL = /wheel|racing|driving force|\b[gt]\d{2,3}\b/i; // in the device's name
 const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
+
+// What is chosen, and the property of its control that holds it.
+export const FIELDS = {
+  plus: "value", minus: "value", dead: "valueAsNumber", full: "valueAsNumber", invert: "checked",
+  hold: "value",
+};
 
 const SOURCES = {
   axis: (pad, index) => pad.axes[index] ?? 0,
@@ -23,10 +30,12 @@ export function preset(pad, upright) {
       ? { ...common, plus: "button 7", minus: "button 6" }
       : { ...common, plus: "axis 0", minus: "", dead: 0.15 };
   }
-  // A wheel: axis 0 turns, the next ones are pedals (a G29's throttle and brake).
+  // A wheel: axis 0 turns, the next ones are pedals (a G29's throttle and brake). The trigger of a
+  // gamepad that the browser does not know may rest at the end of an axis: no move takes over.
+  const hold = WHEEL.test(pad.id) ? MOVING : common.hold;
   return upright
-    ? { ...common, plus: "pedal 2", minus: "pedal 3", hold: MOVING }
-    : { ...common, plus: "axis 0", minus: "", dead: 0.02, full: 0.25, hold: MOVING };
+    ? { ...common, plus: "pedal 2", minus: "pedal 3", hold }
+    : { ...common, plus: "axis 0", minus: "", dead: 0.02, full: 0.25, hold };
 }
 
 export function read(pad, choice) {
@@ -51,7 +60,7 @@ export class Gamepads {
     this.scenario = this.controls = null;
     this.pad = null;
     this.said = OFF;
-    for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
+    for (const name in FIELDS) {
       form[name].addEventListener("input", () => this.choose());
       form[name].addEventListener("change", () => form[name].blur()); // the arrow keys drive again
     }
@@ -104,22 +113,13 @@ export class Gamepads {
     options(this.form.plus, ["", ...axes, ...pedals, ...buttons], this.choice.plus);
     options(this.form.minus, ["", ...pedals, ...buttons], this.choice.minus);
     options(this.form.hold, [MOVING, ...buttons], this.choice.hold);
-    this.form.dead.value = this.choice.dead;
-    this.form.full.value = this.choice.full;
-    this.form.invert.checked = this.choice.invert;
+    for (const name of ["dead", "full", "invert"]) this.form[name][FIELDS[name]] = this.choice[name];
   }
 
   choose() {
     if (!this.pad) return;
-    const { plus, minus, dead, full, invert, hold } = this.form;
-    this.choice = {
-      plus: plus.value,
-      minus: minus.value,
-      dead: Number(dead.value),
-      full: Number(full.value),
-      invert: invert.checked,
-      hold: hold.value,
-    };
+    const chosen = Object.entries(FIELDS).map(([name, field]) => [name, this.form[name][field]]);
+    this.choice = Object.fromEntries(chosen);
     localStorage.setItem(KEPT, JSON.stringify({ ...kept(), [this.key]: this.choice }));
   }
 }

@@ -30,6 +30,7 @@ export class Keyboard {
     this.pressed = []; // what the keys add to hands off
     this.changed = changed;
     addEventListener("keydown", (event) => {
+      if (event.metaKey) this.release(); // of a key that comes up beside it a Mac says nothing
       if (event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
       if (event.code in WISHES && !event.repeat) return wish(WISHES[event.code]);
       const key = keyOf(event.code);
@@ -50,9 +51,6 @@ export class Keyboard {
       if (this.drives(key) && !typing(event.target)) event.preventDefault();
       if (this.down.delete(key)) this.settle();
     });
-    // A page without the focus hears no key come up.
-    for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
-    addEventListener("visibilitychange", () => document.hidden && this.release());
   }
 
   drives(key) {
@@ -115,7 +113,7 @@ export class Pad {
     this.at = { aside: 0, along: 0 }; // the finger, right and up to 1
     this.changed = changed;
     element.addEventListener("pointerdown", (event) => {
-      if (this.finger !== null) return;
+      if (this.finger !== null || event.button !== 0) return;
       this.finger = event.pointerId;
       element.setPointerCapture(event.pointerId);
       this.move(event);
@@ -125,11 +123,11 @@ export class Pad {
     for (const up of ["pointerup", "pointercancel", "lostpointercapture"]) {
       element.addEventListener(up, (event) => event.pointerId === this.finger && this.release());
     }
-    for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
   }
 
   move(event) {
     if (event.pointerId !== this.finger) return;
+    if (!event.buttons) return this.release(); // it came up unheard
     const box = this.element.getBoundingClientRect();
     const along = 1 - (2 * (event.clientY - box.top)) / box.height;
     const aside = (2 * (event.clientX - box.left)) / box.width - 1;

@@ -59,12 +59,16 @@ export class Link {
       this.on.state("live");
       this.on.echo(message);
     } else if (message.kind === "view") {
-      this.seen = message.number;
-      this.changed(); // The next view waits for this word.
       this.on.view(message);
     } else {
       this.over = true;
     }
+  }
+
+  // The next view waits for this word.
+  drew(number) {
+    this.seen = number;
+    this.changed();
   }
 
   wish(word) {

@@ -20,8 +20,10 @@ from trainer.person.tests.browser import (
     poll,
     reads,
     until,
+    view_of_step,
 )
 from trainer.person.tests.people import LET_GO
+from trainer.person.web import VIEWS_UNDERWAY
 
 pytestmark = pytest.mark.usefixtures("opened")
 
@@ -84,6 +86,61 @@ async def test_a_page_that_loses_the_focus_has_let_go(browser, cockpit):
     await browser.evaluate("dispatchEvent(new Event('blur'))")
     await reads(cockpit, lambda r: not r.engaged)
     await browser.keyboard.up("ArrowUp")
+
+
+HIDE = "Object.defineProperty(document, 'hidden', {configurable: true, value: %s})"
+SEEN = "window.dispatchEvent(new Event('visibilitychange'))"
+
+
+async def test_a_hidden_page_has_let_go_and_comes_back_without_a_pile_of_frames(browser, cockpit):
+    """Browsers say nothing new of a gamepad there, and give no animation frame."""
+    held = [0.0] * 17
+    held[5] = held[7] = 1.0
+    await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {held})")
+    await reads(cockpit, lambda r: r.engaged)
+    await browser.evaluate(
+        f"{HIDE % 'true'}; window.asked = 0; requestAnimationFrame = () => asked++; {SEEN}"
+    )
+    await reads(cockpit, lambda r: r == LET_GO)
+    for step in range(20):
+        cockpit.show(view_of_step(step))
+        await asyncio.sleep(0.02)
+    assert poll(cockpit) == LET_GO
+    assert await browser.evaluate("asked") == 0
+    assert cockpit.present
+    await browser.evaluate(f"{HIDE % 'false'}; {SEEN}")
+    await reads(cockpit, lambda r: r.engaged)
+    assert await browser.evaluate("asked") == 1
+
+
+async def test_no_view_is_sent_ahead_of_what_is_drawn(browser, cockpit):
+    await browser.evaluate("window.asked = 0; requestAnimationFrame = () => asked++")
+    for step in range(20):
+        cockpit.show(view_of_step(step))
+        await asyncio.sleep(0.02)
+    assert await browser.evaluate("asked") <= VIEWS_UNDERWAY + 1  # One may be drawn already.
+
+
+async def test_a_key_whose_coming_up_may_be_lost_is_let_go(browser, cockpit):
+    for lost in ("new KeyboardEvent('keydown', {key: 'Meta', metaKey: true})",
+                 "new MouseEvent('contextmenu')"):  # fmt: skip
+        await browser.keyboard.down("ArrowUp")
+        await reads(cockpit, lambda r: r.engaged)
+        await browser.evaluate(f"window.dispatchEvent({lost})")
+        await reads(cockpit, lambda r: r == LET_GO)
+        await browser.keyboard.up("ArrowUp")
+
+
+async def test_only_the_main_button_holds_the_pad(browser, cockpit):
+    await browser.hover("#pad")
+    await browser.mouse.down(button="right")
+    await asyncio.sleep(0.2)
+    assert poll(cockpit) == LET_GO
+    await browser.mouse.up(button="right")
+    await browser.mouse.down()
+    await reads(cockpit, lambda r: r.engaged)
+    await browser.mouse.up()
+    await reads(cockpit, lambda r: r == LET_GO)
 
 
 async def test_a_page_that_hangs_has_let_go_and_must_press_again(browser, cockpit):
@@ -165,6 +222,11 @@ async def test_a_gamepads_triggers_drive_while_its_button_is_held(browser, cockp
     assert (await reads(cockpit, lambda r: r.engaged)).action == 1.0
     await browser.evaluate("delete pads[0]")
     await reads(cockpit, lambda r: r == LET_GO)
+
+
+async def test_a_gamepad_that_the_browser_does_not_know_takes_over_by_a_button(browser, cockpit):
+    await browser.evaluate(f"plug('Twin Stick', '', [0, 0, -1, 1], {[0.0] * 12})")
+    assert not (await reads(cockpit, lambda r: r.action == 1.0)).by_moving
 
 
 async def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(browser, cockpit):
