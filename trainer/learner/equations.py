@@ -23,9 +23,10 @@ def masked_action(policy_action: Action, human_action: Action | None) -> Action:
 def correlated(
     before: NDArray[np.float64], correlation: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """The next standard normal numbers of a first-order autoregressive process, as ``before``.
+    """The next numbers of a first-order autoregressive process, as ``before``.
 
-    ``correlation`` is that of two in a row; 0 draws each anew.
+    ``correlation`` is that of two in a row; 0 draws each anew. They tend to standard normal ones:
+    from zeros, the k-th numbers have the deviation sqrt(1 - correlation^(2 k)).
     """
     fresh = random.standard_normal(before.shape)
     return correlation * before + math.sqrt(1.0 - correlation**2) * fresh
@@ -42,7 +43,7 @@ def shaped_reward(reward: float, penalty: float, human: bool, human_before: bool
 
 
 def smoothed_target_action(action: Tensor, noise: Tensor, bound: float) -> Tensor:
-    """TD3's target policy smoothing, to both sides: noise clipped to +-``bound``, then [-1, 1]."""
+    """TD3's target policy smoothing: adds noise clipped to +-``bound``, and clips to [-1, 1]."""
     return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
 
 
@@ -86,7 +87,7 @@ def priority(
     return weight * td_error.abs() + offset + advantage_weight * advantage * human
 
 
-def importance_weights(probabilities: Tensor, beta: float | Tensor, normalise: bool) -> Tensor:
+def importance_weights(probabilities: Tensor, beta: float, normalise: bool) -> Tensor:
     """Eq. 15: p(i) ** -beta.
 
     ``normalise`` divides by the batch's largest weight, as the paper's source of prioritised

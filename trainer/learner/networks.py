@@ -36,8 +36,8 @@ _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|bf16)\b")
 def bfloat16_is_faster(device_type: str) -> bool:
     """Whether ``device_type`` (``cpu``, ``cuda``) multiplies bfloat16 faster than float32.
 
-    An Intel does where the kernel has its matrix unit; with its vectors' bfloat16 an update took
-    84 ms, without 73 (``results/bench/xeon_threads_1.json`` of revision 25e9c254).
+    On an Intel it takes the matrix unit (AMX): with the vectors' bfloat16 an update took 84 ms, in
+    float32 73 (``results/bench/xeon_threads_1.json`` of revision 25e9c254).
     """
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)

@@ -1,6 +1,7 @@
 """The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time.
 
-``tests/test_reference.py`` has the same written plainly; this one computes nothing twice.
+``trainer/tests/test_reference.py`` has the same written plainly; here each network embeds a picture
+once.
 """
 
 import copy
@@ -37,6 +38,12 @@ def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 OPTIMISERS = ("actor_optimiser", "critic_optimiser")
+
+
+def _values(critics: networks.CriticPair, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
+    """Q_1 and Q_2, each [n], from pictures that both critics have embedded."""
+    pairs = zip(critics.pair, pictures, strict=True)
+    return [critic.value(picture, actions) for critic, picture in pairs]
 
 
 class TD3Learner:
@@ -164,7 +171,7 @@ class TD3Learner:
     def _shift(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Each picture [n, 2, 45, 80] a few pixels aside; its border is repeated.
 
-        Of a small picture that is at most an eighth. Numbers stay as they are.
+        At most an eighth of a picture's shorter side. Numbers stay as they are.
         """
         if frames.dtype.names:
             moved = frames.copy()
@@ -199,10 +206,7 @@ class TD3Learner:
             next_actions.shape, generator=self.noise, device=self.device
         )
         next_actions = equations.smoothed_target_action(next_actions, noise, c.target_noise_bound)
-        first, second = (
-            critic.value(picture, next_actions)
-            for critic, picture in zip(self.target_critics.pair, pictures, strict=True)
-        )
+        first, second = _values(self.target_critics, pictures, next_actions)
         rewards, terminals = self._tensor(batch.rewards), self._tensor(batch.terminals)
         discount = c.gamma ** torch.as_tensor(batch.spans, device=self.device)
         return equations.td_target(rewards, terminals, (first, second), discount)
@@ -215,14 +219,14 @@ class TD3Learner:
         weights = equations.importance_weights(
             self._tensor(batch.probabilities).float(), beta, c.normalise_importance
         )
-        values = self._values(pictures, actions)
+        values = _values(self.critics, pictures, actions)
         first, second = (
             equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
         )
         loss, errors, mean = first + second, targets - values[0].detach(), values[0].detach().mean()
         if self._charges_overruled and batch.penalised.any():
             penalised = self._tensor(batch.penalised)
-            overruled = self._values(pictures, self._tensor(batch.overruled))
+            overruled = _values(self.critics, pictures, self._tensor(batch.overruled))
             first, second = (
                 equations.overruled_loss(value, penalised, c.intervention_penalty, weights)
                 for value in overruled
@@ -232,17 +236,10 @@ class TD3Learner:
             missed = (c.intervention_penalty - overruled[0].detach()) * penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
         if self.algorithm.proxy_values and batch.human.any():
-            overruled = self._values(pictures, self._tensor(batch.overruled))
+            overruled = _values(self.critics, pictures, self._tensor(batch.overruled))
             for pair in zip(values, overruled, strict=True):
                 loss = loss + equations.proxy_value_loss(*pair, human)
         return loss, errors, mean
-
-    def _values(self, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
-        """Q_1 and Q_2, each [n], from pictures that both critics have embedded."""
-        return [
-            critic.value(picture, actions)
-            for critic, picture in zip(self.critics.pair, pictures, strict=True)
-        ]
 
     def _actor_losses(
         self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor

@@ -1,7 +1,9 @@
 import multiprocessing
 import platform
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -201,6 +203,38 @@ def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew, frames):
     assert not tiles
     assert torch.equal(reduced, by_pairs) != by_tiles
     assert (reduced - by_pairs).norm() < 0.01 * single.norm()
+
+
+WITHOUT_OPENMP = """\
+#!/bin/sh
+case "$*" in *-fopenmp*) echo "{says}" >&2; exit 1;; esac
+exec c++ "$@"
+"""
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    ("says", "is_kept"),
+    [("error: unsupported option '-fopenmp'", True), ("c++: fatal error: Killed", False)],
+)
+def test_only_for_want_of_openmp_a_kernel_of_one_thread_is_kept(tmp_path, anew, says, is_kept):
+    """What fails for another reason may pass the next time."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text(WITHOUT_OPENMP.format(says=says))
+    compiler.chmod(0o700)
+    assert (anew(CXX=str(compiler)) is not None) == is_kept
+    assert bool(list(tmp_path.rglob("*.so"))) == is_kept
+
+
+@needs_kernel
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+def test_what_only_a_matrix_unit_needs_compiles_without_one():
+    source = Path(kernel.__file__).with_name("trunk.cpp")
+    command = ["c++", "-std=c++17", "-march=sapphirerapids", "-fsyntax-only", str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "sapphirerapids" in done.stderr:
+        pytest.skip("the compiler does not know such a processor")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.skipif(

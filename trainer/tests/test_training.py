@@ -36,7 +36,7 @@ from trainer.training.command import check_directory
 from trainer.training.config import CONFIG_FILE, RunConfig
 from trainer.training.metrics import NAMES, Trials, read_metrics
 from trainer.training.run import TrainingRun
-from trainer.util import Purpose, episode_seed, load_torch, source_revision
+from trainer.util import Purpose, episode_seed, load_torch, save_torch, source_revision
 
 # Learning, the slowest part, begins late, and still before what a test looks at.
 SMALL = LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=170, exploration_initial=1.0)
@@ -164,6 +164,17 @@ def test_a_run_of_so_many_steps_goes_on_as_one(tmp_path):
     train(replace(TINY, episodes=1, steps=1, evaluate_every_steps=0), tmp_path)
     with pytest.raises(UserError, match="is a run of --steps 1: repeat that, or more"):
         check_directory(tmp_path, replace(TINY, episodes=1, evaluate_every_steps=0), resume=True)
+
+
+def test_a_checkpoint_of_other_observations_is_said_to_fit_no_more(tmp_path):
+    config = replace(TINY, episodes=1, evaluate_every_steps=0)
+    train(config, tmp_path)
+    state = load_torch(tmp_path / CHECKPOINT_FILE)
+    replay = state["learning"]["replay"]
+    replay["pictures"] = torch.cat([replay["pictures"]] * 2, dim=-1)
+    save_torch(tmp_path / CHECKPOINT_FILE, state)
+    with pytest.raises(UserError, match="does not fit this run"):
+        TrainingRun(config, tmp_path, resume=True)
 
 
 def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):

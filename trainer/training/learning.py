@@ -71,6 +71,7 @@ class LearningThread:
         self._random = random_stream(seed, Purpose.REPLAY)
         # Adam's mean of a gradient that has ended stays denormal for ever, and a processor takes
         # many times as long for those: 3 ms a step instead of 1. To a weight they add nothing.
+        # First of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
         self._updates = algorithm.updates_per_step
         self._begun: tuple[list[Batch], Future[tuple[list[Losses], float]]] | None = None

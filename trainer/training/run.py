@@ -202,7 +202,7 @@ class TrainingRun:
         path = self.run_dir / CHECKPOINT_FILE
         try:
             self._restore(util.load_torch(path))
-        except (LookupError, TypeError, RuntimeError) as error:
+        except (LookupError, TypeError, ValueError, RuntimeError) as error:
             raise UserError(f"{path} does not fit this run") from error
 
     def _restore(self, state: dict[str, Any]) -> None:

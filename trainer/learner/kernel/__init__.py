@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -37,8 +38,8 @@ _TIMEOUT_S = 120.0  # For a build; it takes a few
 def load() -> ctypes.CDLL | None:
     """The library built from ``trunk.cpp``, or None, with one warning, if there can be none.
 
-    Import torch first: on Linux the kernel then shares the OpenMP threads that torch brought along.
-    Two pools of threads would fight for the same cores.
+    On Linux a kernel of GCC shares the OpenMP threads of torch, which is imported before it: two
+    pools of threads would fight for the same cores.
     """
     if os.environ.get("PHIL_KERNEL") == "0":
         return None
@@ -62,8 +63,8 @@ def load() -> ctypes.CDLL | None:
 def _built(source: Path) -> ctypes.CDLL:
     """The library of this source, compiler and processor: from the cache, or built now."""
     compiler = _compiler()
-    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor(), ""]).encode()
-    key = settings + source.read_bytes()
+    settings = *compiler, _version(compiler), *_FLAGS, _OPENMP, _processor(), ""
+    key = "\0".join(settings).encode() + source.read_bytes()
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
     if not library.exists():
         _build(compiler, source, library)
@@ -75,21 +76,31 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as directory:
         target = Path(directory) / library.name
-        # A compiler without OpenMP still gives a kernel of one thread.
         for openmp in ([_OPENMP], []):
-            command = [*compiler, *_FLAGS, *openmp, "-o", str(target), str(source)]
-            try:
-                done = subprocess.run(
-                    command, capture_output=True, text=True, errors="replace",
-                    timeout=_TIMEOUT_S, check=False,
-                )  # fmt: skip
-            except (OSError, subprocess.TimeoutExpired) as error:
-                raise UserError(f"{command[0]} cannot be run: {error}") from error
+            done = _ask([*compiler, *_FLAGS, *openmp, "-o", str(target), str(source)])
             if done.returncode == 0:
                 write_atomic(library, target.read_bytes())
                 return
+            # A compiler without OpenMP still gives a kernel of one thread; another fault may pass.
+            if not re.search(r"fopenmp|[lg]omp", done.stderr):
+                break
     errors = (line for line in done.stderr.splitlines() if "error" in line)
-    raise UserError(f"{command[0]} failed: {next(errors, f'status {done.returncode}')}")
+    raise UserError(f"{compiler[0]} failed: {next(errors, f'status {done.returncode}')}")
+
+
+def _ask(command: list[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(
+            command, capture_output=True, text=True, errors="replace",
+            timeout=_TIMEOUT_S, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise UserError(f"{command[0]} cannot be run: {error}") from error
+
+
+def _version(compiler: list[str]) -> str:
+    """What it says of itself: a newer one may know more of the processor."""
+    return _ask([*compiler, "--version"]).stdout
 
 
 def _compiler() -> list[str]:
@@ -131,9 +142,9 @@ def trunk_features(
 
     Differentiable once with respect to the parameters. The compiled kernel serves the networks of
     this project on the CPU; anything else, and every export, takes the torch operations.
-    Under ``torch.autocast`` the kernel multiplies in bfloat16 where the processor can: forward, and
-    by a matrix unit backward, too. Its sums, features and gradients stay in single precision. The
-    torch operations follow autocast's own rules, which round features too.
+    Under ``torch.autocast`` the kernel multiplies in bfloat16 where the processor can, backward
+    only with a matrix unit. Its sums, features and gradients stay in single precision. The torch
+    operations follow autocast's own rules, which round features too.
 
     Args:
         frames: uint8 [batch, n, 45, 80] with n = 1 or 2. A slice of a longer stack of frames,

@@ -75,8 +75,8 @@ constexpr int PRODUCTS = 9, TAPS = 9;  // see below
 constexpr int WIDE = REGISTERS / 16;   // vectors of positions computed together
 constexpr uint8_t OFF = 4;             // in the place of a winner (0..3): ReLU is off
 
-// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. They are numbered along
-// rows of PITCH with room up to SIZE, so that no loop has a remainder. The surplus is not used.
+// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. Output (row, column) has
+// the number row * PITCH + column, of SIZE, so that no loop has a remainder. Nobody reads the others.
 template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
           int COLUMNS_>
 struct Layer {
@@ -212,7 +212,7 @@ inline void pool(const Vector (&block)[4], float bias, float* output, uint8_t* w
     }
     best += bias;
     const Integers on = best > Vector{};
-    store(output, best < Vector{} ? Vector{} : best);  // not the mask: NaN should stay NaN
+    store(output, best < Vector{} ? Vector{} : best);  // not the mask: four NaN stay NaN
     *reinterpret_cast<LooseBytes*>(winner) =
         __builtin_convertvector(on ? place : Integers{} + OFF, Bytes);
 }
@@ -295,7 +295,7 @@ inline bool tiles_permitted() {
     return permitted;
 }
 
-// GCC's tile loads and configurations do not tell it which memory they read.
+// GCC does not see which memory its tile instructions read: it may move a store past them.
 inline void settle() { asm volatile("" ::: "memory"); }
 
 struct Shape {
@@ -424,8 +424,8 @@ private:
 };
 #endif
 
-// What a thread needs for one image. It starts as zeros: unused positions may hold anything, but
-// reading them should not meet slow denormal numbers.
+// What a thread needs for one image, forward. It starts as zeros: unused positions may hold
+// anything, but reading them should not meet slow denormal numbers.
 template <int FRAMES, template <class> class Way>
 struct ForwardScratch {
     using First = FirstLayer<FRAMES>;
@@ -867,6 +867,7 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
     std::vector<Totals> sums((images + CHUNK - 1) / CHUNK);
 #pragma omp parallel num_threads(threads) if (images > CHUNK)
     {
+        // Zeros, which margins and padding must stay: nobody writes there.
         const auto scratch = std::make_unique<typename Way<FRAMES>::Scratch>();
 #pragma omp for schedule(dynamic)
         for (int64_t first = 0; first < images; first += CHUNK)
@@ -890,7 +891,7 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
 // channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need
 // is kept in hidden and winners1, trunk_hidden() numbers an image each, and in winners2,
-// trunk_outputs() numbers an image. All three are null if there will be none. ``reduced`` asks for
+// trunk_outputs() numbers an image. All three are null if no backward pass follows. ``reduced`` asks for
 // bfloat16; a backward pass has it by a matrix unit only.
 
 extern "C" {
