@@ -185,27 +185,26 @@ def die_with_parent() -> None:
 
 
 @cache
-def source_revision() -> str:
-    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
+def source_revision(directory: Path = Path(__file__).parent) -> str:
+    """A repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
 
     As it was when first asked for: what is committed later is not what this process runs. Results
     that a run has just written make no other source.
     """
-    commit = _git("rev-parse", "HEAD")
+    commit = _git(directory, "rev-parse", "HEAD")
     if commit is None:
         return "unknown"
     source = (":/", *(f":(top,exclude){path}" for path in WRITTEN))
-    dirty = _git("diff", "--quiet", "HEAD", "--", *source) is None
+    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", *source) is None
     return f"{commit}-dirty" if dirty else commit
 
 
-def _git(*arguments: str) -> str | None:
+def _git(directory: Path, *arguments: str) -> str | None:
     """What git says; None where it fails."""
     try:
         done = subprocess.run(
-            ["git", *arguments],
-            cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
-        )  # fmt: skip
+            ["git", *arguments], cwd=directory, capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()

@@ -138,8 +138,8 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
     path = directory / MODEL_FILE
     state = load_torch(path)
     try:
-        check_trained_in(env, directory, state["scenario"])
         actor = Actor(state["action_size"], state["frames"], env.observation_space)
+        check_trained_in(env, directory, state["scenario"])
         actor.load_state_dict(state.pop("actor"))
     except (AttributeError, LookupError, TypeError, RuntimeError) as error:
         raise UserError(f"{path} is not a human model of this project") from error

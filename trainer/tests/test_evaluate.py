@@ -38,7 +38,8 @@ def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name
     (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(tmp_path)
     label = {"scenario": "planted:Env-v0", "algorithm": "phil_td3", "seed": 0, "episode": 3}
-    save_torch(tmp_path / name, {**label, "actor": Actor().state_dict()})
+    more = {"action_size": 1, "frames": 2, "actor": Actor().state_dict()}
+    save_torch(tmp_path / name, {**label, **more})
     with pytest.raises(UserError, match="trained in planted:Env-v0, not in left_turn"):
         load_driver(str(tmp_path), make_environment("left_turn"))
 
