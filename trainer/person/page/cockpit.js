@@ -41,10 +41,11 @@ const frames = [...document.querySelectorAll("#frames canvas")];
 const link = new Link(hands, { view: see, echo: hearEcho, state: showState });
 let lastMs = performance.now();
 setInterval(step, STEP_MS);
-// Without the focus, or under a menu, a page hears no key or button come up.
-for (const gone of ["blur", "pagehide", "contextmenu", "visibilitychange"]) {
+// Without the focus a page hears neither key nor finger come up, and under a menu no key.
+for (const gone of ["blur", "pagehide", "visibilitychange"]) {
   addEventListener(gone, () => [touch, keyboard].forEach((hand) => hand.release()));
 }
+addEventListener("contextmenu", () => keyboard.release());
 addEventListener("visibilitychange", () => view && show());
 
 function step() {

@@ -119,6 +119,7 @@ export class Pad {
       this.move(event);
       event.preventDefault();
     });
+    element.addEventListener("contextmenu", (event) => event.preventDefault()); // a long press
     element.addEventListener("pointermove", (event) => this.move(event));
     for (const up of ["pointerup", "pointercancel", "lostpointercapture"]) {
       element.addEventListener(up, (event) => event.pointerId === this.finger && this.release());

@@ -166,6 +166,9 @@ async def test_a_finger_on_the_pad_drives(browser, cockpit):
     x, middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     await touch("Start", (x, middle))
     assert abs((await reads(cockpit, lambda r: r.engaged)).action) < 0.05
+    long_press = "new MouseEvent('contextmenu', {bubbles: true, cancelable: true})"
+    menu = await browser.evaluate(f"document.getElementById('pad').dispatchEvent({long_press})")
+    assert not menu, "as a phone asks for one under a thumb that stays"
     await touch("Move", (x, middle - 0.45 * box["height"]))
     await reads(cockpit, lambda r: r.action == 1.0)
     await touch("Move", (x, middle + 0.225 * box["height"]))
