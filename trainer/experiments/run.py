@@ -40,7 +40,13 @@ from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE
-from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
+from trainer.training.metrics import (
+    METRICS_FILE,
+    EpisodeMetrics,
+    read_metrics,
+    totals,
+    was_validated,
+)
 from trainer.training.run import TrainingRun
 
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
@@ -75,7 +81,6 @@ TEST_COLUMNS = (
 """What is kept of each test drive; the seeds are 0, 1, ..."""
 TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
-NOT_VALIDATED = ("", "nan")
 DIGITS = 5
 PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
 EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
@@ -213,7 +218,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         if not _train(task, run_dir):
             return None
         rows = read_metrics(run_dir)
-        validated = [row for row in rows if row["validation_success"] not in NOT_VALIDATED]
+        validated = [row for row in rows if was_validated(row)]
         tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
         record["training"] = _columns(rows, TRAINING_COLUMNS)
         record["validation"] = _columns(validated, VALIDATION_COLUMNS)
@@ -264,7 +269,7 @@ def _train(task: Task, run_dir: Path) -> bool:
     )
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
-    validated = over and rows[-1]["validation_success"] not in NOT_VALIDATED
+    validated = over and was_validated(rows[-1])
     if validated and (run_dir / BEST_FILE).is_file():
         return True  # trained before; the checkpoint may be gone already
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())

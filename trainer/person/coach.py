@@ -14,7 +14,7 @@ from pathlib import Path
 from bridge.report import failed
 from edge_runtime.util import counted
 from trainer.training.metrics import LEARNED as LEVELS
-from trainer.training.metrics import is_reached
+from trainer.training.metrics import is_reached, was_validated
 
 LEARNED, WELL = LEVELS
 """Success of the policy alone from which the person only watches, and from which all is done."""
@@ -79,7 +79,7 @@ class Coach:
             given_s += human_s
             known = int(row["episode"]), row["outcome"], human_s, int(row["interventions"])
             self.episodes.append(Episode(*known))
-            if row.get("validation_success", "") not in ("", "nan"):
+            if was_validated(row):
                 self.curve.append((given_s, float(row["validation_success"])))
 
     def to_check(self) -> list[int]:

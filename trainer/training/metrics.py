@@ -7,7 +7,7 @@ import copy
 import csv
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -145,7 +145,7 @@ class MetricsWriter:
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """The rows of a run; empty where it has none.
+    """The rows of a run, empty where it has none; a column that it began without is empty in each.
 
     A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
 
@@ -175,11 +175,16 @@ def _rows(text: str) -> list[dict[str, str]]:
                     (int if name in WHOLE else float)(value)
         except (ValueError, TypeError):
             raise ValueError(f"row {number} is broken") from None
-    return rows
+    return [{**dict.fromkeys(NAMES, ""), **row} for row in rows]
 
 
 LEARNED = (0.9, 0.98)
 """Success of the policy alone, in validation, at which one asks what it has cost."""
+
+
+def was_validated(row: Mapping[str, str]) -> bool:
+    """Whether the policy alone was validated as this row's episode ended."""
+    return row["validation_success"] not in ("", "nan")
 
 
 def is_reached(level: float, success: float) -> bool:
@@ -213,7 +218,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     measured = [
         (float(row["validation_success"]), number)
         for number, row in enumerate(rows)
-        if row.get("validation_success", "") not in ("", "nan")
+        if was_validated(row)
     ]
     validation = {}
     if measured:
@@ -226,7 +231,7 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
-        "updates": int(rows[-1].get("updates") or 0),
+        "updates": int(rows[-1]["updates"] or 0),
         **spent(rows, period_s),
         "validation": validation,
         "until": until,
