@@ -28,6 +28,7 @@ from deploy.bundle import (
     _pack,
     _sign,
     build_edge_wheel,
+    build_installer,
     check_wheels,
     gather,
     lock_path,
@@ -69,6 +70,7 @@ def test_the_same_inputs_give_the_same_bytes(workshop, tmp_path):
         folder = make_bundle(each, HERE, tmp_path / str(number)).path.parent
         made.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert (made[0], len(made[0])) == (made[1], 2)  # the bundle and its signature
+    assert build_installer() == build_installer()
 
 
 @pytest.mark.board

@@ -266,6 +266,7 @@ class TestClaims:
         for claim in (*claims.CLAIMS, *claims.AS_PRINTED, *claims.GOALS):
             assert claim.source in EXPERIMENTS
             for found in filter(None, claims.judge_both(everything, claim)):
+                assert found.holds in ("yes", "no", "undecided")
                 assert found.text not in ("", "not measured")
             nothing = claims.judge_both(results, claim)[0]
             assert (nothing.text, nothing.holds) == ("not measured", "undecided")

@@ -1,5 +1,6 @@
 import multiprocessing
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import torch
 from trainer.learner import kernel
 from trainer.learner.kernel import trunk_features
 
+needs_x86 = pytest.mark.skipif(
+    platform.machine() != "x86_64", reason="the flags are those of x86-64"
+)
 needs_kernel = pytest.mark.skipif(
     kernel.load() is None, reason="there is no compiler here, or PHIL_KERNEL=0"
 )
@@ -172,7 +176,7 @@ def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, anew, compi
 
 
 @needs_kernel
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+@needs_x86
 @pytest.mark.parametrize("flags", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
 def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
     """Also: without bfloat16 instructions, reduced precision is single precision."""
@@ -185,7 +189,7 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
 
 
 @needs_kernel
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+@needs_x86
 @pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
 def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew, frames):
     pictures = _pictures(9)[:, frames]
@@ -208,7 +212,7 @@ def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew, frames):
 WITHOUT_OPENMP = """\
 #!/bin/sh
 case "$*" in *-fopenmp*) echo "{says}" >&2; exit 1;; esac
-exec c++ "$@"
+exec {compiler} "$@"
 """
 
 
@@ -220,17 +224,18 @@ exec c++ "$@"
 def test_only_for_want_of_openmp_a_kernel_of_one_thread_is_kept(tmp_path, anew, says, is_kept):
     """What fails for another reason may pass the next time."""
     compiler = tmp_path / "compiler"
-    compiler.write_text(WITHOUT_OPENMP.format(says=says))
+    compiler.write_text(WITHOUT_OPENMP.format(says=says, compiler=shlex.join(kernel._compiler())))
     compiler.chmod(0o700)
     assert (anew(CXX=str(compiler)) is not None) == is_kept
     assert bool(list(tmp_path.rglob("*.so"))) == is_kept
 
 
 @needs_kernel
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+@needs_x86
 def test_what_only_a_matrix_unit_needs_compiles_without_one():
     source = Path(kernel.__file__).with_name("trunk.cpp")
-    command = ["c++", "-std=c++17", "-march=sapphirerapids", "-fsyntax-only", str(source)]
+    flags = ["-std=c++17", "-march=sapphirerapids", "-fsyntax-only"]
+    command = [*kernel._compiler(), *flags, str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if "sapphirerapids" in done.stderr:
         pytest.skip("the compiler does not know such a processor")

@@ -75,8 +75,9 @@ constexpr int PRODUCTS = 9, TAPS = 9;  // see below
 constexpr int WIDE = REGISTERS / 16;   // vectors of positions computed together
 constexpr uint8_t OFF = 4;             // in the place of a winner (0..3): ReLU is off
 
-// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. Output (row, column) has
-// the number row * PITCH + column, of SIZE, so that no loop has a remainder. Nobody reads the others.
+// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. Output (row, column)
+// has the number row * PITCH + column, of SIZE, so that no loop has a remainder. Nobody reads the
+// others.
 template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
           int COLUMNS_>
 struct Layer {
@@ -891,8 +892,8 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
 // channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need
 // is kept in hidden and winners1, trunk_hidden() numbers an image each, and in winners2,
-// trunk_outputs() numbers an image. All three are null if no backward pass follows. ``reduced`` asks for
-// bfloat16; a backward pass has it by a matrix unit only.
+// trunk_outputs() numbers an image. All three are null if no backward pass follows. ``reduced``
+// asks for bfloat16; a backward pass has it by a matrix unit only.
 
 extern "C" {
 
