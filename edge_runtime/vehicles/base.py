@@ -13,20 +13,7 @@ import math
 import threading
 import time
 from collections import deque
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Callable,
-    ClassVar,
-    Deque,
-    Dict,
-    List,
-    Mapping,
-    NamedTuple,
-    Optional,
-    Sequence,
-    Tuple,
-)
+from typing import TYPE_CHECKING, Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
@@ -47,10 +34,10 @@ class VehicleReport(NamedTuple):
     in the scenario; its pedal is then worked out from its speed.
     """
 
-    action: Dict[str, float]
+    action: dict[str, float]
     speed_mps: float
     self_braking: bool
-    faults: List[str]
+    faults: list[str]
     standing: Sequence[str] = ()
     scenario_speed_mps: Optional[float] = None
     commanded_speed_mps: Optional[float] = None
@@ -90,7 +77,7 @@ class Vehicle(abc.ABC):
         return cls(**settings)
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> dict[str, ActionLimit]:
         """What `limits` of the driver would be, without opening anything: a replay needs them.
 
         By default those of the class. Raises UserError where it has none, or as `open` does.
@@ -109,7 +96,7 @@ class Vehicle(abc.ABC):
 
     @abc.abstractmethod
     def command(
-        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+        self, action: dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
         """Ask for an action; it holds for 2 T, after which the vehicle brakes by itself.
 
@@ -151,9 +138,9 @@ class VehicleWatch:
 
     def __init__(self, control_period_s: float, limits: Limits) -> None:
         self._silence_s, self._limits = 2 * control_period_s, limits
-        self._asked: Deque[Tuple[float, Dict[str, float]]] = deque()
+        self._asked: deque[tuple[float, dict[str, float]]] = deque()
         self._reported_s: Optional[float] = None
-        self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
+        self._believed: Optional[tuple[float, float]] = None  # time, speed of the last possible one
         self._deviates_since_s = math.inf
         self._lies = False
 
@@ -166,7 +153,7 @@ class VehicleWatch:
         """The vehicle is enabled: from now on it owes reports."""
         self._reported_s = now_s
 
-    def command(self, action: Dict[str, float], now_s: float) -> None:
+    def command(self, action: dict[str, float], now_s: float) -> None:
         """Note what was asked; of a safe stop, too."""
         self._asked.append((now_s, action))
         # One entry older than LAG_S stays: it was in force when the window began.
@@ -216,7 +203,7 @@ class VehicleWatch:
                 return True
         return False
 
-    def _range(self, name: str) -> Tuple[float, float]:
+    def _range(self, name: str) -> tuple[float, float]:
         """Of an action of the vehicle; it may report more than it takes, in -1 to 1."""
         limit = self._limits.get(name)
         return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
@@ -354,7 +341,7 @@ class VehicleRunner:
                 self._report()
             self._busy_since_s = None
 
-    def _wait(self, until_s: float) -> Tuple[bool, Optional[_Task]]:
+    def _wait(self, until_s: float) -> tuple[bool, Optional[_Task]]:
         """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
         with self._due:
             self._due.wait_for(

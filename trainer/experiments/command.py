@@ -122,6 +122,9 @@ def run(arguments: argparse.Namespace) -> int:
     wanted = plan.units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
+    if arguments.ray and any(unit.scenario in FOREIGN for unit in wanted):
+        kinds = " or ".join(plan.SCENARIOS)
+        raise UserError(f"--ray lacks {', '.join(FOREIGN)}: compute one with --scenario {kinds}")
     possible = [unit for unit in wanted if plan.is_possible(unit, humans)]
     if left_out := len(wanted) - len(possible):
         say(f"{left_out} units left out: {humans} holds no human model of their scenario")

@@ -345,11 +345,12 @@ class Window:
         for line in textwrap.wrap(coach.advice, 30):
             self._text(line, (left, top), "text", 24)
             top += 24
-        top = 140
-        for line in (f"policy alone: {coach.alone or '–'}", *textwrap.wrap(coach.said, 36)):
-            self._text(line, (left, top), "dim")
-            top += 20
-        self._curves(coach, pygame.Rect(left, 220, COACH_WIDTH, CURVE_HEIGHT))
+        if coach.alone or coach.typical:  # Not where nothing learns
+            top = 140
+            for line in (f"policy alone: {coach.alone or '–'}", *textwrap.wrap(coach.said, 36)):
+                self._text(line, (left, top), "dim")
+                top += 20
+            self._curves(coach, pygame.Rect(left, 244, COACH_WIDTH, CURVE_HEIGHT))
         rows = [
             (str(one.number), one.outcome, f"{one.human_s:.1f}", str(one.takeovers))
             for one in reversed(coach.episodes)
@@ -357,7 +358,7 @@ class Window:
         for row, (number, outcome, human_s, takeovers) in enumerate(
             [("", "", "you, s", "take-overs"), *rows]
         ):
-            y = 384 + 19 * row
+            y = 408 + 19 * row
             self._text(outcome, (left + 36, y), "text")
             for cell, end in ((number, 26), (human_s, 154), (takeovers, COACH_WIDTH)):
                 self._text(cell, (left + end, y), "dim", right=True)

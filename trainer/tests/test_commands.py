@@ -80,6 +80,7 @@ TOLD = [
     ("experiment fig7 --seeds 0", "--seeds"),
     ("experiment report status", "stand alone"),
     ("experiment fig7 --ray auto --device cuda", "on processors"),
+    ("experiment guidance --ray auto", "lacks hill, racetrack"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
     ("experiment report --results nowhere", "no results"),
 ]  # fmt: skip

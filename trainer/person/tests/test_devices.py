@@ -1,7 +1,8 @@
 import re
+import textwrap
 import time
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import msgspec
@@ -11,11 +12,12 @@ from hypothesis import strategies as st
 
 from bridge import rerun
 from edge_runtime.util import UserError
-from trainer.person.coach import Coaching, Episode
+from trainer.person.coach import Coaching, Episode, said
 from trainer.person.controls import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 from trainer.person.devices import (
     COACH_LEFT,
     COACH_WIDTH,
+    COLOURS,
     SIZE,
     JoystickHands,
     KeyboardHands,
@@ -181,6 +183,28 @@ def test_the_learning_curve_runs_through_the_right_column(opened):
     line = found(rerun.POLICY)
     assert line.left >= COACH_LEFT
     assert line.width == pytest.approx(28 / 30 * COACH_WIDTH, abs=6)
+
+
+def test_the_learning_curve_leaves_the_words_above_it_alone(opened):
+    cost = {"human_s": 129.0, "takeovers": 12, "failures": 13}
+    words = said(cost, [(42.0, 0.9)], [(22.0, 0.9)])
+    coach = Coaching("", words, "90%", [(42.0, 0.9)], [], 129.0, [])
+    opened(1920, 1080).show(replace(first_view(), coach=coach))
+    right = shown().subsurface((COACH_LEFT, 0, COACH_WIDTH, 400))
+    panel = pygame.mask.from_threshold(right, COLOURS["panel"], (1, 1, 1, 255))
+    top = max(panel.get_bounding_rects(), key=lambda box: box.width * box.height).top
+    ink = pygame.mask.from_threshold(right, COLOURS["dim"], (60, 60, 60, 255))
+    inked = [any(ink.get_at((x, y)) for x in range(COACH_WIDTH)) for y in range(top)]
+    lines = sum(now and not before for before, now in pairwise(inked))
+    assert lines == 1 + len(textwrap.wrap(words, 36)) == 5
+
+
+def test_where_nothing_learns_there_is_no_curve(opened):
+    coach = Coaching("", "29 s at the wheel", "", [], [], 29.0, [FAILED])
+    opened(1920, 1080).show(replace(first_view(), coach=coach))
+    right = shown().subsurface((COACH_LEFT, 0, COACH_WIDTH, 400))
+    mask = pygame.mask.from_threshold(right, COLOURS["background"], (1, 1, 1, 255))
+    assert mask.count() == right.get_width() * right.get_height()
 
 
 def test_a_window_that_is_resized_shows_all_of_it_in_its_shape(opened):
