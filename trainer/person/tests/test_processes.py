@@ -158,6 +158,19 @@ def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
     all_in_replay(training.run_dir)
 
 
+def test_the_window_loads_no_llvm_beside_that_of_triton(display):
+    code = """
+from pathlib import Path
+from trainer.person.devices import KeyboardHands, Window
+window = Window(KeyboardHands("left_turn"))
+window.poll(0.0)
+print("LLVM" in Path("/proc/self/maps").read_text())
+"""
+    command, environment = [sys.executable, "-c", code], {**os.environ, **display}
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert told.stdout == "False\n", told.stderr
+
+
 def train(run_dir, *more):
     module = "trainer.person.tests.virtual_wheel"
     return Training(run_dir, "--human", "wheel", *more, module=module, SDL_VIDEODRIVER="dummy")
