@@ -53,7 +53,7 @@ class Coaching:
     """What is shown of the coach."""
 
     advice: str  # Empty where there is none
-    said: str  # What the person has given, beside the typical human where one is known
+    said: str  # What the person has given; empty where there is nothing to hold it against
     alone: str  # Success of the policy alone, in words; empty before the first validation
     curve: Curve
     typical: Curve  # Of a scripted human with the same algorithm; empty where none is known
@@ -100,10 +100,11 @@ class Coach:
             return None
         alone = self.curve[-1][1] if self.curve else None
         known = ([] if alone is None else [f"{alone:.0%}"]) + ["checking"] * self.checking
+        compared = bool(known or self.typical)
         advice = advise(list(self.episodes), alone, self._mastered) if self.learning else ""
         return Coaching(
             advice=advice,
-            said=said(cost, self.curve, self.typical),
+            said=said(cost, self.curve, self.typical) if compared else "",
             alone=", ".join(known),
             curve=[(round(x, 1), round(y, 3)) for x, y in self.curve],
             typical=self.typical,

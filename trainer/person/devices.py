@@ -345,7 +345,7 @@ class Window:
         for line in textwrap.wrap(coach.advice, 30):
             self._text(line, (left, top), "text", 24)
             top += 24
-        if coach.alone or coach.typical:  # Not where nothing learns
+        if coach.said:
             top = 140
             for line in (f"policy alone: {coach.alone or '–'}", *textwrap.wrap(coach.said, 36)):
                 self._text(line, (left, top), "dim")

@@ -14,7 +14,7 @@ export function showCoach(coach) {
   if (text === shown) return;
   shown = text;
   byId("advice").textContent = coach?.advice ?? "";
-  byId("coach").hidden = !coach || (!coach.alone && !coach.typical.length);
+  byId("coach").hidden = !coach?.said;
   byId("listed").hidden = !coach?.episodes.length;
   if (!coach) return;
   byId("alone").textContent = coach.alone;

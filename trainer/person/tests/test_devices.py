@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bridge import rerun
 from edge_runtime.util import UserError
-from trainer.person.coach import Coaching, Episode, said
+from trainer.person.coach import Coach, Coaching, Episode, said
 from trainer.person.controls import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 from trainer.person.devices import (
     COACH_LEFT,
@@ -200,8 +200,10 @@ def test_the_learning_curve_leaves_the_words_above_it_alone(opened):
 
 
 def test_where_nothing_learns_there_is_no_curve(opened):
-    coach = Coaching("", "29 s at the wheel", "", [], [], 29.0, [FAILED])
-    opened(1920, 1080).show(replace(first_view(), coach=coach))
+    coach = Coach()
+    coach.episodes.append(FAILED)
+    coaching = coach.show({"human_s": 29.0, "takeovers": 2, "failures": 1})
+    opened(1920, 1080).show(replace(first_view(), coach=coaching))
     right = shown().subsurface((COACH_LEFT, 0, COACH_WIDTH, 400))
     mask = pygame.mask.from_threshold(right, COLOURS["background"], (1, 1, 1, 255))
     assert mask.count() == right.get_width() * right.get_height()
