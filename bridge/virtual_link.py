@@ -23,7 +23,9 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from bridge.network import LatencySpec, Link, make_link
+from edge_runtime.freshness import Freshness
 from edge_runtime.safety import (
+    Event,
     Mode,
     Safety,
     advance,
@@ -188,6 +190,8 @@ class VirtualLink(Generic[Message]):
         self._numbers = itertools.count()
         self._newest_at_edge = -1
         self._safety = Safety(period_s)
+        self._freshness = Freshness(self._safety.answer_s)
+        self._unanswered = -1  # The step of a state that came too late to be driven on
         self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
         self._admitted_s = 0.0
 
@@ -213,7 +217,7 @@ class VirtualLink(Generic[Message]):
             overtaken = step <= self._newest_at_edge
             if not overtaken:
                 self._newest_at_edge = step
-                self._note_fresh(now_s)
+                self._note_arrival(step, now_s)
             return Arrival(step, now_s, content, overtaken)
         return None
 
@@ -221,7 +225,12 @@ class VirtualLink(Generic[Message]):
         heapq.heappush(self._under_way, (arrival_s, next(self._numbers), message))
 
     def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
-        """Send the answer to the newest state back; ``computing_s`` is reported only."""
+        """Send the answer to the newest state back; ``computing_s`` is reported only.
+
+        An edge runtime that drives does not answer a state that lags too far behind.
+        """
+        if arrival.step == self._unanswered:
+            return
         if self._safety.mode is Mode.SAFE_STOP:
             command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
         if command.plan:  # as long as the edge runtime's own silence
@@ -238,11 +247,17 @@ class VirtualLink(Generic[Message]):
         acts_s = self._admitted_s if answered else self._window_end_s
         return self.hold.decide(acts_s, edge_silence_s)
 
-    def _note_fresh(self, now_s: float) -> None:
-        """What the edge runtime's safety machine makes of a fresh state's moment."""
+    def _note_arrival(self, step: int, now_s: float) -> None:
+        """What the edge runtime's safety machine makes of a newest state's moment."""
         gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
             self._safety = advance(self._safety, gap)
+        stands, sent_s = self._safety.mode is Mode.SAFE_STOP, step * self._period_s
+        lag_s = self._freshness.lag_s("", sent_s, now_s, None, stands)
+        if lag_s > self._safety.answer_s + ROUNDING_S:
+            self._safety = advance(self._safety, Event.LATE)
+            self._unanswered = step if self._safety.mode is Mode.DRIVE else -1
+            return
         self._safety = note_arrival(self._safety, "", now_s)
         fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
         self._safety = advance(self._safety, fresh)

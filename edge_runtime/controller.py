@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from edge_runtime import safety as rules
+from edge_runtime.freshness import Freshness
 from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, State, is_foreign
@@ -93,6 +94,19 @@ class Received(NamedTuple):
     arrived_s: float
     arrived_ns: int
 
+    @property
+    def trip_s(self) -> Optional[float]:
+        """How long the newest command that the sender had heard, and this state, were under way.
+
+        None where the sender does not say. The stamps of each clock are subtracted first: two of
+        different clocks may be decades apart.
+        """
+        heard_sent_ns, heard_ns = self.state.heard_sent_ns, self.state.heard_ns
+        if isinstance(heard_sent_ns, int) and isinstance(heard_ns, int):
+            held_ns = self.state.sent_ns - heard_ns
+            return (self.arrived_ns - heard_sent_ns - held_ns) * 1e-9
+        return None
+
 
 class Order(NamedTuple):
     """A command without the sender's stamps. `ridden`: of a plan, for this end's vehicle only."""
@@ -141,6 +155,8 @@ class Controller:
     ) -> None:
         self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
         self._ride = ride
+        self._freshness = Freshness(self.safety.answer_s)
+        self._lag_s = 0.0  # of the newest state
         self.link_quality = link_quality  # of a policy with an envelope; the shell feeds it
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
@@ -153,6 +169,7 @@ class Controller:
         self._last_action = neutral_action(limits)
         self._ordered_s = -math.inf  # when that was ordered
         self._newest: Optional[Received] = None
+        self._driven: Optional[Received] = None  # the state whose plan is played
         self._begun_s: Optional[float] = None
         self._next_stop_s = math.inf  # nothing is repeated before a first safe stop
         if needs_rearm and not armed_at_start:
@@ -176,7 +193,11 @@ class Controller:
         event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
         if event is not None:
             self._apply(event)
-        self.safety = rules.note_arrival(self.safety, session, received.arrived_s)
+        stands = self.safety.mode is Mode.SAFE_STOP
+        sent_s, arrived_s = received.state.sent_ns * 1e-9, received.arrived_s
+        self._lag_s = self._freshness.lag_s(session, sent_s, arrived_s, received.trip_s, stands)
+        if not self._is_late:
+            self.safety = rules.note_arrival(self.safety, session, arrived_s)
         self._newest = received
         self._begun_s = now_s
 
@@ -191,25 +212,27 @@ class Controller:
             return None
         overdue = now_s - self._begun_s > self._period_s
         # A process that was stopped in between would drive on what the road was then.
-        if overdue or now_s - self._newest.arrived_s > self.safety.answer_s:
+        age_s = now_s - self._newest.arrived_s + (0.0 if self._is_late else self._lag_s)
+        if overdue or age_s > self.safety.answer_s:
             return self._give_up(now_s)
         self._begun_s = None
-        held_up = self._ride is not None and self._ride.is_held_up(self._newest)
-        if held_up and self.safety.mode is Mode.DRIVE and not self._newest.state.final:
-            return None  # newer ones follow: it rides until then
         if now_s - self._newest.arrived_s > self._period_s:
             self.deadline_misses += 1
         wanted: List[float] = []
         form = (np.float32, (len(self._limits),))
         if output is not None and (output.dtype, output.shape) == form:
             wanted = output.tolist()
-        self._apply(self._event_of(wanted))
+        event = self._event_of(wanted)
+        self._apply(event)
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + self._period_s
             return self._stop_order(inference_ns, now_s)
-        if self._needs_rearm and self._newest.state.final:
+        if event is Event.LATE:
+            return None  # as if it had not come
+        if self._newest.state.final and (self._needs_rearm or self._is_late):
             # A vehicle that is told to drive on would do so until its own watchdog ends it.
             return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
+        self._driven = self._newest
         order = self._drive_order(self._newest, wanted, inference_ns, now_s)
         if self._ride is None or self.safety.mode is not Mode.DRIVE:
             return order
@@ -223,22 +246,22 @@ class Controller:
 
     def tick(self, now_s: float) -> Optional[Order]:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
-        if self._newest is None:
-            return None  # before the first state there is nobody to tell
         if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
-        was = self.safety.mode
+        was, heard = self.safety.mode, self._newest is not None
         if self._policy_is_dead:
             pass  # whatever else is wrong, this is why it stands
-        elif was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
+        elif was is not Mode.STANDBY and heard and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
-        elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
+        elif self.vehicle_fault:
             self._apply(Event.VEHICLE)  # it may be over before the next state
+        if self._newest is None:
+            return None  # before the first state there is nobody to tell
         if self.safety.mode is not Mode.SAFE_STOP:
             ridden = self._ride.play(now_s) if self._ride else None
-            if ridden is None:
+            if ridden is None or self._driven is None:
                 return None
-            return self._drive_order(self._newest, ridden, 0, now_s)._replace(ridden=True)
+            return self._drive_order(self._driven, ridden, 0, now_s)._replace(ridden=True)
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
             return None
         self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
@@ -268,7 +291,8 @@ class Controller:
             return f"the vehicle is at fault: {self.vehicle_fault}"
         if rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
-            return "no fresh states arrive; re-arm when the link is back"
+            arrives = "only late" if self._is_late else "no fresh"
+            return f"{arrives} states arrive; re-arm when the link is back"
         if self.link_quality is not None and (refusal := self.link_quality.refusal()):
             return refusal
         self._apply(Event.REARM)
@@ -284,6 +308,7 @@ class Controller:
     def _event_of(self, wanted: List[float]) -> Event:
         """Which event an answer is; `wanted` is empty where it has another form."""
         assert self._newest is not None
+        final = self._newest.state.final
         if self._task and is_foreign(self._newest.state, self._task):
             return Event.OTHER_TASK
         if not wanted:
@@ -295,7 +320,13 @@ class Controller:
             return Event.VEHICLE
         if self.link_quality is not None and self.link_quality.outside:
             return Event.OUTSIDE
-        return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
+        if self._is_late:  # the end of the episode ends the drive, however late it is
+            return Event.FINAL if final and self.safety.mode is Mode.DRIVE else Event.LATE
+        return rules.classify_fresh(self.safety, final, self._needs_rearm)
+
+    @property
+    def _is_late(self) -> bool:
+        return self._lag_s > self.safety.answer_s
 
     def _give_up(self, now_s: float) -> Order:
         """Stop because the policy takes too long; its answer, should it come, is not used."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from typing import List, Optional
 
-from edge_runtime.controller import Limits, Received, limit_action
-from edge_runtime.safety import SILENCE_PERIODS
+from edge_runtime.controller import Limits, limit_action
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PLAN, MAX_RIDE_S
 
@@ -35,24 +34,6 @@ class Ride:
         self._period_s, self._limits, self._plays = period_s, limits, plays
         self._left: List[List[float]] = []
         self._next_s = math.inf
-        self._heard: Optional[Received] = None
-        self._lag_s = 0.0
-
-    def is_held_up(self, received: Received) -> bool:
-        """Whether a link that holds messages (TCP) held this state for longer than 2.2 T.
-
-        After a silence through which it rode, such a backlog comes at once and looks fresh. Its
-        first state lags by the time between the arrivals less that between the sendings; one that
-        comes at the usual pace is no backlog, whatever its sender's clock does.
-        """
-        heard, self._heard = self._heard or received, received
-        gap_s = received.arrived_s - heard.arrived_s
-        later_s = gap_s - (received.state.sent_ns - heard.state.sent_ns) * 1e-9
-        if gap_s > SILENCE_PERIODS * self._period_s:
-            self._lag_s = min(later_s, gap_s)
-        else:
-            self._lag_s = self._lag_s + later_s if gap_s < self._period_s / 2 else 0.0
-        return self._lag_s > SILENCE_PERIODS * self._period_s
 
     def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
         """The actions after the command `action`, on towards what the policy `wanted`, from now on.

@@ -33,6 +33,7 @@ class Event(str, Enum):
     RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for longer than silence_s
+    LATE = "state_late"  # the state lags behind its stamps by more than answer_s (freshness.py)
     NOT_FINITE = "output_not_finite"
     FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
     DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps
@@ -54,6 +55,7 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
     Event.RECOVERED: (_D, _D, _D),
     Event.FINAL: (_S, _S, _X),  # the end of an episode is no way around the condition
     Event.SILENT: (_S, _X, _X),  # between two episodes nothing is due
+    Event.LATE: (_X, _D, _X),  # it is not answered: what drives is silent if no other comes in time
     Event.NOT_FINITE: (_X, _X, _X),
     Event.FAILED: (_X, _X, _X),
     Event.DEAD: (_X, _X, _X),
@@ -69,8 +71,8 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
 TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (before, event): after for event, row in _ROWS.items() for before, after in zip(Mode, row)
 }
-# What stops a drive is a fault.
-FAULTS = tuple(event for event in Event if TRANSITIONS[_D, event] is _X)
+# What stops it in standby or in a drive is a fault.
+FAULTS = tuple(event for event in Event if _X in (TRANSITIONS[_S, event], TRANSITIONS[_D, event]))
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 
 
@@ -79,9 +81,10 @@ class Safety(NamedTuple):
 
     `control_period_s` is T. It never changes.
 
-    `last_fresh_s` and `session` are the monotonic arrival of the newest state and the simulator
-    that sent it, None before the first one. `permitted_s` is when it last drove or was re-armed,
-    or the arrival of the very first state. `ride_s` never changes; 0: no ride-through.
+    `last_fresh_s` and `session` are the monotonic arrival of the newest state that was not late,
+    and the simulator that sent it, None before the first one. `permitted_s` is when it last drove
+    or was re-armed, or the arrival of the very first state. `ride_s` never changes; 0: no
+    ride-through.
     """
 
     control_period_s: float
@@ -154,7 +157,10 @@ def advance(safety: Safety, event: Event) -> Safety:
 
 
 def note_arrival(safety: Safety, session: str, arrived_s: float) -> Safety:
-    """Remember whose newest state arrived when, before anyone knows what the policy makes of it."""
+    """Remember whose newest state arrived when, before anyone knows what the policy makes of it.
+
+    Not called for a late state: the silence goes on.
+    """
     drives = safety.mode is Mode.DRIVE or safety.permitted_s is None
     return safety._replace(
         last_fresh_s=arrived_s,

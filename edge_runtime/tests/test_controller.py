@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from edge_runtime.controller import ActionLimit, Controller, Received, limit_action, shared_limits
 from edge_runtime.ride import Ride
+from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
 from edge_runtime.util import UserError
@@ -35,7 +36,8 @@ def make(needs_rearm=False, actions=(PEDAL,), vehicle=None, **options):
 
 
 def begin(controller, step, arrived_s, now_s, **changes):
-    controller.begin(Received(make_state(step, **changes), arrived_s, 0), now_s)
+    sent = {"sent_ns": round(arrived_s * 1e9), **changes}
+    controller.begin(Received(make_state(step, **sent), arrived_s, 0), now_s)
 
 
 def answer(controller, step, now_s, output=GOOD, **changes):
@@ -71,8 +73,8 @@ def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
     for step, (arrived_s, sent_s, driven) in enumerate([
         (10.0, 5.0, True), (10.1, 5.1, True), (10.6, 5.6, True),  # lost: as late as it was sent
         (11.1, 5.7, False), (11.101, 5.8, False), (11.102, 5.9, True), (11.103, 6.0, True),
-        (11.104, 6.1, True), (11.2, 6.2, True), (11.3, 2.0, True), (11.4, 9.0, True),  # a clock
-        (11.8, 9.1, False), (11.9, 9.2, True),  # in step again
+        (11.104, 6.1, True), (11.2, 6.2, True), (11.3, 2.0, False),  # its clock was set back
+        (11.4, 2.1, False), (11.5, 6.5, True),  # and ahead again
     ]):  # fmt: skip
         order = answer(controller, step, arrived_s, sent_ns=round(sent_s * 1e9))
         assert (order is not None) == driven, step
@@ -448,6 +450,65 @@ def test_a_service_with_a_vehicle_waits_for_its_first_permission():
         (6.001, "finish", "not_armed"), *states(6.1, 4, "not_armed"), (6.45, "rearm", ""),
         (6.5, "state", "drive"),
     ])  # fmt: skip
+
+
+def fault_in_the_vehicle(controller):
+    controller.vehicle_fault = LYING
+    controller.tick(0.31)
+
+
+# What makes an event happen after 0.3 s, with a vehicle.
+CAUSES = {
+    Event.FRESH: lambda c: answer(c, 9, 0.32),
+    Event.FINAL: lambda c: answer(c, 9, 0.32, final=True),
+    Event.SILENT: lambda c: c.tick(0.9),
+    Event.LATE: lambda c: answer(c, 9, 0.32, sent_ns=-(10**9)),
+    Event.NOT_FINITE: lambda c: answer(c, 9, 0.32, NAN),
+    Event.FAILED: lambda c: answer(c, 9, 0.32, None),
+    Event.DEAD: lambda c: c.policy_died(),
+    Event.TOO_LONG: lambda c: (begin(c, 9, 0.32, 0.32), c.tick(0.43)),
+    Event.OTHER_SESSION: lambda c: answer(c, 9, 0.32, session="simulator-b"),
+    Event.OTHER_TASK: lambda c: answer(c, 9, 0.32, task="another"),
+    Event.VEHICLE: fault_in_the_vehicle,
+}
+WAYS = {  # into each mode
+    Mode.STANDBY: [(0.3, "final", "final_state")],
+    Mode.DRIVE: [(0.3, "state", "drive")],
+    Mode.SAFE_STOP: [FIRST, (0.25, "tick", SILENT), (0.3, "state", SILENT)],
+}
+
+
+@pytest.mark.parametrize("event", CAUSES)
+@pytest.mark.parametrize("mode", Mode)
+def test_the_table_holds_in_every_mode(mode, event):
+    controller = play(make(needs_rearm=True, task="ours"), WAYS[mode])
+    assert controller.safety.mode is mode
+    CAUSES[event](controller)
+    assert controller.safety.mode is TRANSITIONS[mode, event]
+    if controller.safety.mode is Mode.SAFE_STOP:
+        assert controller.safety.reason == (event.value if event in FAULTS else SILENT)
+        assert controller.waits_for_rearm
+
+
+def test_a_fault_of_the_vehicle_before_the_first_state_is_remembered():
+    play(make(needs_rearm=True), [
+        (0, "fault", LYING), (0.0, "tick", None), (0, "fault", ""), *states(0.1, 9, FAULT),
+        (0.95, "rearm", ""), (1.0, "state", "drive"),
+    ])  # fmt: skip
+
+
+def test_held_up_states_do_not_feed_the_watchdog():
+    """A state each 0.4 s, ever later: it stops when its ride ends, and waits for the operator."""
+    controller = riding(0.5, needs_rearm=True)
+    answer(controller, 0, 0.0)
+    due = []
+    for step in range(1, 20):
+        while (due_s := controller.next_deadline_s() or math.inf) < 0.4 * step:
+            due.append(said(controller.tick(due_s + 1e-6)))
+        order = answer(controller, step, 0.4 * step, sent_ns=round(0.05e9 * step))
+        assert order is None or order.mode == "safe_stop"
+    assert due[:6] == ["drive"] * 5 + [SILENT]
+    assert controller.waits_for_rearm
 
 
 class Quality:

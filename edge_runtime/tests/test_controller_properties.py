@@ -88,15 +88,14 @@ class AnyHistory(RuleBasedStateMachine):
 
     @rule()
     def the_vehicle_fails(self):
-        """In whatever moment: what drives, or rides, stops with the next look."""
+        """In whatever moment: it stops with the next look, and needs the operator."""
         if self.vehicle:
-            drove, rearmed = self._drives(), self._is_stopped() and self.permitted
+            drove = self._drives()
             self.controller.vehicle_fault = "it is stuck"
             order = self.controller.tick(self.now_s)
             self.controller.vehicle_fault = ""
             assert not drove or (order is not None and order.reason == "vehicle_fault")
-            if drove or rearmed:
-                self._fault()
+            self.good_in_a_row, self.permitted = 0, False
             if order is not None:
                 self._note(order)
 

@@ -1,0 +1,215 @@
+"""Which state is too late: by hand, then any story of a link, a clock and a vehicle."""
+
+import heapq
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_runtime.controller import Controller, Received, shared_limits
+from edge_runtime.freshness import DRIFT, Freshness
+from edge_runtime.ride import Ride
+from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.policies import PEDAL
+from edge_runtime.vehicles.mock import MockVehicle
+
+T = 0.1
+LIMIT_S = 2.2 * T
+DECADES_S = 1.7e9
+GOOD = np.array([0.5], np.float32)
+
+
+def lags(*states, limit_s=LIMIT_S, trips=None, stands=()):
+    """The lag of each (sent, arrived); `trips` and `stands` by number."""
+    freshness, trips = Freshness(limit_s), trips or {}
+    return [
+        freshness.lag_s("a", sent_s, arrived_s, trips.get(n), n in stands)
+        for n, (sent_s, arrived_s) in enumerate(states)
+    ]
+
+
+def near(*lags_s):
+    return pytest.approx(lags_s, abs=3e-3)  # the least may have crept
+
+
+def test_a_lag_is_what_a_state_has_above_the_quickest_of_its_session():
+    assert lags((5.0, 10.0), (5.1, 10.15), (5.2, 10.19), (5.3, 10.6)) == near(0, 0.05, 0, 0.31)
+    # Whatever the pace: a backlog that comes in step is as late as one that comes at once.
+    assert lags((0.0, 0.0), *((T * n, T * n + 3.0) for n in (1, 2, 3)))[1:] == near(3, 3, 3)
+
+
+def test_clocks_that_drift_apart_are_followed():
+    drifting = [(s, s * (1 + DRIFT)) for s in range(0, 3601, 60)]
+    assert max(lags(*drifting)) == 0.0
+    assert lags((0.0, 0.0), (100.0, 100.3)) == near(0, 0.28)
+
+
+def test_each_session_has_its_own_quickest_state_and_keeps_it():
+    freshness = Freshness(LIMIT_S)
+    assert freshness.lag_s("a", 0.0, 0.0, None, False) == 0.0
+    assert freshness.lag_s("b", 500.0, 0.1, None, False) == 0.0
+    assert freshness.lag_s("a", 0.2, 2.0, None, False) == pytest.approx(1.8, abs=1e-3)
+
+
+def test_a_clock_that_is_set_counts_as_lag_until_the_round_trip_of_a_stop_shows_no_backlog():
+    trips = dict.fromkeys(range(9), 0.05)
+    back = [(0.0, 0.0), (T, T), (-9.8, 0.2), (-9.7, 0.3), (-9.6, 0.4)]
+    assert lags(*back, trips=trips)[2:] == near(10, 10, 10)
+    assert lags(*back, trips=trips, stands={3})[2:] == near(10, 0, 0)
+    assert lags(*back, trips={**trips, 3: 2.0}, stands={3})[2:] == near(10, 1.95, 1.95)
+    assert lags(*back, stands={3})[2:] == near(
+        10, 10, 10
+    )  # a sender that does not say what it heard
+    ahead = [(0.0, 0.0), (T, T), (9.2, 0.2), (9.3, 0.3)]
+    assert lags(*ahead, trips=trips)[2:] == near(9, 9)
+    assert lags(*ahead, trips={**trips, 2: -1.0}, stands={2, 3})[2:] == near(9, 0)
+
+
+def test_a_round_trip_is_held_against_the_quickest_whose_state_did_not_lag():
+    back = [(0.0, 0.0), (T, 0.3), (-9.8, 0.4), (-9.7, 0.5)]
+    assert lags(*back, trips={1: 0.25, 3: 0.25}, stands={2, 3})[2:] == near(10.2, 0.2)
+    # What is measured only while a clock may have been set shows nothing.
+    assert lags(*back, trips={2: 2.0, 3: 2.0}, stands={3})[2:] == near(10.2, 10.2)
+
+
+class World:
+    """A sender each T, a link in either direction that keeps the order, and a controller."""
+
+    def __init__(self, vehicle: bool, ride_s: float, down_s: float = 0.05) -> None:
+        limits = shared_limits([PEDAL], MockVehicle.limits if vehicle else {})
+        ride = Ride(ride_s, T, limits, plays=vehicle) if ride_s else None
+        self.controller = Controller(limits, T, vehicle, ride=ride)
+        self.vehicle, self.ride_s = vehicle, ride_s
+        self.now_s, self.step, self.clock_s = 1000.0, 0, 0.0
+        self.up_s, self.down_s = 0.01, down_s
+        self.up_free_s = self.down_free_s = 0.0
+        self.heard: dict = {}
+        self.heard_s = self.stepped_s = -math.inf
+        self.least_s = math.inf  # of the true delays that a clock's step did not disguise
+        self.hidden_s = 0.0  # by steps ahead since a round trip in a stop
+        self.permitted = True
+        self.measured = self.stopped = False
+        self.drives = 0
+        self.events: list = []
+        self.numbers = itertools.count()
+
+    def lives(self, periods, up_s, growth_s, step_s, lost, fault, rearms):
+        """So many control periods of one kind; the delay grows with each state."""
+        self.up_s = up_s
+        self.clock_s += step_s
+        self.hidden_s += max(step_s, 0.0)
+        self.stepped_s = self.now_s if step_s else self.stepped_s
+        self.controller.vehicle_fault = "it is stuck" if fault else ""
+        for _ in range(periods):
+            self.up_s += growth_s
+            self.send(lost)
+            if rearms and self.controller.rearm(self.now_s) == "":
+                self.permitted = True
+            self.run_until(self.now_s + T)
+
+    def send(self, lost):
+        sent_ns = round((self.now_s + self.clock_s + DECADES_S) * 1e9)
+        state = make_state(self.step, sent_ns=sent_ns, **self.heard)
+        self.step += 1
+        if not lost:
+            self.up_free_s = max(self.up_free_s, self.now_s + self.up_s)
+            self.push(self.up_free_s, ("state", state, (self.now_s, self.heard_s)))
+
+    def push(self, at_s, event):
+        heapq.heappush(self.events, (at_s, next(self.numbers), event))
+
+    def run_until(self, end_s):
+        while True:
+            due_s = self.controller.next_deadline_s()
+            due_s = math.inf if due_s is None else max(due_s + 1e-6, self.now_s)
+            next_s = self.events[0][0] if self.events else math.inf
+            if min(due_s, next_s) > end_s:
+                break
+            self.now_s = min(due_s, next_s)
+            if due_s <= next_s:
+                self.note(self.controller.tick(self.now_s))
+                continue
+            kind, message, when = heapq.heappop(self.events)[2]
+            if kind == "state":
+                self.arrive(message, *when)
+            else:
+                self.heard_s = self.now_s
+                heard_ns = round((self.now_s + self.clock_s + DECADES_S) * 1e9)
+                self.heard = {"heard": 1, "heard_sent_ns": message, "heard_ns": heard_ns}
+        self.now_s = end_s
+
+    def arrive(self, state, sent_s, heard_s):
+        delay_s = self.now_s - sent_s
+        if heard_s >= self.stepped_s:
+            self.least_s = min(self.least_s, delay_s)
+        self.late_s = delay_s - self.least_s
+        # A round trip shows a backlog where one without it was measured before.
+        self.measured |= heard_s > 0.0 > self.stepped_s and self.late_s < LIMIT_S
+        if self.stopped and self.measured and heard_s > self.stepped_s:
+            self.hidden_s = 0.0
+        received = Received(state, self.now_s, round(self.now_s * 1e9))
+        self.controller.begin(received, self.now_s)
+        self.now_s += 0.001
+        self.note(self.controller.finish(GOOD, 1_000_000, self.now_s))
+
+    def note(self, order: Any) -> None:
+        if order is None:
+            return
+        if order.ridden:
+            assert self.vehicle
+            assert not self.stopped
+            age_s = self.now_s - order.answers.arrived_s
+            assert age_s <= LIMIT_S + self.ride_s + 1e-3
+        elif order.mode == "drive":
+            allowed_s = LIMIT_S + DRIFT * (self.now_s - 1000.0) + self.hidden_s
+            assert self.late_s <= allowed_s + 1e-6
+            assert self.permitted or not self.vehicle
+            self.stopped = False
+            self.drives += 1
+        elif order.reason != "final_state":
+            self.permitted = self.permitted and self.stopped
+            self.stopped = True
+        if not order.ridden:
+            self.down_free_s = max(self.down_free_s, self.now_s + self.down_s)
+            self.push(self.down_free_s, ("command", round(self.now_s * 1e9), 0.0))
+
+
+delays = st.sampled_from([0.01, 0.01, 0.05, 0.2, 0.31, 0.6, 3.0])
+kinds_of_life = st.fixed_dictionaries({
+    "periods": st.sampled_from([1, 3, 8, 20]), "up_s": delays,
+    "growth_s": st.sampled_from([0.0, 0.0, 0.0, 0.005, 0.05, 0.3]),
+    "step_s": st.sampled_from([0.0] * 5 + [-0.15, -0.5, -3600.0, 0.15, 0.5, 3600.0]),
+    "lost": st.booleans(), "fault": st.booleans(), "rearms": st.booleans(),
+})  # fmt: skip
+
+
+@settings(max_examples=1000)
+@given(st.booleans(), st.sampled_from([0.0, 0.5]), delays, st.lists(kinds_of_life, max_size=6))
+def test_no_story_drives_on_a_late_state_or_without_a_permission(vehicle, ride_s, down_s, story):
+    world = World(vehicle, ride_s, down_s)
+    for life in story:
+        world.lives(**life)
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, -0.3, 0.0, 0.3, 3600.0])
+@pytest.mark.parametrize("ride_s", [0.0, 0.5])
+def test_it_drives_again_after_a_stop_whatever_was_done_to_the_clock(step_s, ride_s):
+    world, good = World(True, ride_s), {"growth_s": 0.0, "lost": False, "fault": False}
+    quick = {"up_s": 0.05, **good}
+    world.lives(periods=20, step_s=0.0, rearms=False, **quick)
+    assert world.drives > 15
+    world.lives(periods=20, step_s=step_s, rearms=False, **quick)
+    assert world.stopped == (step_s != 0.0)
+    world.lives(periods=20, step_s=0.0, rearms=True, **quick)
+    assert not world.stopped
+    # A backlog stops it again, and while it lasts no permission helps.
+    backlog = {**quick, "up_s": 3.0}
+    world.lives(periods=40, step_s=0.0, rearms=True, **backlog)
+    assert world.stopped
+    world.lives(periods=20, step_s=0.0, rearms=True, **quick)
+    world.lives(periods=20, step_s=0.0, rearms=True, **quick)
+    assert not world.stopped
