@@ -37,10 +37,15 @@ def event(level: str, name: str, /, **fields: Any) -> None:
     _LOGGER.log(logging.getLevelName(level.upper()), name, extra={"fields": fields})
 
 
-def close() -> None:
-    """Write what still waits, for half a second at most. Call it before the process ends."""
+def close() -> bool:
+    """Write what still waits, for half a second at most. Call it before the process ends.
+
+    Returns False where a reader of stderr stands still: the interpreter's exit would wait for it.
+    """
     for handler in _LOGGER.handlers:
         handler.close()
+    backgrounds = [one for one in _LOGGER.handlers if isinstance(one, _Background)]
+    return not any(one.thread.is_alive() for one in backgrounds)
 
 
 class _Background(logging.Handler):
@@ -50,8 +55,8 @@ class _Background(logging.Handler):
         super().__init__()
         self._target = target
         self._lines: queue.Queue[Optional[logging.LogRecord]] = queue.Queue(_WAITING_LINES)
-        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self.thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
         with contextlib.suppress(queue.Full):
@@ -62,7 +67,7 @@ class _Background(logging.Handler):
             self._lines.put(None, timeout=_FLUSH_S)
         except queue.Full:
             return
-        self._thread.join(_FLUSH_S)
+        self.thread.join(_FLUSH_S)
         super().close()
 
     def _run(self) -> None:

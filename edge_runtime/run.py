@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 
 import zenoh
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
 
 
 _WAITING_PERIOD_S = 5.0
+_ANNOUNCE_S = 0.5
 
 
 class _StopSignal:
@@ -72,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     for number in ending_signals():  # a second one must not change how it has ended
         signal.signal(number, signal.SIG_IGN)
     if not ended:
-        # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        # A thread hangs in native code or in a write, and would hold the interpreter's exit.
         os._exit(0)
     return 0
 
@@ -90,8 +91,8 @@ def drive(
 
     `vehicle` is a driver, or what `--vehicle` takes; a driver is closed in the end. `config` is a
     TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
-    it in the main thread only. Returns False where the policy's thread hangs and would hold the
-    interpreter's exit. Raises UserError where it cannot begin, and where it gave way to another
+    it in the main thread only. Returns False where a thread hangs and would hold the interpreter's
+    exit. Raises UserError where it cannot begin, and where it gave way to another
     runtime of the same vehicle id.
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
@@ -103,13 +104,22 @@ def drive(
     try:
         loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
         log.configure(loaded.log_level, loaded.log_format)
-        with contextlib.ExitStack() as undo:
-            undo.callback(log.close)
-            return _drive(loaded, _StopSignal(until, undo), driver)
     except BaseException:
         if driver is not None:
-            driver.close()
+            _close_in_time(driver)
         raise
+    try:
+        with contextlib.ExitStack() as undo:
+            ended = _drive(loaded, _StopSignal(until, undo), driver)
+    finally:
+        written = log.close()
+    return ended and written
+
+
+def _close_in_time(vehicle: Vehicle) -> None:
+    from edge_runtime.vehicles.base import close_in_time
+
+    close_in_time(vehicle)
 
 
 def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None) -> bool:
@@ -117,35 +127,38 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
 
     Raises UserError, and leaves nothing open, where the run cannot be made, and where it gave way.
     """
-    tls: Optional[TlsFiles] = None
-    access: Optional[Dict[str, Any]] = None
-    if config.tls is not None:
-        from edge_runtime.tls import EDGE, check_name, common_name, load_tls, rules_for_edge
-
-        tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
-        check_name(tls.name, common_name(EDGE, config.vehicle_id))
-        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
-    if config.vehicle != NONE:
-        from edge_runtime.vehicles import find_vehicle, make_vehicle
-
-        find_vehicle(config.vehicle)  # now: nobody need wait for the policy to hear of a misprint
-    claim = (config.realtime_priority, config.cpus, config.lock_memory)
-    if any(claim):
-        from edge_runtime.realtime import claim_resources
-
-        claim_resources(*claim)
-    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-    # Both of its sessions hear only what this vehicle's edge may hear.
-    connected = partial(open_session, connect=config.connect, tls=tls, access=access)
-    open_client = partial(connected, mode="client")
-    notifier = service.Notifier()
     with contextlib.ExitStack() as undo:
+        if vehicle is not None:
+            undo.callback(_close_in_time, vehicle)
+        tls: Optional[TlsFiles] = None
+        access: Optional[Dict[str, Any]] = None
+        if config.tls is not None:
+            from edge_runtime.tls import EDGE, check_name, common_name, load_tls, rules_for_edge
+
+            tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
+            check_name(tls.name, common_name(EDGE, config.vehicle_id))
+            log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
+        if config.vehicle != NONE:
+            from edge_runtime.vehicles import find_vehicle, make_vehicle
+
+            # Now: nobody need wait for the policy to hear of a misprint.
+            find_vehicle(config.vehicle)
+        claim = (config.realtime_priority, config.cpus, config.lock_memory)
+        if any(claim):
+            from edge_runtime.realtime import claim_resources
+
+            claim_resources(*claim)
+        policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+        # Both of its sessions hear only what this vehicle's edge may hear.
+        connected = partial(open_session, connect=config.connect, tls=tls, access=access)
+        open_client = partial(connected, mode="client")
+        notifier = service.Notifier()
         period_s = policy.manifest.control_period_s
         if config.vehicle != NONE:
             vehicle = make_vehicle(config.vehicle, config.vehicle_settings, policy.manifest)
+            undo.callback(_close_in_time, vehicle)
         name, its_limits = NONE, {}
         if vehicle is not None:
-            undo.callback(vehicle.close)
             vehicle.control_period_s = period_s
             name, its_limits = vehicle.name, vehicle.limits
         limits = shared_limits(policy.manifest.action, its_limits)
@@ -182,6 +195,30 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
     stop.on_stop = loop.stop
     why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
     over = threading.Event()
+    failures: List[BaseException] = []
+
+    def announce() -> None:
+        try:
+            if has_router:
+                wait_for_router(session)
+            link.appear(open_client, loop.stop)
+            if policy.trust != VERIFIED:
+                log.event("warning", "policy_not_verified", trust=policy.trust)
+            print(
+                f"ready vehicle_id={config.vehicle_id} vehicle={name}"
+                f" connect={config.connect} policy_id={policy.policy_id}",
+                flush=True,
+            )
+            notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")
+            # One that is linked already has some time for its first state.
+            grace_s = _WAITING_PERIOD_S if session.info.routers_zid() else 0.0
+            say_what_is_missing(loop.has_heard, why, over, time.monotonic() + grace_s)
+        except BaseException as error:  # the main thread raises it
+            failures.append(error)
+            loop.stop()
+
+    # Apart from the watchdog, which is the main thread: whoever reads stdout may stand still.
+    announcer = threading.Thread(target=announce, name="announce", daemon=True)
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()
     gc.freeze()
@@ -189,21 +226,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         if runner is not None:
             runner.start(armed)
         loop.start()
-        if has_router:
-            wait_for_router(session)
-        link.appear(open_client, loop.stop)
-        if policy.trust != VERIFIED:
-            log.event("warning", "policy_not_verified", trust=policy.trust)
-        print(
-            f"ready vehicle_id={config.vehicle_id} vehicle={name}"
-            f" connect={config.connect} policy_id={policy.policy_id}",
-            flush=True,
-        )
-        # One that is linked already has some time for its first state.
-        first_s = time.monotonic() + (_WAITING_PERIOD_S if session.info.routers_zid() else 0.0)
-        say = partial(say_what_is_missing, loop.has_heard, why, over, first_s)
-        threading.Thread(target=say, name="waiting", daemon=True).start()
-        notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")
+        announcer.start()
         if not stop.came:
             loop.run()
     finally:
@@ -212,7 +235,10 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         notifier.tell("STOPPING=1")
         ended = loop.close()
         if runner is not None:
-            runner.close()
+            ended = runner.close() and ended
+        if announcer.ident is not None:
+            announcer.join(_ANNOUNCE_S)
+            ended = ended and not announcer.is_alive()
         link.close()
         health = loop.health()
         log.event(
@@ -224,6 +250,8 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             safe_stops=health.safe_stops,
             uptime_s=round(health.uptime_s, 1),
         )
+    if failures:
+        raise failures[0]
     if link.gave_way:
         raise taken(config.vehicle_id)
     return ended

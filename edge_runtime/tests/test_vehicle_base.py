@@ -7,7 +7,7 @@ import time
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
@@ -16,7 +16,7 @@ from edge_runtime.tests.policies import T
 from edge_runtime.tests.rigs import CAR, CARS, PEDAL, a_manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import base, make_vehicle
-from edge_runtime.vehicles.base import LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
+from edge_runtime.vehicles.base import BRAKING, LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 from edge_runtime.wire import SAFE_STOP, encode
 
@@ -53,6 +53,8 @@ class BrokenVehicle(MockVehicle):
             raise OSError("no such device")
         if self.broken == "feedback exits":
             raise SystemExit
+        if self.broken == "feedback interrupts":
+            raise KeyboardInterrupt
         if self.broken == "hang":
             self.hanging.set()
             self.released.wait()
@@ -80,6 +82,8 @@ class BrokenVehicle(MockVehicle):
         self.asked.append(what)
         if self.broken == "command":
             raise OSError("bus off")
+        if self.broken == what == "enable":
+            raise RuntimeError("no control of the gearbox")
         if self.broken == "exit":
             raise SystemExit
 
@@ -112,8 +116,10 @@ def runner(vehicle):
     [
         ("broken", "feedback", ""),
         ("broken", "feedback exits", ""),
+        ("broken", "feedback interrupts", ""),
         ("odd", {"speed_mps": None}, {}),
         ("odd", {"action": {"pedal": "full"}}, {}),
+        ("odd", {"action": {"steering": 0.0}}, {}),  # whether it obeys, nobody could see
         ("odd", {"faults": 3}, {}),
     ],
 )
@@ -189,14 +195,9 @@ def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(veh
 
 
 @pytest.mark.parametrize("broken", ["command", "exit"])
-def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner, broken):
-    vehicle.hang()
-    runner.close()
-    assert vehicle.asked == []  # it may be in the middle of a call
+def test_a_driver_that_raises_at_the_end_is_closed_all_the_same(vehicle, runner, broken):
     vehicle.broken = broken
-    vehicle.released.set()
-    runner._thread.join(10.0)
-    runner.close()
+    assert runner.close()
     assert vehicle.asked == ["brake", "close"]
 
 
@@ -263,6 +264,116 @@ def test_only_a_vehicle_that_is_armed_is_enabled(vehicle, armed):
     runner.close()
 
 
+def test_a_failed_enable_is_a_fault_that_no_drive_passes_until_one_succeeds(vehicle, runner):
+    vehicle.broken = "enable"
+    runner.enable()
+    wait_until(lambda: runner.faults, "the fault")
+    assert "no control" in runner.fault(time.monotonic())
+    assert runner.standing_fault(time.monotonic()) == ""  # to try again is how it ends
+    runner.command(make_command())
+    runner.command(make_command(1, mode=SAFE_STOP))
+    wait_until(lambda: vehicle.asked[-1] == "brake", "the brake")
+    assert "command" not in vehicle.asked
+    vehicle.broken = ""
+    runner.enable()
+    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
+    runner.command(make_command(2))
+    wait_until(lambda: vehicle.asked[-1] == "command", "the drive")
+
+
+RAISED = [OSError("bus off"), SystemExit(3), KeyboardInterrupt(), GeneratorExit()]
+
+
+class RaisingVehicle(BrokenVehicle):
+    """Raises in the calls of `raises`, and moves only by commands that it takes."""
+
+    def __init__(self):
+        super().__init__()
+        self.raises: dict = {}
+
+    def _ask(self, what):
+        super()._ask(what)
+        if self.raises.get(what):
+            raise self.raises[what]
+
+    def feedback(self, now_s):
+        if self.raises.get("feedback"):
+            raise self.raises["feedback"]
+        return super().feedback(now_s)
+
+
+calls = st.sampled_from(["enable", "command", "brake", "feedback"])
+deeds = st.one_of(
+    st.sampled_from(["enable", "drive", "stop", "report"]),
+    st.tuples(calls, st.sampled_from([None, *RAISED])),
+)
+
+
+@settings(max_examples=1000)
+@given(st.lists(deeds, max_size=20))
+def test_whatever_a_driver_raises_it_gets_no_drive_that_no_enable_has_allowed(story):
+    vehicle = RaisingVehicle()
+    runner = NotingRunner(vehicle)
+    refused = False  # the newest enable
+    for deed in story:
+        vehicle.asked.clear()
+        if isinstance(deed, tuple):
+            vehicle.raises = {**vehicle.raises, deed[0]: deed[1]}
+        elif deed == "enable":
+            runner.enable()
+            runner._enable()
+            refused = vehicle.raises.get("enable") is not None
+        elif deed == "report":
+            runner._report()
+        else:
+            command = make_command(mode="drive" if deed == "drive" else SAFE_STOP)
+            runner._obey(base._Task(command, None, True, time.monotonic()))
+            wanted = "brake" if deed == "stop" else "command"
+            assert vehicle.asked == ([] if refused and deed == "drive" else [wanted])
+        assert runner.fault(time.monotonic()) or not refused
+
+
+@pytest.mark.parametrize("call", ["feedback", "enable", "command", "brake", "close"])
+def test_a_driver_that_hangs_anywhere_is_left_in_time_and_braked_when_it_comes_back(
+    monkeypatch, call
+):
+    monkeypatch.setattr(base, "_LEAVE_S", 0.3)
+    vehicle = BrokenVehicle()
+    runner = NotingRunner(vehicle)
+    runner.start()
+    vehicle.asked.clear()
+    real = getattr(vehicle, call)
+
+    def hangs(*arguments, **options):
+        vehicle.hanging.set()
+        vehicle.released.wait()
+        return real(*arguments, **options)
+
+    setattr(vehicle, call, hangs)
+    runner.enable()
+    runner.command(make_command())
+    if call in ("feedback", "enable", "command"):
+        assert vehicle.hanging.wait(10.0)
+    begun_s = time.monotonic()
+    assert not runner.close()
+    assert time.monotonic() - begun_s < 5.0
+    assert "close" not in vehicle.asked
+    vehicle.released.set()
+    wait_until(lambda: vehicle.asked[-2:] == ["brake", "close"], "its end")
+
+
+def test_a_driver_that_is_only_busy_at_the_end_is_braked_and_closed(vehicle, runner):
+    vehicle.hang()
+    threading.Timer(0.8, vehicle.go_on).start()
+    assert runner.close()
+    assert vehicle.asked == ["brake", "close"]
+
+
+def test_a_driver_that_was_never_started_is_closed(vehicle):
+    assert NotingRunner(vehicle).close()
+    assert vehicle.asked == ["brake", "close"]
+
+
 TICK_S = 0.05
 
 
@@ -285,7 +396,7 @@ def watched(asked=0.0, **reported):
     ("asked", "reported", "newest", "fault"),
     [
         (0.3, {"pedal": 0.3}, {}, ""),
-        (0.6, {"pedal": -1.0, "self_braking": True}, {}, ""),  # and obeys nobody
+        (0.6, {"pedal": -1.0, "self_braking": True}, {}, BRAKING),  # though it is to drive
         (0.0, {}, {"speed_mps": 9.0}, LYING),
         (0.0, {}, {"speed_mps": math.nan}, LYING),
         (0.0, {}, {"pedal": 1.1}, LYING),
@@ -296,6 +407,24 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
     watch, now_s = watched(asked=asked, **reported)
     watch.report(report(**{**reported, **newest}), now_s + TICK_S)
     assert watch.fault(now_s + TICK_S) == fault
+
+
+def test_one_that_brakes_by_itself_while_it_is_to_drive_is_at_fault_once_it_could_be_enabled():
+    times = [round(tick * TICK_S, 3) for tick in range(60)]
+
+    def live(braking, drives):
+        watch, said = VehicleWatch(T, MockVehicle.limits), {}
+        watch.enable(0.0)
+        for now_s in times:
+            watch.command({"pedal": 0.0}, now_s, drives)
+            watch.report(report(self_braking=braking(now_s)), now_s)
+            said[now_s] = watch.fault(now_s)
+        return said
+
+    said = live(lambda now_s: True, True)
+    assert (said[1.2], said[1.25]) == ("", BRAKING)
+    assert set(live(lambda now_s: True, False).values()) == {""}
+    assert set(live(lambda now_s: now_s % 0.2 < 0.1, True).values()) == {""}
 
 
 def test_silence_after_two_periods_also_before_the_first_report():

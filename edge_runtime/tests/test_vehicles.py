@@ -1,5 +1,6 @@
 """The door of the drivers: built in, installed by others, or named as module:Class; and `drive`."""
 
+import math
 import sys
 import threading
 import time
@@ -9,6 +10,7 @@ import msgspec
 import pytest
 
 import edge_runtime
+from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import Simulator, make_state, run_command, wait_until
 from edge_runtime.tests.rigs import CAR, a_manifest
@@ -35,6 +37,20 @@ class Half(Vehicle):
 
 class Boundless(Cart):
     limits = {"pedal": (-1.0, 1.0)}  # no ActionLimit
+
+class Exits(Cart):
+    def __init__(self):
+        raise SystemExit(0)
+
+class Raises(Cart):
+    @property
+    def limits(self):
+        raise OSError("not connected")
+
+class Unknown(Cart):
+    @classmethod
+    def limits_of(cls, settings, manifest):
+        return None
 
 number = 3
 """
@@ -68,6 +84,8 @@ WHOLE = msgspec.structs.asdict(CAR)
         ("carts:number", {}, "carts:number is no edge_runtime.vehicles.base.Vehicle"),
         ("carts:Half", {}, "no whole Vehicle: it lacks brake, close, command, feedback"),
         ("carts:Boundless", {}, "cart: its limits must be like {'pedal': ActionLimit.*not {"),
+        ("carts:Exits", {}, "carts:Exits cannot be opened: SystemExit"),
+        ("carts:Raises", {}, "cart cannot be opened: OSError: not connected"),
         ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
         ("milk_cart", {"port": "ttyS9"}, "milk_cart cannot be opened: .*no such port"),
         ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`; known are dead_time_s"),
@@ -99,6 +117,23 @@ def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words
     table = "cart" if ":" in name else name
     with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
         make_vehicle(name, {table: settings}, a_manifest())
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        (math.nan, 1.0), (-1.0, math.inf), (None, 1.0), ("-1", 1.0), (1.0, -1.0), (True, 1.0),
+        (-1.0, 1.0, math.nan), (-1.0, 1.0, None), (-1.0, 1.0, -2.0), (-1.0, 1.0, 0.0),
+    ],
+)  # fmt: skip
+def test_limits_that_bound_nothing_are_refused_wherever_they_are_read(limit, monkeypatch):
+    find_vehicle("carts:Cart")
+    monkeypatch.setattr(sys.modules["carts"].Cart, "limits", {"pedal": ActionLimit(*limit)})
+    for read in (make_vehicle, vehicle_limits):
+        with pytest.raises(UserError, match="limits"):
+            read("carts:Cart", {}, a_manifest())
+    with pytest.raises(UserError, match="limits"):
+        vehicle_limits("carts:Unknown", {}, a_manifest())
 
 
 def test_a_driver_of_another_package_gets_its_own_table():

@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import difflib
 import inspect
+import math
 from importlib import import_module
 from importlib.metadata import entry_points
+from numbers import Real
 from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.base import Vehicle
+from edge_runtime.vehicles.base import Vehicle, close_in_time
 
 GROUP = "phil.vehicles"
 _Made = TypeVar("_Made")
@@ -38,14 +40,13 @@ def check_driver(vehicle: Any) -> None:
     """Raise UserError for what is no driver, and, closed, for one without proper `limits`."""
     if not isinstance(vehicle, Vehicle):
         raise UserError(f"vehicle {vehicle!r} is no edge_runtime.vehicles.base.Vehicle")
-    if not isinstance(vehicle.name, str):
-        vehicle.close()
-        raise UserError(f"vehicle {type(vehicle).__name__}: its name must be text")
-    limits: Any = getattr(vehicle, "limits", None)
-    if not (isinstance(limits, dict) and all(isinstance(x, ActionLimit) for x in limits.values())):
-        vehicle.close()
-        form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller"
-        raise UserError(f"vehicle {vehicle.name}: its limits must be like {form}, not {limits!r}")
+    try:
+        if not isinstance(vehicle.name, str):
+            raise UserError(f"vehicle {type(vehicle).__name__}: its name must be text")
+        _call(lambda: _checked(vehicle.name, vehicle.limits), vehicle.name)
+    except UserError:
+        close_in_time(vehicle)
+        raise
 
 
 def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
@@ -56,7 +57,25 @@ def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    return _call(kind.limits_of, name, settings, manifest)
+    return _checked(name, _call(kind.limits_of, name, settings, manifest))
+
+
+def _checked(name: str, limits: Any) -> Limits:
+    """The limits; UserError for what a comparison would let through, or fail on."""
+    pairs = limits.items() if isinstance(limits, dict) else [("", None)]
+    if not all(isinstance(key, str) and _is_limit(limit) for key, limit in pairs):
+        form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
+        raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
+    checked: Limits = limits
+    return checked
+
+
+def _is_limit(limit: Any) -> bool:
+    if not isinstance(limit, ActionLimit):
+        return False
+    numbers = (limit.low, limit.high, limit.slew_per_s)
+    is_real = all(isinstance(n, Real) and not isinstance(n, bool) for n in numbers)
+    return is_real and -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
 
 
 def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
@@ -64,7 +83,7 @@ def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
         return door(*arguments)
     except UserError:
         raise
-    except Exception as error:  # a stranger's driver raises what its library raises
+    except BaseException as error:  # a stranger's driver raises what its library raises, or exits
         raise UserError(f"vehicle {name} cannot be opened: {_words(error)}") from None
 
 
@@ -80,7 +99,7 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     module, _, member = place.partition(":")
     try:
         kind = getattr(import_module(module), member)
-    except Exception as error:  # whatever a stranger's module raises
+    except BaseException as error:  # whatever a stranger's module raises
         raise UserError(f"vehicle {name!r} cannot be loaded: {_words(error)}") from None
     if not (isinstance(kind, type) and issubclass(kind, Vehicle)):
         raise UserError(f"vehicle {name!r}: {place} is no edge_runtime.vehicles.base.Vehicle")
@@ -125,5 +144,5 @@ def _others() -> Iterable[Any]:
     return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())
 
 
-def _words(error: Exception) -> str:
+def _words(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

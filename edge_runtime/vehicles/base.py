@@ -13,11 +13,13 @@ import math
 import threading
 import time
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
+from edge_runtime.safety import SILENCE_PERIODS
 from edge_runtime.util import UserError, printable
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
@@ -125,6 +127,8 @@ class Vehicle(abc.ABC):
 
 PEDAL = "pedal"
 SILENT, STUCK, LYING = "vehicle_silent", "vehicle_stuck", "vehicle_lying"
+BRAKING = "vehicle_self_braking"
+ENABLE_TIMEOUT_S = 1.0  # a vehicle may take so long to confirm that it is enabled
 LAG_S = 0.3  # an actuator may still follow a command of this age
 DEVIATION = 0.125  # of an action's range, outside of all that was asked within LAG_S
 DEVIATES_S = 0.1  # for this long without a break
@@ -138,6 +142,8 @@ class VehicleWatch:
 
     def __init__(self, control_period_s: float, limits: Limits) -> None:
         self._silence_s, self._limits = 2 * control_period_s, limits
+        self._brakes_s = SILENCE_PERIODS * control_period_s
+        self._drives, self._enabled_s, self._braking_since_s = False, -math.inf, math.inf
         self._asked: deque[tuple[float, dict[str, float]]] = deque()
         self._reported_s: Optional[float] = None
         self._believed: Optional[tuple[float, float]] = None  # time, speed of the last possible one
@@ -150,11 +156,16 @@ class VehicleWatch:
         return math.inf if self._reported_s is None else self._reported_s + self._silence_s
 
     def begin(self, now_s: float) -> None:
-        """The vehicle is enabled: from now on it owes reports."""
+        """From now on it owes reports."""
         self._reported_s = now_s
 
-    def command(self, action: dict[str, float], now_s: float) -> None:
+    def enable(self, now_s: float) -> None:
+        """It is asked to take control: until it has, it brakes by itself."""
+        self._enabled_s = now_s
+
+    def command(self, action: dict[str, float], now_s: float, drives: bool = True) -> None:
         """Note what was asked; of a safe stop, too."""
+        self._drives = drives
         self._asked.append((now_s, action))
         # One entry older than LAG_S stays: it was in force when the window began.
         while len(self._asked) > 1 and self._asked[1][0] < now_s - LAG_S:
@@ -168,13 +179,17 @@ class VehicleWatch:
         self._reported_s = now_s
         deviates = self._deviates(report, now_s)
         self._deviates_since_s = min(self._deviates_since_s, now_s) if deviates else math.inf
+        brakes = self._drives and report.self_braking
+        self._braking_since_s = min(self._braking_since_s, now_s) if brakes else math.inf
 
     def fault(self, now_s: float) -> str:
-        """SILENT, LYING, STUCK, or empty where nothing is wrong."""
+        """SILENT, LYING, BRAKING, STUCK, or empty where nothing is wrong."""
         if now_s > self.silent_at_s:
             return SILENT
         if self._lies:
             return LYING
+        if now_s - max(self._braking_since_s, self._enabled_s + ENABLE_TIMEOUT_S) > self._brakes_s:
+            return BRAKING  # it obeys nobody, and would drive off with the next command
         return STUCK if now_s - self._deviates_since_s > DEVIATES_S else ""
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
@@ -209,9 +224,33 @@ class VehicleWatch:
         return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
 
 
-_JOIN_S = 0.5
-_RAISED = (Exception, SystemExit)
-"""A driver may raise anything; its thread must live on, whatever asks it to exit."""
+_LEAVE_S = 3.0  # a Hunter that is to stand and give control back takes half of it
+
+
+def close_in_time(vehicle: Vehicle) -> bool:
+    """Close a driver that was never enabled, in a thread that nobody need wait for.
+
+    Returns whether it came to its end.
+    """
+    end = partial(_end, vehicle, vehicle.close)
+    thread = threading.Thread(target=end, name="vehicle", daemon=True)
+    thread.start()
+    return _joined(thread, vehicle)
+
+
+def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
+    for call in calls:
+        try:
+            call()
+        except BaseException as error:  # the rest must still come to its end
+            log.event("error", "driver_not_closed", vehicle=vehicle.name, detail=repr(error))
+
+
+def _joined(thread: threading.Thread, vehicle: Vehicle) -> bool:
+    thread.join(_LEAVE_S)
+    if thread.is_alive():
+        log.event("error", "driver_hangs", vehicle=vehicle.name, waited_s=_LEAVE_S)
+    return not thread.is_alive()
 
 
 class _Task(NamedTuple):
@@ -242,6 +281,7 @@ class VehicleRunner:
         # As often as the topic says, and twice before its silence would be a fault.
         self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
         self._refuses = False  # the driver raised at the newest command
+        self._not_enabled = ""  # why the newest `enable` failed
         self._failing = False
         self._next: Optional[_Task] = None  # the newest, until the driver takes it
         self._last: Optional[Command] = None
@@ -265,8 +305,10 @@ class VehicleRunner:
     def fault(self, now_s: float) -> str:
         """What is wrong with the vehicle, empty if nothing. Never waits."""
         with self._due:
-            seen = None if self._enable_due else self._report_seen
-        return self._seen_fault(now_s) or (seen.faults[0] if seen and seen.faults else "")
+            if self._enable_due:
+                return self._seen_fault(now_s)
+            words = [self._not_enabled, *(self._report_seen.faults if self._report_seen else [])]
+        return self._seen_fault(now_s) or next(filter(None, words), "")
 
     def standing_fault(self, now_s: float) -> str:
         """What enabling the vehicle now would not end, empty if nothing. Never waits."""
@@ -276,14 +318,13 @@ class VehicleRunner:
     def start(self, armed: bool = True) -> None:
         """Start the vehicle's feedback, and enable it unless that is to wait for an operator.
 
-        Raises UserError: it cannot be enabled.
+        Raises UserError where it cannot be enabled.
         """
         now_s = time.monotonic()
         if armed:
-            try:
-                self._vehicle.enable(now_s)
-            except _RAISED as error:
-                raise UserError(f"vehicle {self.name} cannot be enabled: {error}") from error
+            self._take_control(now_s)
+            if self._not_enabled:
+                raise UserError(f"vehicle {self.name} cannot be enabled: {self._not_enabled}")
         self._watch.begin(now_s)
         self._thread.start()
 
@@ -309,37 +350,39 @@ class VehicleRunner:
             self._next = _Task(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
 
-    def close(self) -> None:
-        """Brake, end the feedback, close the driver; one that hangs is left alone."""
+    def close(self) -> bool:
+        """End the feedback; its thread brakes and closes the driver. False where that hangs."""
         with self._due:
             self._stopping = True
             self._due.notify()
-        if self._thread.is_alive():
-            self._thread.join(_JOIN_S)
-        if self._thread.is_alive():
-            log.event("error", "driver_hangs", vehicle=self.name)
-            return
-        for end in (lambda: self._vehicle.brake(time.monotonic()), self._vehicle.close):
-            try:
-                end()
-            except _RAISED as error:  # the rest of the runtime must still come to its end
-                log.event("error", "driver_not_closed", detail=error)
+        if self._thread.ident is None:  # it was never started, and is closed all the same
+            self._thread.start()
+        return _joined(self._thread, self._vehicle)
 
     def _run(self) -> None:
         next_s = time.monotonic()
-        while not self._stopping:
-            enables, task = self._wait(next_s)
-            self._busy_since_s = time.monotonic()
-            if enables:
-                self._enable()
-            if task is not None:
-                self._obey(task)
-            now_s = time.monotonic()
-            if now_s >= next_s:
-                # Absolute deadlines; after a long pause one report, not one for each missed period.
-                next_s = max(next_s + self._period_s, now_s)
-                self._report()
-            self._busy_since_s = None
+        try:
+            while not self._stopping:
+                next_s = self._live(next_s)
+        finally:
+            vehicle = self._vehicle
+            _end(vehicle, lambda: vehicle.brake(time.monotonic()), vehicle.close)
+
+    def _live(self, next_s: float) -> float:
+        """Do what is due, or wait for it; returns when the next report is."""
+        enables, task = self._wait(next_s)
+        self._busy_since_s = time.monotonic()
+        if enables:
+            self._enable()
+        if task is not None:
+            self._obey(task)
+        now_s = time.monotonic()
+        if now_s >= next_s:
+            # Absolute deadlines; after a long pause one report, not one for each missed period.
+            next_s = max(next_s + self._period_s, now_s)
+            self._report()
+        self._busy_since_s = None
+        return next_s
 
     def _wait(self, until_s: float) -> tuple[bool, Optional[_Task]]:
         """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
@@ -352,14 +395,22 @@ class VehicleRunner:
             return self._enable_due, task
 
     def _enable(self) -> None:
-        try:
-            self._vehicle.enable(time.monotonic())
-        except _RAISED as error:  # its report goes on saying what is wrong
-            log.event("error", "not_enabled", detail=error)
-        else:
+        self._take_control(time.monotonic())
+        if not self._not_enabled:
             self._ask()
         with self._due:
             self._enable_due = False
+        if self._not_enabled:
+            self.on_fault()
+
+    def _take_control(self, now_s: float) -> None:
+        try:
+            self._watch.enable(now_s)
+            self._vehicle.enable(now_s)
+            self._not_enabled = ""
+        except BaseException as error:
+            self._not_enabled = printable(str(error) or type(error).__name__)
+            log.event("error", "not_enabled", detail=self._not_enabled)
 
     def _obey(self, task: _Task) -> None:
         """Ask the driver. A safe stop's mode alone means brake."""
@@ -368,15 +419,17 @@ class VehicleRunner:
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
         if command.mode == SAFE_STOP:  # It brakes, whatever number is the policy's stop.
-            self._watch.command({**action, PEDAL: -1.0}, now_s)
+            self._watch.command({**action, PEDAL: -1.0}, now_s, drives=False)
         try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s, task.latch)
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
+            elif self._not_enabled:
+                return  # that is the fault
             elif now_s - task.given_s <= self._silence_s:  # One that hung must not obey the past.
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
-        except _RAISED as error:
+        except BaseException as error:
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)
             self._refuses = True
@@ -399,7 +452,7 @@ class VehicleRunner:
                 episode=last.episode if last else -1,
                 step=last.step if last else -1,
                 mode=last.mode if last else "standby",
-                action=[report.action.get(name, 0.0) for name in self._action_names],
+                action=[report.action[name] for name in self._action_names],
                 speed_mps=report.speed_mps,
                 self_braking=report.self_braking,
                 faults=[text[:MAX_TEXT_CHARS] for text in faults],
@@ -416,9 +469,9 @@ class VehicleRunner:
     def _ask(self) -> Optional[VehicleReport]:
         """The vehicle's report; None where the driver fails, which is silence like any other."""
         try:
-            report = _plain(self._vehicle.feedback(time.monotonic()))
+            report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
-        except _RAISED as error:
+        except BaseException as error:
             if not self._failing:
                 log.event("error", "no_feedback", detail=error)
             self._failing = True
@@ -428,10 +481,16 @@ class VehicleRunner:
         return report
 
 
-def _plain(report: VehicleReport) -> VehicleReport:
-    """In Python's own types: a driver's numbers may be numpy's. Raises for what is no report."""
+def _plain(report: VehicleReport, names: Sequence[str]) -> VehicleReport:
+    """In Python's own types: a driver's numbers may be numpy's.
+
+    Raises for what is no report, and for one that leaves out an action of these names: nobody could
+    see whether it obeys.
+    """
     more = (None if value is None else float(value) for value in report[5:])
     action = {name: float(value) for name, value in report.action.items()}
+    if lacking := [name for name in names if name not in action]:
+        raise ValueError(f"feedback without {', '.join(lacking)}")
     said = (report.faults, report.standing)
     faults, standing = ([printable(str(words)) for words in each] for each in said)
     speed_mps, braking = float(report.speed_mps), bool(report.self_braking)
