@@ -179,6 +179,8 @@ class VehicleWatch:
         self._reported_s = now_s
         deviates = self._deviates(report, now_s)
         self._deviates_since_s = min(self._deviates_since_s, now_s) if deviates else math.inf
+        if not report.self_braking:
+            self._enabled_s = -math.inf  # it has taken control
         brakes = self._drives and report.self_braking
         self._braking_since_s = min(self._braking_since_s, now_s) if brakes else math.inf
 

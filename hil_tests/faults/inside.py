@@ -39,6 +39,7 @@ _FULL_MPS2, _MOST_MPS = 4.0, 12.0
 _WHITE, _DARKEST_TO_BRIGHTEST = 255, 120
 _STUCK_AT, _LEAP_MPS = -1.0, 8.0
 _STEP_S = 3600
+_ESTOP = "the emergency stop is pressed"
 
 
 Observation = dict[str, np.ndarray]
@@ -123,14 +124,26 @@ if "PhilEndless-v0" not in gymnasium.registry:
 
 
 class FaultyMockVehicle(MockVehicle):
-    """The mock until its switch, a file, holds ``silent``, ``stuck`` or ``lying``."""
+    """The mock until its switch, a file, holds ``silent``, ``stuck``, ``lying``, ``self_braking``,
+    ``estop`` (it is pressed) or ``locked`` (it cannot be enabled).
+    """
 
     _switch = Path(os.environ.get(DIRECTORY, "")) / VEHICLE
 
+    def enable(self, now_s: float) -> None:
+        """As the mock, where it can be."""
+        if self._word() == "locked":
+            raise RuntimeError("no control of the gearbox")
+        super().enable(now_s)
+
     def feedback(self, now_s: float) -> VehicleReport:
-        """The mock's report: none, one of stuck actuators, or an impossible one."""
-        word = self._switch.read_text().strip() if self._switch.exists() else ""
+        """The mock's report: none, one of stuck actuators, an impossible one, or a fault's."""
+        word = self._word()
         report = super().feedback(now_s)
+        if word == "self_braking":
+            report = report._replace(self_braking=True)
+        if word == "estop":
+            report = report._replace(faults=[_ESTOP], standing=[_ESTOP])
         if word == "silent":
             raise TimeoutError("the vehicle says nothing")
         if word == "stuck":
@@ -139,6 +152,9 @@ class FaultyMockVehicle(MockVehicle):
         if word == "lying":
             report = report._replace(speed_mps=report.speed_mps + _LEAP_MPS)
         return report
+
+    def _word(self) -> str:
+        return self._switch.read_text().strip() if self._switch.exists() else ""
 
 
 def step_clock_on_signals() -> None:

@@ -52,7 +52,7 @@ _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_PERIODS, _SETTLED_COMMANDS = 3.5, 3
 _REARM_EVERY_S = 2.0
 _HEALTH_S = 0.6  # Longer than a period of the health message
-_CHUNK_BYTES = 65536
+_CHUNK_BYTES = 4096  # Small, so that a throttled link hands over bit by bit
 _STATE_BYTES = 20
 """More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
 (then 47 bytes for each are on the link)."""
@@ -156,13 +156,18 @@ class Rig:
 
         def driving() -> bool:
             nonlocal rearmed_s
-            if self._vehicle != "none" and time.monotonic() - rearmed_s > _REARM_EVERY_S:
+            if self.has_vehicle and time.monotonic() - rearmed_s > _REARM_EVERY_S:
                 # A busy machine may have stopped it once more: the operator stays beside it.
                 self.try_rearm()
                 rearmed_s = time.monotonic()
             return self._is_driving() and ready()
 
         wait_until(driving, "a steady drive")
+
+    @property
+    def has_vehicle(self) -> bool:
+        """Whether only an operator lets it drive again after a stop."""
+        return self._vehicle != "none"
 
     def brakes(self) -> list[tuple[float, bool]]:
         """When the simulated vehicle's brake was pressed (True) or released so far."""
@@ -333,6 +338,13 @@ class Sender:
             self.step += 1
             self.send(make_state(self.step, self._task))
 
+    def end_episode(self) -> None:
+        """Send a final state, and no other until ``running`` is set."""
+        self.running.clear()
+        with self.lock:
+            self.step += 1
+            self.send(make_state(self.step, self._task, final=True))
+
     def stop(self) -> None:
         """End the thread."""
         self._stopping.set()
@@ -424,6 +436,7 @@ class Link:
         self._flowing = threading.Event()
         self._flowing.set()
         self._is_cut = False
+        self._bytes_per_s = float("inf")
         self._lock = threading.Lock()
         self._open: list[socket.socket] = []
         self._listener = socket.create_server((LOOPBACK, 0))
@@ -441,9 +454,13 @@ class Link:
         """Keep the connections and hold what comes, as a radio link that repeats does."""
         self._flowing.clear()
 
+    def throttle(self, bytes_per_s: float) -> None:
+        """Hand no more to whoever connected; what is not handed over yet waits."""
+        self._bytes_per_s = bytes_per_s
+
     def restore(self) -> None:
         """Be a link again; what was held comes at once."""
-        self._is_cut = False
+        self._is_cut, self._bytes_per_s = False, float("inf")
         self._flowing.set()
 
     def close(self) -> None:
@@ -477,6 +494,8 @@ class Link:
         with contextlib.suppress(OSError):
             while data := source.recv(_CHUNK_BYTES):
                 self._flowing.wait()
+                if to_caller:
+                    time.sleep(len(data) / self._bytes_per_s)
                 sink.sendall(data)
                 if to_caller and len(data) > _STATE_BYTES:
                     self.last_state_s = time.monotonic()

@@ -11,6 +11,7 @@ RIDE_S later than without it. A fault of the vehicle and a stop end it at once.
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import signal
@@ -256,19 +257,22 @@ def router_restarted(rig: Rig, number: int) -> Try:
 @drives_on()
 def clock_stepped_edge(rig: Rig, number: int) -> Try:
     """Edge's wall clock 1 h ahead and back."""
-    return _stepped(rig.edge, number)
-
-
-@drives_on()
-def clock_stepped_simulator(rig: Rig, number: int) -> Try:
-    """Simulator's wall clock 1 h ahead and back."""
-    return _stepped(rig.simulator, number)
-
-
-def _stepped(process: Process, number: int) -> Try:
-    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
+    _step(rig.edge, number)
     time.sleep(LASTS_S)
     return Try()
+
+
+@fault("edge sends safe_stop: no_fresh_state", "the step to safe_stop on the wire")
+def clock_stepped_simulator(rig: Rig, number: int) -> Try:
+    """Simulator's wall clock 1 h ahead or back: no stamp is believed before the stop."""
+    begin_s = time.monotonic()
+    _step(rig.simulator, number)
+    stop = rig.stop_command(begin_s)
+    return Try(stop.seen_s - begin_s, rig.recovered_after_s(stop.seen_s), stop.reason)
+
+
+def _step(process: Process, number: int) -> None:
+    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
 
 
 @fault(
@@ -323,16 +327,53 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong=wrong)
 
 
-for _word, _done in (
-    ("silent", "vehicle silent"),
-    ("stuck", "vehicle's pedal stuck"),
-    ("lying", "vehicle reports a speed that cannot be"),
+for _word, _done, _after_s in (
+    ("silent", "vehicle silent", 0.0),
+    ("stuck", "vehicle's pedal stuck", 0.0),
+    ("lying", "vehicle reports a speed that cannot be", 0.0),
+    ("self_braking", "vehicle says that it brakes by itself while it is to drive", 0.1),
 ):
     fault(
         "edge sends safe_stop: vehicle_fault; stays until re-armed",
         "last good feedback at the probe to safe_stop on the wire",
         name=f"vehicle_{_word}", done=_done, rig={"vehicle": MOCK}, policy="steady", flows=True,
+        reaction_limit_s=REACTION_LIMIT_S + _after_s,
     )(partial(_vehicle_is, _word))  # fmt: skip
+
+
+@fault("nothing; then waits for a re-arm", "none", reaction_limit_s=None, policy="steady",
+       rig={"vehicle": MOCK, "sender": True})  # fmt: skip
+def vehicle_fault_between_episodes(rig: Rig, number: int) -> Try:
+    """Emergency stop pressed for 1 s after the end of an episode."""
+    rig.sender.end_episode()
+    time.sleep(SETTLED_S)
+    rig.switch(VEHICLE, "estop")
+    time.sleep(LASTS_S)
+    rig.switch(VEHICLE, None)
+    time.sleep(SETTLED_S)
+    since_s = time.monotonic()
+    rig.sender.running.set()
+    time.sleep(LASTS_S)
+    wrong = drives_between(rig.timeline.commands, since_s)
+    return Try(None, rig.drive_again(), "vehicle_fault", wrong=wrong)
+
+
+@fault("stands; stays until an enable succeeds", "none", reaction_limit_s=None, policy="steady",
+       rig={"vehicle": MOCK})  # fmt: skip
+def vehicle_not_enabled(rig: Rig, number: int) -> Try:
+    """Vehicle at fault; the driver's `enable` raises at the re-arm."""
+    rig.switch(VEHICLE, "lying")
+    rig.stop_command(time.monotonic())
+    rig.switch(VEHICLE, "locked")
+    time.sleep(LASTS_S)
+    rig.rearm()
+    rearmed_s = time.monotonic()
+    time.sleep(LASTS_S)
+    moved = [f.speed_mps for seen_s, f in rig.timeline.feedback if seen_s > rearmed_s]
+    wrong = [f"it moves at {max(moved)} m/s"] if max(moved) > 0.0 else []
+    wrong += [] if rig.timeline.commands[-1].mode == SAFE_STOP else ["it is told to drive"]
+    rig.switch(VEHICLE, None)
+    return Try(None, rig.drive_again(), "vehicle_fault", wrong=wrong)
 
 
 @drives_on("recorder says so and ends; the recording is readable; drives on")
@@ -383,6 +424,31 @@ SHORT_S, RIDING_S = 0.4, 0.3
 """An outage through which it rides, and where in one it surely rides."""
 _LATER_S = REACTION_LIMIT_S + RIDE_S
 _VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
+
+
+def _link_slows(periods: float, rig: Rig, number: int) -> Try:
+    """It stops though states go on coming, each a little later, and none too late is driven on."""
+    time.sleep(SETTLED_S)
+    begin_s, task = time.monotonic(), rig.task
+    entries = task.observation.values()
+    state_bytes = sum(math.prod(e.shape) * np.dtype(e.dtype).itemsize for e in entries)
+    rig.link.throttle(state_bytes / (periods * rig.period_s))
+    stop = rig.logged_stop(begin_s)
+    time.sleep(LASTS_S)
+    late = drives_between(rig.timeline.commands, stop.seen_s)
+    rig.link.restore()
+    ended_s = time.monotonic()
+    recovered_s = rig.drive_again() if rig.has_vehicle else rig.recovered_after_s(ended_s)
+    return Try(None, recovered_s, stop.reason, wrong=late)
+
+
+for _name, _periods, _rig in (
+    ("link_slow", 1.4, {}), ("ride_link_slow", 1.4, _VEHICLE), ("ride_link_slower", 4.0, _VEHICLE),
+):  # fmt: skip
+    fault("edge sends safe_stop: no_fresh_state", "none", _name,
+          f"TCP slower than the states: one comes each {_periods:g} T, ever later",
+          reaction_limit_s=None, policy="steady",
+          rig={**_rig, "between": "link"})(partial(_link_slows, _periods))  # fmt: skip
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
