@@ -191,7 +191,7 @@ class Controller:
         session = received.state.session
         # The gap counts even where the watchdog did not get to run within it.
         event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
-        if event is not None:
+        if event is not None and not (event is Event.SILENT and self._stopped_late):
             self._apply(event)
         stands = self.safety.mode is Mode.SAFE_STOP
         sent_s, arrived_s = received.state.sent_ns * 1e-9, received.arrived_s
@@ -248,10 +248,10 @@ class Controller:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
         if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
-        was, heard = self.safety.mode, self._newest is not None
+        was, owed = self.safety.mode, self._newest is not None and not self._stopped_late
         if self._policy_is_dead:
             pass  # whatever else is wrong, this is why it stands
-        elif was is not Mode.STANDBY and heard and rules.is_silent(self.safety, now_s):
+        elif was is not Mode.STANDBY and owed and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
         elif self.vehicle_fault:
             self._apply(Event.VEHICLE)  # it may be over before the next state
@@ -327,6 +327,11 @@ class Controller:
     @property
     def _is_late(self) -> bool:
         return self._lag_s > self.safety.answer_s
+
+    @property
+    def _stopped_late(self) -> bool:
+        """Whether late states are why it stands: that there are no others goes without saying."""
+        return self._is_late and self.safety.reason == Event.LATE.value
 
     def _give_up(self, now_s: float) -> Order:
         """Stop because the policy takes too long; its answer, should it come, is not used."""
