@@ -214,12 +214,8 @@ class Bench:
 
 # In this order, because one begins where another ends.
 RULES: dict[str, Callable[[Bench], bool]] = {
-    "each action has a finite range": lambda it: (
-        bool(it.go)
-        and all(
-            -math.inf < one.low < one.high < math.inf and one.slew_per_s > 0.0
-            for one in it.vehicle.limits.values()
-        )
+    "each action has a range": lambda it: (
+        bool(it.go) and all(one.low < one.high for one in it.vehicle.limits.values())
     ),
     "no command moves it before `enable`": lambda it: not it.goes(limit_s=5 * it.period_s),
     "enabled, it stands until the first command": lambda it: (

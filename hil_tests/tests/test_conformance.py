@@ -14,7 +14,7 @@ from hil_tests.conformance import RULES
 from hil_tests.faults.rig import ChassisProcess, free_bus
 
 LIMITS = {
-    "frozen": {**MockVehicle.limits, "steering": ActionLimit(-1.0, 1.0, slew_per_s=0.0)},
+    "frozen": {**MockVehicle.limits, "steering": ActionLimit(0.5, 0.5)},
     "dead": {**MockVehicle.limits, "pedal": ActionLimit(-1.0, 0.0, math.inf)},
 }
 
@@ -92,7 +92,7 @@ def clock(monkeypatch):
     [
         ("", ""),
         ("slow", "no call takes longer"),
-        ("frozen", "each action has a finite range"),
+        ("frozen", "each action has a range"),
         ("dead", "commands move it"),
         ("complains", "commands move it, and it tells of no fault"),
         ("takes no speed", "commands move it"),
