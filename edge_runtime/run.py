@@ -21,7 +21,7 @@ from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
-from edge_runtime.util import PathLike, ending_signals, take_signals
+from edge_runtime.util import PathLike, ending_signals, ends_within, take_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
 
 
 _WAITING_PERIOD_S = 5.0
-_ANNOUNCE_S = 0.5
+_ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
 
 
 class _StopSignal:
@@ -239,7 +239,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         if announcer.ident is not None:
             announcer.join(_ANNOUNCE_S)
             ended = ended and not announcer.is_alive()
-        link.close()
+        ended = ends_within(_CLOSE_S, link.close) and ended  # a peer that was stopped holds it
         health = loop.health()
         log.event(
             "info",

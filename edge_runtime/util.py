@@ -114,6 +114,14 @@ def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
     return tables
 
 
+def ends_within(limit_s: float, call: Callable[[], Any]) -> bool:
+    """Call it in a thread that nobody need wait for; returns whether it came to its end in time."""
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    thread.join(limit_s)
+    return not thread.is_alive()
+
+
 def ending_signals() -> Set[int]:
     """Those that would end this process as it is now, and that it can catch.
 

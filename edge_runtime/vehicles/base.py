@@ -20,7 +20,7 @@ from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
-from edge_runtime.util import UserError, printable
+from edge_runtime.util import UserError, ends_within, printable
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 if TYPE_CHECKING:
@@ -229,15 +229,15 @@ class VehicleWatch:
 _LEAVE_S = 3.0  # a Hunter that is to stand and give control back takes half of it
 
 
-def close_in_time(vehicle: Vehicle) -> bool:
-    """Close a driver that was never enabled, in a thread that nobody need wait for.
+def close_in_time(vehicle: Vehicle) -> None:
+    """Close a driver that was never enabled; one that hangs is left alone."""
+    _note_end(vehicle, ends_within(_LEAVE_S, partial(_end, vehicle, vehicle.close)))
 
-    Returns whether it came to its end.
-    """
-    end = partial(_end, vehicle, vehicle.close)
-    thread = threading.Thread(target=end, name="vehicle", daemon=True)
-    thread.start()
-    return _joined(thread, vehicle)
+
+def _note_end(vehicle: Vehicle, ended: bool) -> bool:
+    if not ended:
+        log.event("error", "driver_hangs", vehicle=vehicle.name, waited_s=_LEAVE_S)
+    return ended
 
 
 def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
@@ -246,13 +246,6 @@ def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
             call()
         except BaseException as error:  # the rest must still come to its end
             log.event("error", "driver_not_closed", vehicle=vehicle.name, detail=repr(error))
-
-
-def _joined(thread: threading.Thread, vehicle: Vehicle) -> bool:
-    thread.join(_LEAVE_S)
-    if thread.is_alive():
-        log.event("error", "driver_hangs", vehicle=vehicle.name, waited_s=_LEAVE_S)
-    return not thread.is_alive()
 
 
 class _Task(NamedTuple):
@@ -359,7 +352,8 @@ class VehicleRunner:
             self._due.notify()
         if self._thread.ident is None:  # it was never started, and is closed all the same
             self._thread.start()
-        return _joined(self._thread, self._vehicle)
+        self._thread.join(_LEAVE_S)
+        return _note_end(self._vehicle, not self._thread.is_alive())
 
     def _run(self) -> None:
         next_s = time.monotonic()
