@@ -17,7 +17,6 @@ COMMANDS = {
         "find the policy of a run from which on a drive ends differently",
     ),
     "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
-    "repair": ("bridge.record:REPAIR", "save what is whole of a cut-off or damaged recording"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }
 main = program(

@@ -160,13 +160,11 @@ class RecordedEpisode:
 def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
     """Read an episode; ``number`` None: the only one.
 
-    UserError for a damaged recording, and one that does not say how its episodes were begun.
+    UserError for a recording that does not say how its episodes were begun.
     """
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
-    if recording.is_damaged:
-        mend = f"python -m bridge repair {path} --out G.mcap saves what is whole"
-        raise UserError(f"{path} {recording.trouble()}; {mend}")
+    recording.say_trouble()
     begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
     for heard, message in _messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:

@@ -11,7 +11,6 @@ import json
 import os
 import re
 import shutil
-import sys
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import pairwise
@@ -72,8 +71,7 @@ def run(arguments: Any) -> int:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     left_out = sum(not state.final for state in drive.states()) - frames
-    if trouble := drive.recording.trouble():
-        print(f"the recording {trouble}; what is whole of it was exported", file=sys.stderr)
+    drive.recording.say_trouble()
     missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
     print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
     return 0

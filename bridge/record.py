@@ -1,4 +1,4 @@
-"""``python -m bridge record`` and ``repair``: MCAP files of the wire, and how they are mended.
+"""``python -m bridge record``: MCAP files of the wire.
 
 The recorder is a listener of its own. It keeps the exact payloads for replay, and copies that
 viewers can draw:
@@ -21,7 +21,6 @@ from __future__ import annotations
 import contextlib
 import enum
 import functools
-import io
 import sys
 import threading
 import time
@@ -43,19 +42,13 @@ from bridge.ports import (
     add_options,
     open_listener,
 )
-from bridge.recording import METADATA, WIRE_ENCODING, Recording
+from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
-from edge_runtime.files import (
-    check_writable,
-    lock_file,
-    make_directory,
-    try_to_lock_file,
-    write_atomic,
-)
+from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.tls import tls_for
-from edge_runtime.util import UserError, counted, open_regular
+from edge_runtime.util import UserError, counted
 
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
@@ -105,8 +98,8 @@ def _run_record(arguments: Any) -> int:
                 _listen(listener, writer, arguments, ended)
                 writer.finish(listener.dropped)
         except OSError as error:
-            stopped = f"error: recording {path} stopped: {error.strerror}; it holds what was"
-            print(f"{stopped} written before: python -m bridge repair {path}", file=sys.stderr)
+            stopped = f"error: recording {path} stopped: {error.strerror}"
+            print(f"{stopped}; it holds what was written before", file=sys.stderr)
             return NOT_WRITTEN
     if listener.dropped:
         dropped = counted(listener.dropped, "message")
@@ -244,15 +237,8 @@ def _vehicle_id(heard: Heard) -> str:
     return heard.key.split("/")[1]
 
 
-def start_mcap(stream: Any) -> Writer:
-    """Begin an MCAP file as all of ours are: in chunks with checksums, ``stream`` at its start."""
-    writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start(profile="", library=f"phil-hil {__version__}")
-    return writer
-
-
 def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
-    """A new MCAP file, locked until it is closed: ``bridge repair`` keeps away meanwhile.
+    """Begin a new MCAP file, in chunks with checksums.
 
     UserError, and no file, where one exists already, or it cannot be made.
     """
@@ -260,8 +246,8 @@ def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
     try:
         stream = path.open("xb")
         try:
-            lock_file(stream.fileno())
-            writer = start_mcap(stream)
+            writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+            writer.start(profile="", library=f"phil-hil {__version__}")
             writer.flush()  # Before anybody is told of the file, it is an MCAP file.
         except OSError:
             close_torn(stream)
@@ -396,75 +382,8 @@ def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
     return entry_name
 
 
-def _add_repair_arguments(parser: Any) -> None:
-    text = "the recording; one that is damaged, not only cut off, needs --out"
-    parser.add_argument("recording", metavar="F.mcap", help=text)
-    out = "write here instead of over the recording itself; it must not exist yet"
-    parser.add_argument("--out", metavar="G.mcap", type=new_recording, help=out)
-
-
-def _run_repair(arguments: Any) -> int:
-    """Rewrite what can be read; the file is replaced only once the new one is whole."""
-    source = Path(arguments.recording)
-    if arguments.out is None:
-        check_writable(source)
-    try:
-        stream = open_regular(source)
-    except OSError as error:
-        raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
-    with stream:
-        # What a growing recording still gets would go into the old file.
-        if not try_to_lock_file(stream.fileno()):
-            raise UserError(f"{source} is being written; repair it when its writer has ended")
-        recording = Recording(source)
-        data, messages = _rewrite(recording)
-        found = counted(messages, "message")
-        if not messages:
-            raise UserError(f"{source} holds no whole message; there is nothing to repair")
-        if arguments.out is None and not recording.trouble():
-            if recording.has_checksums:
-                print(f"{source} is whole: {found}; nothing done")
-            else:
-                print(
-                    f"{source} can be read to its end: {found}; nothing done. It has no checksum"
-                    " over all of it, so a change in its index would not show; --out G.mcap writes"
-                    " it with one"
-                )
-            return 0
-        if arguments.out is None and recording.is_damaged:
-            stays = "it stays as it is; --out G.mcap takes what is whole"
-            raise UserError(f"{source} {recording.trouble()}: {stays}")
-        write_atomic(arguments.out or source, data)
-    left_out = recording.missing() and f"; left out: {recording.missing()}"
-    print(f"wrote {arguments.out or source}: {found}{left_out}")
-    return 0
-
-
-def _rewrite(recording: Recording) -> tuple[bytes, int]:
-    """Copy every message into a new recording, held in memory."""
-    stream = io.BytesIO()
-    writer = start_mcap(stream)
-    channel_of = functools.cache(writer.register_channel)
-    schema_of = functools.cache(writer.register_schema)
-    messages = 0
-    for channel, schema, message in recording.messages():
-        schema_id = 0 if schema is None else schema_of(schema.name, schema.encoding, schema.data)
-        channel_id = channel_of(channel.topic, channel.message_encoding, schema_id)
-        stamps = message.publish_time, message.sequence
-        writer.add_message(channel_id, message.log_time, message.data, *stamps)
-        messages += 1
-    if recording.metadata:
-        writer.add_metadata(METADATA, recording.metadata)
-    writer.finish()
-    return stream.getvalue(), messages
-
-
 RECORD_EXAMPLE = examples(
     "python -m bridge record --out drive.mcap",
     "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
 )
-REPAIR_EXAMPLE = examples(
-    "python -m bridge repair drive.mcap", "python -m bridge repair drive.mcap --out whole.mcap"
-)
 RECORD = Command(RECORD_EXAMPLE, _add_record_arguments, _run_record)
-REPAIR = Command(REPAIR_EXAMPLE, _add_repair_arguments, _run_repair)

@@ -1,10 +1,8 @@
 """Reads MCAP recordings: whole ones, ones that a kill or a full disk has cut off, and damaged ones.
 
-`Recording` walks any MCAP file record by record, and over the places in it that are broken. A chunk
-has a checksum, so one that is read is as it was written; of the rest, the header and the index of
-each chunk included, the checksum at the end of the data says so. Behind a broken record the next
-one is where the record's length says; where no record begins there, the length is broken, too, and
-the next whole chunk is looked for byte by byte.
+`Recording` reads every recording of ours. A chunk has a checksum: one that is not as it was written
+is left out and counted. Where even the length of a record is broken, reading goes on at the next
+chunk, which is looked for byte by byte.
 
 Anybody may have made the file. What a chunk announces is looked at before it is unpacked, and
 reading is limited by the length of the file.
@@ -15,18 +13,15 @@ from __future__ import annotations
 import os
 import re
 import struct
-import zlib
+import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -35,11 +30,10 @@ from edge_runtime.util import UserError, counted, open_regular
 
 WIRE_ENCODING = "msgpack"
 METADATA = "phil"
-MAX_RECORD_BYTES = 64 << 20
-"""A torn length must not ask for more memory than any record of ours needs."""
-MAX_CHUNK_BYTES = 8 << 20  # Unpacked; ours hold little more than 1 MiB
+MAX_RECORD_BYTES = 8 << 20
+"""Of a record, and of a chunk when it is unpacked; ours hold little more than 5 MiB."""
 MAX_WORK = 200
-"""Bytes read for each byte of the file, above one chunk."""
+"""Bytes read for each byte of the file, above one record."""
 RECORD_BYTES = 256
 """What a record in a chunk counts as: taking it apart costs as much, however empty it is."""
 TORN = (
@@ -50,15 +44,12 @@ TORN = (
 LANDMARK = re.compile(
     rb"\x06(?=.{4}\x00{4}.{28}\x04\x00{3}zstd)"  # a chunk as we write it
     rb"|\x0c(?=.{4}\x00{4}\x04\x00{3}phil)"  # our metadata
-    rb"|\x0f(?=\x04\x00{7})"  # the end of the data
-    rb"|\x02(?=\x14\x00{7})",  # the footer
+    rb"|\x02(?=\x14\x00{7}.{20}\x89MCAP0\r\n)",  # the footer
     re.DOTALL,
 )
 """First bytes of records that can be recognised without knowing where the one before ends."""
 LANDMARK_BYTES = 45
 BLOCK_BYTES = 1 << 16
-_HEAD = struct.Struct("<BQ")
-_CRC_BYTES = 4
 
 
 class Stored(NamedTuple):
@@ -69,59 +60,54 @@ class Stored(NamedTuple):
     message: Message
 
 
-@dataclass
-class Condition:
-    """What is missing of a recording, known when all of it has been read."""
+class Recording:
+    """One MCAP file; what is missing of it is known when ``messages`` came to the end."""
 
-    cut_off: bool = False
-    """The file ends without its index, between two records or within one: its writer was killed."""
-    damaged_places: int = 0  # Broken parts before the end; all that is whole between them is read
-    damaged_bytes: int = 0
-    torn_bytes: int = 0  # Of the record within which the file stops
-    nameless_messages: int = 0  # Whole ones whose topic stood in a broken part alone
-    is_altered: bool = False  # The checksum over the data is wrong, though nothing in it is broken
-    has_checksums: bool = False
-    """Over all of the data and over the index: nothing could change without being noticed."""
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._begin()
+
+    def _begin(self) -> None:
+        self.metadata: dict[str, str] = {}
+        self.cut_off = False
+        """The file ends without its index, between two records or within one: a kill."""
+        self.torn_bytes = 0  # Of the record within which the file stops
+        self.damaged_places = (
+            0  # Broken parts before the end; all that is whole between them is read
+        )
+        self.damaged_bytes = 0
+        self.nameless_messages = 0  # Whole ones whose topic stood in a broken part alone
+        self._work_bytes = 0
 
     @property
     def is_damaged(self) -> bool:
         """Whether more is amiss than a kill leaves behind."""
-        return self.damaged_places > 0 or self.nameless_messages > 0 or self.is_altered
+        return self.damaged_places > 0 or self.nameless_messages > 0
 
-    def missing(self) -> str:
-        """Say what could not be read; empty where all of the file could."""
+    def trouble(self) -> str:
+        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
         places = counted(self.damaged_places, "damaged place")
         messages = counted(self.nameless_messages, "message")
         parts = {
             f"{places} of {counted(self.damaged_bytes, 'byte')}": self.damaged_places,
-            "bytes that changed outside of its chunks": self.is_altered,
             f"{messages} whose topic was in a damaged place": self.nameless_messages,
             f"a torn end of {counted(self.torn_bytes, 'byte')}": self.torn_bytes,
         }
-        return ", ".join(part for part, is_so in parts.items() if is_so)
+        missing = ", ".join(part for part, count in parts.items() if count)
+        what = "is damaged" if self.is_damaged else "was cut off" if self.cut_off else ""
+        return f"{what} ({missing})" if missing else what
 
-    def trouble(self) -> str:
-        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
-        if self.is_damaged:
-            return f"is damaged ({self.missing()})"
-        return "was cut off" if self.cut_off else ""
-
-
-class Recording(Condition):
-    """One MCAP file; its condition is known when ``messages`` or ``records`` came to the end.
-
-    One pass at a time: a new one ends the one before.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path = path
-        self.metadata: dict[str, str] = {}
+    def say_trouble(self, taken: str = "") -> None:
+        """Tell of it in one line on stderr, with how much is taken; nothing where all is whole."""
+        if trouble := self.trouble():
+            line = f"the recording {self.path} {trouble}; what is whole of it is taken"
+            print(line + taken, file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[Stored]:
         """Yield the messages as they stand in the file, which is the order of their arrival.
 
-        UserError as ``records``.
+        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
+        reading than its size accounts for.
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
@@ -134,7 +120,7 @@ class Recording(Condition):
                 channels.setdefault(record.id, record)
 
         has_looked = False
-        for record in self.records():
+        for record in self._records():
             learn(record)
             if isinstance(record, Metadata):
                 self.metadata |= record.metadata
@@ -143,7 +129,7 @@ class Recording(Condition):
                 if not has_looked and (channel is None or channel.schema_id not in (0, *schemas)):
                     # The chunk that named it is broken; the index at the end repeats all names.
                     has_looked = True
-                    for other in Recording(self.path).records():
+                    for other in Recording(self.path)._records():
                         learn(other)
                     channel = channels.get(record.channel_id)
                 if channel is None:
@@ -151,147 +137,85 @@ class Recording(Condition):
                 else:
                     yield Stored(channel, schemas.get(channel.schema_id), record)
 
-    def records(self) -> Iterator[McapRecord]:
-        """Yield every record that can be read, a chunk as what it holds.
-
-        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
-        reading than its size accounts for.
-        """
-        vars(self).update(vars(Condition()), metadata={})
-        self._has_ended, self._read_bytes = False, 0
+    def _records(self) -> Iterator[McapRecord]:
+        """Yield every record that can be read, a chunk as what it holds."""
+        self._begin()
         try:
-            with open_regular(self.path) as self._stream:
-                self._size = self._stream.seek(0, os.SEEK_END)
-                last = self._size - MAGIC_SIZE
-                ends = (self._bytes(0, MAGIC_SIZE), self._bytes(last, MAGIC_SIZE))
-                if MCAP0_MAGIC not in ends or last <= 0:
+            with open_regular(self.path) as stream:
+                self._size = stream.seek(0, os.SEEK_END)
+                ends = []
+                for at in (0, max(0, self._size - MAGIC_SIZE)):
+                    stream.seek(at)
+                    ends.append(stream.read(MAGIC_SIZE))
+                if MCAP0_MAGIC not in ends or self._size <= MAGIC_SIZE:
                     raise UserError(f"{self.path} is no MCAP recording")
-                yield from self._walk()
+                self.cut_off = ends[1] != MCAP0_MAGIC
+                yield from self._walk(stream)
         except OSError as error:
             raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
 
-    def _walk(self) -> Iterator[McapRecord]:
+    def _walk(self, stream: BinaryIO) -> Iterator[McapRecord]:
         at = MAGIC_SIZE
-        while at < self._size and not self._has_ended:
-            found = self._read(at)
-            if found is None:
-                at = self._pass_over(at)
-                continue
-            parts, end = found
-            for part in parts[:1]:  # DataEnd and Footer never stand inside a chunk.
-                self._note_end(part, at)
-            at = end
-            self.cut_off = at >= self._size and not self._has_ended
-            yield from parts
-
-    def _note_end(self, record: McapRecord, at: int) -> None:
-        """Note the end of the data, with its checksum, and that of the file."""
-        if isinstance(record, DataEnd):
-            wanted = record.data_section_crc
-            self.has_checksums = wanted != 0
-            # In a damaged place, the difference is known already.
-            if wanted and not self.damaged_places:
-                self.is_altered = self._crc32(0, at) != wanted
-        if isinstance(record, Footer):
-            self.has_checksums &= record.summary_crc != 0
-            self._has_ended = True
-
-    def _pass_over(self, at: int) -> int:
-        """Count what is broken there; return where the next record begins, or the file's end."""
-        end = self._end(at)
-        if end is not None and end < self._size and self._read(end) is not None:
-            next_at = end
-        else:
-            next_at = self._scan(at + 1)
-        if end is None and next_at == self._size and self._is_begun(at):
-            self.cut_off, self.torn_bytes = True, self._size - at
-        else:
-            self.damaged_places += 1
-            self.damaged_bytes += next_at - at
-        return next_at
-
-    def _scan(self, at: int) -> int:
         while at < self._size:
-            block = self._bytes(at, BLOCK_BYTES + LANDMARK_BYTES)
-            for match in LANDMARK.finditer(block):
-                if self._read(at + match.start()) is not None:
-                    return at + match.start()
-            at += BLOCK_BYTES
-        return self._size
+            stream.seek(at)
+            reader = StreamReader(stream, True, True, record_size_limit=MAX_RECORD_BYTES)
+            try:
+                for record in reader.records:
+                    parts = _parts(record, stream.tell() - at)
+                    self._spend(RECORD_BYTES * len(parts))
+                    at = stream.tell()
+                    yield from parts
+                    if isinstance(record, Footer):
+                        self.cut_off = False
+                        return
+            except TORN:
+                if at >= self._size:  # It ends between two records.
+                    return
+                read_to = stream.tell()
+                self._spend(read_to - at + BLOCK_BYTES)
+                end = _find_landmark(stream, at + 1)
+                if self.cut_off and min(read_to, end) >= self._size:
+                    self.torn_bytes = end - at
+                else:
+                    self.damaged_places += 1
+                    self.damaged_bytes += end - at
+                at = end
 
-    def _read(self, at: int) -> tuple[list[McapRecord], int] | None:
-        """The record there, a chunk as what it holds, and its end; None: it is not whole."""
-        end = self._end(at)
-        if end is None:
-            return None
-        data = self._bytes(at, end - at)
-        try:
-            record = next(StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records)
-            # The library reads on over lengths inside of a record that do not fit.
-            if _written(record) != data:
-                return None
-            parts = self._unpack(record) if isinstance(record, Chunk) else [record]
-        except TORN:
-            return None
-        if isinstance(record, Footer) and not self._has_its_index(record, at):
-            return None
-        return parts, end
-
-    def _end(self, at: int) -> int | None:
-        """Where the record that begins there ends by its length; None: not within the file."""
-        head = self._bytes(at, _HEAD.size)
-        if len(head) < _HEAD.size:
-            return None
-        opcode, length = _HEAD.unpack(head)
-        # The closing magic belongs to the footer: one without the other is no end.
-        end: int = at + _HEAD.size + length + (MAGIC_SIZE if opcode == Opcode.FOOTER else 0)
-        return end if length <= MAX_RECORD_BYTES and end <= self._size else None
-
-    def _is_begun(self, at: int) -> bool:
-        """Whether the file ends within a record of a likely length."""
-        head = self._bytes(at, _HEAD.size)
-        return len(head) < _HEAD.size or int(_HEAD.unpack(head)[1]) <= MAX_RECORD_BYTES
-
-    def _has_its_index(self, footer: Footer, at: int) -> bool:
-        """Whether the footer's checksum is that of the index before it."""
-        index_crc = self._crc32(footer.summary_start or at, at)
-        crc = zlib.crc32(_written(footer)[: -MAGIC_SIZE - _CRC_BYTES], index_crc)
-        return footer.summary_crc in (0, crc)
-
-    def _unpack(self, chunk: Chunk) -> list[McapRecord]:
-        """What a chunk holds; one of the TORN where it does not hold what it announces."""
-        size = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
-        # -1: the data do not say. They are then unpacked up to what the chunk says.
-        if size not in (-1, chunk.uncompressed_size) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
-            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-        parts = breakup_chunk(chunk, validate_crc=True)
-        self._read_bytes += RECORD_BYTES * len(parts)
-        return parts
-
-    def _crc32(self, start: int, end: int) -> int:
-        crc = 0
-        for at in range(start, end, BLOCK_BYTES):
-            crc = zlib.crc32(self._bytes(at, min(BLOCK_BYTES, end - at)), crc)
-        return crc
-
-    def _bytes(self, at: int, count: int) -> bytes:
-        """Those bytes, fewer at the file's end; UserError for more reading than damage explains."""
-        self._stream.seek(max(0, at))
-        data = self._stream.read(max(0, min(count, self._size - at)))
-        self._read_bytes += len(data)
-        if self._read_bytes > MAX_CHUNK_BYTES + MAX_WORK * self._size:
+    def _spend(self, count: int) -> None:
+        """Count what was read; UserError for more than damage explains."""
+        self._work_bytes += count
+        if self._work_bytes > MAX_RECORD_BYTES + MAX_WORK * self._size:
             raise UserError(
                 f"recording {self.path} is refused: reading it takes more than"
                 f" {MAX_WORK} times its size"
             )
-        return data
 
 
-def _written(record: McapRecord) -> bytes:
-    """The record as the library writes it; a footer with the magic that must follow."""
+def _parts(record: McapRecord, size: int) -> list[McapRecord]:
+    """A record that took ``size`` bytes, a chunk as what it holds; one of TORN: it is not whole."""
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end() + (MCAP0_MAGIC if isinstance(record, Footer) else b"")
+    if builder.count != size:  # The library reads on over lengths that do not fit, or skips some.
+        raise ValueError("a record of another length than it says")
+    if not isinstance(record, Chunk):
+        return [] if isinstance(record, Message) else [record]  # No checksum is over that one.
+    size = zstandard.frame_content_size(record.data) if record.compression else len(record.data)
+    # -1: the data do not say. They are then unpacked up to what the chunk says.
+    if size not in (-1, record.uncompressed_size) or record.uncompressed_size > MAX_RECORD_BYTES:
+        raise ValueError(f"a chunk of {record.uncompressed_size} bytes")
+    return breakup_chunk(record, validate_crc=True)
+
+
+def _find_landmark(stream: BinaryIO, at: int) -> int:
+    """Where the next record begins that can be recognised; the file's end where none does."""
+    while True:
+        stream.seek(at)
+        block = stream.read(BLOCK_BYTES + LANDMARK_BYTES)
+        if match := LANDMARK.search(block):
+            return at + match.start()
+        if len(block) < BLOCK_BYTES + LANDMARK_BYTES:
+            return at + len(block)
+        at += BLOCK_BYTES
 
 
 def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import queue
 import secrets
-import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -108,8 +107,7 @@ def run(arguments: Any) -> int:
     if report["compared"] == 0:
         raise UserError(f"{arguments.recording} holds answers, but none of the states they answer")
     write_json_out(arguments.out, report)
-    if trouble := recording.trouble():
-        print(f"the recording {trouble}; what is whole of it was replayed", file=sys.stderr)
+    recording.say_trouble()
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"

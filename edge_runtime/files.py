@@ -102,17 +102,8 @@ def _checked(path: PathLike) -> Path:
     return behind_link(path)
 
 
-def lock_file(descriptor: int) -> None:
-    """Hold a file that was just made, until the descriptor is closed.
-
-    Waits while another process looks at it. Does nothing where the file system has no locks.
-    """
-    with contextlib.suppress(OSError):
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-
-
 def try_to_lock_file(descriptor: int) -> bool:
-    """The same without waiting; False where another process holds the file."""
+    """Hold a file until the descriptor is closed; False where another process holds it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -99,9 +99,7 @@ def _show_recording(arguments: Any, sink: str) -> None:
         log = WireLog(recording)
         for each in heard:
             log.write(each)
-        if file.trouble():
-            text = f"the recording {file.trouble()}; what is whole of it is shown"
-            print(text, file=sys.stderr, flush=True)
+        file.say_trouble()
         if sink == SERVE:
             flush(recording)
             print("all of it is there; ^C ends", flush=True)

@@ -37,7 +37,6 @@ ROWS = [
     ("record --out a.mcap --vehicle-id a/b", "vehicle id"),
     ("record --out a.mcap --connect here", "endpoint"),
     ("record --out a.mcap --connect FREE --wait-s 0", "nobody"),
-    ("repair none.mcap", "No such file"),
     ("replay LEFT_TURN --policy none.onnx", "does not exist"),
     ("replay LEFT_TURN --policy none.onnx --tls certs/viewer", "--tls is for a link"),
     ("replay LEFT_TURN --listen FREE --config edge.toml", "--config is for --policy"),

@@ -230,7 +230,7 @@ def test_a_change_behind_the_fork_is_found_as_well(tmp_path, refusal):
         assert says in refusal("fork", path, "--episode", 1, "--at", "3")
 
 
-def test_other_places_and_damage(tmp_path, refusal):
+def test_other_places(refusal):
     assert "--episode says which, 0 to 4" in refusal("fork", LEFT_TURN)
     assert "holds 5 drives" in refusal("fork", LEFT_TURN, "--episode", 5)
     assert "fork before" in refusal("fork", LEFT_TURN, "--episode", 1, "--at", "999s")
@@ -239,11 +239,19 @@ def test_other_places_and_damage(tmp_path, refusal):
     words = ("--policy", SHIPPED / "congestion.onnx", "--allow-unsigned")
     assert "the policy is for 'congestion:" in refusal("fork", LEFT_TURN, "--episode", 1, *words)
     assert "--human takes no" in refusal("fork", LEFT_TURN, "--human", "web", "--latency", "9ms")
-    damaged = Path(shutil.copy(LEFT_TURN, tmp_path))
-    flip_chunk(damaged, 0)
-    assert "bridge repair" in refusal("fork", damaged)
     named = fork_of(LEFT_TURN, "--episode", 1, "--env", "trainer.scenarios:phil/LeftTurn-v0")
     assert named["differs_from_s"] is None
+
+
+def test_of_a_damaged_recording_what_is_whole_is_forked(tmp_path, capsys):
+    damaged = Path(shutil.copy(LEFT_TURN, tmp_path))
+    flip_chunk(damaged, -1)
+    words = ("--episode", 1, "--policy", OURS, "--latency", "40ms+-10ms")
+    assert fork_of(damaged, *words)["fork"] == fork_of(LEFT_TURN, *words)["fork"]
+    assert capsys.readouterr().err.count("damaged place") == 1
+    flip_chunk(damaged, 4)  # The middle of the second drive is in it.
+    assert bridge_status(["fork", str(damaged), "--episode", "1", "--at", "5s"]) == 2
+    assert "fork before" in capsys.readouterr().err
 
 
 def test_a_person_is_handed_to_the_trainer_with_all_that_was_said(monkeypatch):

@@ -155,12 +155,28 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
 def read_steps(path: Path) -> Iterator[Step]:
     """The steps of a recording, up to its end or to where a kill has cut it off.
 
+    Of a damaged one, an episode that the damage has torn is left out: its steps do not follow one
+    another, or how it ended is gone, and whether the person discarded it. One line says how much.
+
     Raises UserError: no such file, or not one of ours.
     """
-    recording = Recording(path)
+    recording, steps, given = Recording(path), 0, 0
+    for _, drive in groupby(_steps(recording), key=lambda step: step.index - step.step):
+        places = recording.damaged_places
+        episode = list(drive)
+        follow = [step.step for step in episode] == list(range(len(episode)))
+        ended = episode[-1].outcome or recording.damaged_places == places
+        steps = episode[-1].index + 1
+        if (follow and ended) or not recording.is_damaged:
+            yield from episode
+            given += len(episode)
+    recording.say_trouble(f", {given} of {steps} steps" if recording.is_damaged else "")
+
+
+def _steps(recording: Recording) -> Iterator[Step]:
+    """Every step that can be read."""
+    path = recording.path
     for channel, _, message in recording.messages():
-        if recording.damaged_places:
-            return
         if channel.topic != TOPIC:
             hint = f"`python -m bridge view {path}` shows one of the wire"
             raise UserError(f"{path}, with {channel.topic}, is no recording of a sitting; {hint}")
