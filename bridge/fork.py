@@ -35,7 +35,7 @@ from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
 from bridge.inbound import CommandCheck
-from bridge.messages import DECODERS, ENCODER, STAMPS, Heard, Origin, Scene
+from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene, decode
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.progress import ProgressBar
@@ -187,7 +187,7 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
 def _messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
     for heard in heard_of(recording, vehicle_id):
         if heard.topic in ("scene", "state", "command"):
-            yield heard, DECODERS[heard.topic](heard.payload)
+            yield heard, decode(heard)
 
 
 class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):

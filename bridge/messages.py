@@ -14,10 +14,13 @@ import msgspec
 import numpy as np
 
 from edge_runtime import wire
-from edge_runtime.manifest import Entry, Task, check_task
+from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S, Entry, Task, check_task
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_STATE_BYTES
 
+MOST = 1e12
+"""Of metres, seconds, milliseconds and all else that is drawn."""
+MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
 
@@ -33,7 +36,7 @@ class Heard(NamedTuple):
     size: int  # Bytes on the wire; a payload over the contract's limit is not kept
 
 
-Point = list[float]
+Point = tuple[float, float]
 
 
 class SeenCar(msgspec.Struct, frozen=True):
@@ -122,8 +125,11 @@ def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
 
 
 def read_scene(scene: Mapping[str, Any]) -> SeenScene:
-    """An environment's ``scene()`` as what is drawn; what is not drawn is left out."""
-    return msgspec.msgpack.decode(ENCODER.encode(scene), type=SeenScene)
+    """An environment's ``scene()`` as what is drawn; ValueError where it cannot be drawn."""
+    seen = msgspec.msgpack.decode(ENCODER.encode(scene), type=SeenScene)
+    if not _is_drawable(seen):
+        raise ValueError("a scene with numbers that cannot be drawn")
+    return seen
 
 
 def period_of(state: wire.State) -> float:
@@ -171,6 +177,35 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "scene": decode_scene,
 }
 """Topic -> decoder; for what is not valid it returns a ``Rejection``."""
+
+
+def decode(heard: Heard) -> Any:
+    """What was heard, of one of the topics of DECODERS; a ``Rejection`` where it is not valid.
+
+    Also where its numbers fit their types and still have no place in a plot or on a time axis.
+    """
+    message = DECODERS[heard.topic](heard.payload)
+    if isinstance(message, wire.Rejection):
+        return message
+    step = getattr(message, "step", 0)
+    if isinstance(message, wire.State | Scene) and step:
+        is_placed = MIN_PERIOD_S / 2 < message.sim_time_s / step < MAX_PERIOD_S * 2
+    else:
+        is_placed = True
+    if is_placed and -1 <= step <= MOST_STEPS and _is_drawable(message):
+        return message
+    return wire.Rejection(wire.Reason.MALFORMED, "numbers that cannot be drawn")
+
+
+def _is_drawable(value: Any) -> bool:
+    """Whether each floating-point number in it is finite, and no larger than MOST."""
+    if isinstance(value, float):
+        return abs(value) <= MOST  # False of NaN
+    if isinstance(value, dict):
+        value = list(value.values())
+    elif isinstance(value, msgspec.Struct) and not isinstance(value, Task):
+        value = msgspec.structs.astuple(value)
+    return not isinstance(value, list | tuple) or all(map(_is_drawable, value))
 
 
 class Pace:

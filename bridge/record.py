@@ -33,7 +33,7 @@ import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, images_of
+from bridge.messages import TOKEN_TOPICS, Heard, Scene, decode, images_of
 from bridge.ports import (
     ANY_VEHICLE,
     LINGER_S,
@@ -142,7 +142,7 @@ class ViewerCopies:
             self._view(heard)
 
     def _view(self, heard: Heard) -> None:
-        message = DECODERS[heard.topic](heard.payload)
+        message = decode(heard)
         if isinstance(message, wire.Rejection):
             self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {message.detail}")
             return

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from bridge.messages import DECODERS, Heard, period_of
+from bridge.messages import Heard, decode, period_of
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of
@@ -198,7 +198,7 @@ class RecordedDrive:
         seen: set[Key] = set()  # A network may repeat them.
         for heard in heard_of(self.recording, self.vehicle_id):
             if heard.topic == "state":
-                state = DECODERS["state"](heard.payload)
+                state = decode(heard)
                 if isinstance(state, State) and key_of(state) not in seen:
                     seen.add(key_of(state))
                     yield state
@@ -238,14 +238,14 @@ class RecordedDrive:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
         if heard.topic == "state" and not self.period_s:
-            state = DECODERS["state"](heard.payload)
+            state = decode(heard)
             self.period_s = period_of(state) if isinstance(state, State) else 0.0
         if heard.topic == "scene" and self.task is None:
-            self.task = getattr(DECODERS["scene"](heard.payload), "task", None)
+            self.task = getattr(decode(heard), "task", None)
         if heard.topic not in ("command", "health"):
             return
         heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
-        message = DECODERS[heard.topic](heard.payload)
+        message = decode(heard)
         if isinstance(message, Command) and message.reason != RUNTIME_ENDED:
             self._take_command(message, heard_s)
         elif isinstance(message, Health):

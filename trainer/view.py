@@ -154,7 +154,7 @@ class Steps(NamedTuple):
 
     entries: list[StepEntry]
     frames: NDArray[Any] | None = None  # What the policy saw; shown where it is [2, 45, 80]
-    scene: dict[str, Any] | NDArray[np.uint8] | None = None
+    scene: SeenScene | NDArray[np.uint8] | None = None
     """The environment's, or what it draws; None, too, where the road is not known."""
 
 
@@ -322,7 +322,7 @@ def _shown(env: Any) -> Any:
     """The scene, or what the environment draws where it has none; None where it draws nothing."""
     with suppress(Exception):  # Of any kind: it is somebody else's code, and the training goes on.
         scene = env.scene()
-        return env.render() if scene is None else scene
+        return env.render() if scene is None else read_scene(scene)
     return None
 
 
@@ -389,7 +389,7 @@ class TrainingLog:
 
     def _draw_scene(self, scene: Any) -> None:
         """A road with its cars, a picture, or nothing, in the place of what was there."""
-        road = read_scene(scene) if isinstance(scene, dict) else None
+        road = scene if isinstance(scene, SeenScene) else None
         ground = (road.roads, road.path, road.goal) if road else scene is not None
         if ground != self._ground:
             self._ground = ground

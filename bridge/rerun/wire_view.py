@@ -17,7 +17,16 @@ import msgspec
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import DECODERS, Heard, Pace, Scene, images_of, is_picture, period_of
+from bridge.messages import (
+    DECODERS,
+    Heard,
+    Pace,
+    Scene,
+    decode,
+    images_of,
+    is_picture,
+    period_of,
+)
 from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.record import Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of
@@ -40,7 +49,7 @@ from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt, who
 from edge_runtime.commands import link_words
 from edge_runtime.manifest import Layout
 from edge_runtime.tls import tls_for
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
@@ -100,6 +109,7 @@ def _show_recording(arguments: Any, sink: str) -> None:
         for each in heard:
             log.write(each)
         file.say_trouble()
+        log.say_left_out()
         if sink == SERVE:
             flush(recording)
             print("all of it is there; ^C ends", flush=True)
@@ -110,7 +120,9 @@ def _show_recording(arguments: Any, sink: str) -> None:
 @contextlib.contextmanager
 def _drawn(sink: str) -> Iterator[Callable[[Heard], None]]:
     with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
-        yield WireLog(recording, 0.0 if sink.endswith(SUFFIX) else draw.PICTURE_INTERVAL_S).write
+        log = WireLog(recording, 0.0 if sink.endswith(SUFFIX) else draw.PICTURE_INTERVAL_S)
+        yield log.write
+        log.say_left_out()
 
 
 @contextlib.contextmanager
@@ -244,6 +256,7 @@ class WireLog:
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode: tuple[str, int] | None = None
         self._health: Health | None = None
+        self.left_out = 0  # Messages that could not be drawn
         draw.style_lines(recording, SERIES)
         for side, colour in SIDES.items():
             self._style_rejections(side, ALL, colour)
@@ -256,11 +269,18 @@ class WireLog:
         """Draw one message as it came; a token shows as silence."""
         if heard.topic not in DECODERS:
             return
-        message = DECODERS[heard.topic](heard.payload)
+        message = decode(heard)
         if isinstance(message, wire.Rejection):
+            self.left_out += 1
             self._event(f"unreadable {heard.topic}: {message.detail}", rr.TextLogLevel.ERROR)
         else:
             getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
+
+    def say_left_out(self) -> None:
+        """Say in one line on stderr how many messages could not be drawn, if any."""
+        if self.left_out:
+            said = counted(self.left_out, "message")
+            print(f"left out: {said} that cannot be drawn", file=sys.stderr, flush=True)
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""

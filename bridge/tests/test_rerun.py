@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import bridge.rerun
 from bridge import messages
 from bridge.__main__ import main
+from bridge.recording import Recording, heard_of
 from bridge.rerun import _saved, check_sink, flush, free_port, open_sink
 from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.wire_view import Timeline, WireLog
@@ -44,7 +45,7 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
 
     def bounds(x):
         car = messages.SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
-        return view_bounds(messages.SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
+        return view_bounds(messages.SeenScene(path=[(0.0, 0.0), (10.0, 0.0)], vehicles=[car]))
 
     assert bounds(-60.0) == bounds(5.0)  # One far from the path does not shrink the picture.
     assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
@@ -67,7 +68,7 @@ def test_a_scene_is_read_without_what_is_not_drawn():
                       "width_m": 2.0, "speed_mps": 3.0, "ego": True}],
     }  # fmt: skip
     seen = messages.read_scene(scene)
-    assert (seen.roads, seen.goal, seen.path) == ([[[0.0, 0.0], [9.0, 0.0]]], [9.0, 0.0], ())
+    assert (seen.roads, seen.goal, seen.path) == ([[(0.0, 0.0), (9.0, 0.0)]], (9.0, 0.0), ())
     assert seen.vehicles == [messages.SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, True, 7, 3.0)]
 
 
@@ -250,6 +251,60 @@ def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_pat
     assert "is damaged (1 damaged place of" in said.err
 
 
+CAR = {"x": 0.0, "y": 0.0, "heading_rad": 0.0, "length_m": 4.0, "width_m": 2.0, "ego": True}
+PLACE = {"episode": 0, "step": 3, "sim_time_s": 0.3}
+LINE = [[0.0, 0.0], [1.0, 1.0]]
+GOOD: dict[str, dict] = {
+    "state": msgspec.to_builtins(make_state(3), builtin_types=(bytes,)),
+    "command": msgspec.to_builtins(make_command(3)),
+    "feedback": msgspec.to_builtins(harness.make_feedback(3)),
+    "health": msgspec.to_builtins(HEALTH),
+    "scene": PLACE | {"roads": [LINE], "path": LINE, "goal": [1.0, 1.0], "vehicles": [CAR],
+                          "round_trip_ms": 3.0, "answered_step": 2, "applied": [0.1]},
+}  # fmt: skip
+ABSURD = [2**63, 2**64 - 1, 2**53, 2**31, -(2**63), 1e308, -1e308, math.nan, math.inf, [], [1.0]]
+
+
+def with_each_number_absurd(value):
+    """The same again and again, each time with another of its numbers or lists replaced."""
+    if isinstance(value, dict | list):
+        for key, inner in list(value.items() if isinstance(value, dict) else enumerate(value)):
+            for changed in with_each_number_absurd(inner):
+                again = value.copy()
+                again[key] = changed
+                yield again
+    if isinstance(value, int | float | list) and not isinstance(value, bool):
+        yield from ABSURD
+
+
+def test_no_number_ends_a_viewer_or_makes_a_recording_unviewable(tmp_path, capsys):
+    """What is absurd is left out and counted, by the recorder's copies and the view."""
+    path, out, count = tmp_path / "drive.mcap", tmp_path / "drive.rrd", 0
+    with harness.writing(path) as writer:
+
+        def write(topic, message):
+            payload = msgspec.msgpack.encode(message)
+            key = f"phil/v/{topic}"
+            writer.write(messages.Heard(key, topic, payload, 10**18 + count, len(payload)))
+
+        for topic, good in GOOD.items():
+            for message in with_each_number_absurd(good):
+                count += 1
+                write(topic, message)
+        for topic, good in GOOD.items():
+            write(topic, good)
+    assert count > 500
+    assert main(["view", str(path), "--save", str(out)]) == 0
+    assert "road/ego/body" in verify(out)
+    (line,) = capsys.readouterr().err.splitlines()
+    (left_out,) = map(int, re.findall(r"left out: (\d+) messages", line))
+    assert count / 2 < left_out < count
+    log = WireLog(rr.RecordingStream("test"))
+    for stored in heard_of(Recording(path), "v"):
+        log.write(stored)
+    assert log._timeline.place("late", 0, 0)[1] < 10**6
+
+
 @pytest.fixture
 def kept(monkeypatch):
     numbers: dict[str, list[float]] = {}
@@ -357,7 +412,7 @@ def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is
     scene = messages.decode_scene(messages.encode_scene(environment.scene(), stamps))
     assert isinstance(scene, messages.Scene)
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
-    assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
+    assert scene.path == [(0.0, 0.0), (14.0, 0.0)]
     plain = messages.SeenCar(x=5.0, y=2.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
     seen = {"vehicles": [{name: getattr(plain, name) for name in plain.__struct_fields__[:5]}]}
     scene = messages.decode_scene(messages.encode_scene(seen, stamps))

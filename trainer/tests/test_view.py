@@ -15,6 +15,7 @@ import rerun as rr
 import torch
 from rerun.chunk import RrdReader
 
+from bridge.messages import SeenScene
 from bridge.rerun import APPLIED, HUMAN, POLICY
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
@@ -123,9 +124,12 @@ def control_period():
     return Seen(np.zeros((2, 45, 80), np.uint8), -action, None, action, speed_mps=3.0)
 
 
-def test_a_scene_that_fails_is_not_shown_and_ends_no_training():
+@pytest.mark.parametrize(
+    "scene", [lambda: 1 / 0, lambda: {"path": [[1.0]]}, lambda: {"road_width_m": float("nan")}]
+)
+def test_a_scene_that_fails_is_not_shown_and_ends_no_training(scene):
     kept: list[Any] = []
-    looking_on(kept, scene=lambda: 1 / 0).on_step(control_period())
+    looking_on(kept, scene=scene).on_step(control_period())
     assert kept[0].scene is None
 
 
@@ -271,7 +275,7 @@ def test_what_is_known_no_more_is_not_shown_any_more(monkeypatch):
     log = view.TrainingLog(rr.RecordingStream("t"), [])
     entry, frames = view.StepEntry(0, 0.0, 0.0, 1.0, None), np.zeros((2, 45, 80), np.uint8)
     drawn.clear()
-    scenes: tuple[Any, ...] = ({"vehicles": []}, None, np.zeros((4, 4, 3), np.uint8))
+    scenes: tuple[Any, ...] = (SeenScene(), None, np.zeros((4, 4, 3), np.uint8))
     for scene in scenes:
         log.draw(Steps([entry], frames, scene))
     cleared = [what for what in drawn if what[0] == "road"]
