@@ -51,6 +51,7 @@ RUNTIME_ENDED = "runtime_ended"
 JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
 CLOCK_STEP_S = 1.0
 """Where the two clocks come apart by more than this, the runtime's has been stepped."""
+MOST_REPETITIONS = 1000  # Of a stop: by then nothing is new, however long the silence lasts
 OUTSIDE: Any = SimpleNamespace(outside=Event.OUTSIDE.value)  # A link's measurement, as recorded
 RESTART_S = 0.5  # Uptimes that disagree by more than this belong to two runtimes
 
@@ -188,6 +189,7 @@ class RecordedDrive:
         self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
         self._zero_ns: int | None = None
         self._lead_s: tuple[int, float] | None = None
+        self._arrived_s = -CLOCK_STEP_S  # The newest exchange's
         for heard in heard_of(self.recording, self.vehicle_id):
             self._take(heard)
         if not self.exchanges:
@@ -259,8 +261,11 @@ class RecordedDrive:
             self.policy_ids.append(command.policy_id)
         self.plan_periods = max(self.plan_periods, len(command.plan or ()))
         sent_s = self._sent_s(command, heard_s)
-        first = _first_exchange(command, sent_s, self.period_s)
-        exchange = self.exchanges.setdefault(key_of(command), first)
+        exchange = self.exchanges.get(key_of(command))
+        if exchange is None:
+            exchange = _first_exchange(command, sent_s, self.period_s, self._arrived_s)
+            self.exchanges[key_of(command)] = exchange
+            self._arrived_s = exchange.arrived_s
         exchange.last_s = sent_s
         note(exchange.answers, command)
 
@@ -291,9 +296,17 @@ def key_of(message: State | Command) -> Key:
     return message.session, message.episode, message.step
 
 
-def _first_exchange(command: Command, sent_s: float, period_s: float) -> Exchange:
-    """When it arrived: the answer's sending, less the time between the runtime's two stamps."""
+def _first_exchange(
+    command: Command, sent_s: float, period_s: float, earliest_s: float
+) -> Exchange:
+    """When it arrived: the answer's sending, less the time between the runtime's two stamps.
+
+    States arrive in their order: where that says before ``earliest_s``, the one before, the
+    runtime's clock was set between the two stamps, and the sending counts.
+    """
     arrived_s = sent_s - max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
+    if arrived_s < earliest_s - period_s:
+        arrived_s = sent_s
     begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
     finished_s = sent_s
     if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
@@ -393,8 +406,9 @@ class _Replay:
     def _pass_time(self, until_s: float) -> None:
         """Be the watchdog up to a moment."""
         last_s = None
-        while (due_s := self._controller.next_deadline_s()) is not None and due_s != last_s:
-            if due_s + JUST_AFTER_S > until_s:
+        for _ in range(MOST_REPETITIONS):
+            due_s = self._controller.next_deadline_s()
+            if due_s in (None, last_s) or due_s + JUST_AFTER_S > until_s:
                 return
             self._note(self._controller.tick(due_s + JUST_AFTER_S))
             last_s = due_s

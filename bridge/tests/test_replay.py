@@ -169,6 +169,36 @@ def test_a_runtime_that_was_started_anew_drives_at_once_and_may_be_slow(hand):
     assert is_the_same(hand)
 
 
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        {"received_ns": 0},
+        {"sent_ns": 2**63},
+        {"sent_ns": 2**63, "received_ns": 2**64 - 1},
+        {"inference_ns": 2**63},
+        {"received_ns": ns(0.7 - 3600.0)},  # The clock was set by an hour meanwhile.
+        {"sent_ns": ns(0.7 - 3600.0)},
+    ],
+    ids=repr,
+)
+def test_a_clock_that_is_set_between_two_stamps_changes_nothing(hand, stamps):
+    hand.drive(0, 7)
+    hand.state(0.7, 7)
+    hand.command(0.7 + ANSWER_S, 7, **stamps)
+    hand.drive(8, 12)
+    hand.edge_clock_s = 3600.0
+    hand.drive(12, 15)
+    assert is_the_same(hand, compared=15)
+
+
+def test_a_silence_of_thirty_years_is_soon_over(hand):
+    hand.drive(0, 5)
+    hand.stop(4, 3)
+    hand.drive(5, 9, start_s=1e9, **SAFE_STOP)
+    hand.drive(9, 12, start_s=1e9)
+    assert is_the_same(hand, compared=12)
+
+
 def test_a_recorder_that_was_held_up_changes_nothing(hand):
     hand.drive(0, 3)
     for step in range(3, 6):  # Heard half a second late, answered in time.
