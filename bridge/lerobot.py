@@ -2,18 +2,21 @@
 
 A frame is a state that was answered, with the first new answer to it, whether to drive or to stop.
 The format knows no gaps: where nobody answered a state, only the feature ``step`` jumps. The file
-is read once for each array of the observation, so that its pictures need no memory.
+is read once for each array of the observation, so that pictures need no memory; other arrays wait
+in a file.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,7 @@ from edge_runtime.wire import State, is_foreign
 try:
     import av
     import pyarrow as pa
-    from pyarrow.parquet import write_table
+    from pyarrow.parquet import ParquetWriter
 except ImportError:
     raise UserError("export needs av and pyarrow: pip install 'phil-hil[lerobot]'") from None
 
@@ -42,7 +45,11 @@ FIRST = FILE.format(chunk_index=0, file_index=0)
 SAMPLED_PIXELS = 256  # Of each picture, for the statistics
 ENCODER = {"crf": "10", "g": "2", "bf": "0"}
 """Hardly any loss; every second picture stands alone: a training jumps about in the video."""
-Columns = dict[str, np.ndarray]  # Feature to [frames, ...]; of a video, a sample of its pixels
+MOST_NUMBERS = 1 << 22  # That are in memory at once
+MOST_IN_STATE = 400_000
+"""Of a state, without its pictures: nine statistics of each are kept as text."""
+QUANTILES = (1, 10, 50, 90, 99)
+Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of its pixels
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -88,17 +95,21 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     for name in task.observation:
         if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
             raise UserError(f"the observation {name!r} cannot be the name of a feature")
+    plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
+    if sum(math.prod(task.observation[name].shape) for name in plain) > MOST_IN_STATE:
+        most = f"more than {MOST_IN_STATE} numbers that are no picture"
+        raise UserError(f"{drive.recording.path}: a state holds {most}: too many for a data set")
+    folder.mkdir(parents=True)
     rate = Fraction(1 / task.control_period_s).limit_denominator(1000)
     columns, bounds = _numbers(drive, task, rate)
     features = {key: _feature(values) for key, values in columns.items()}
     features["action"]["names"] = [row.name for row in task.action]
-    plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
     layout = Layout(task)
     for name in task.observation:
         arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
         if name in plain:
             key = "observation.state" if len(plain) == 1 else f"observation.{name}"
-            columns[key] = np.array([array.ravel() for array in arrays])
+            columns[key] = _Rows(folder, arrays)
             features[key] = _feature(columns[key])
         else:
             key = f"observation.images.{name}"
@@ -150,10 +161,29 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
     return columns, bounds
 
 
-def _feature(values: np.ndarray) -> dict[str, Any]:
+class _Rows:
+    """Rows of numbers in a file without a name, read as an array's: ``rows[3:9, :100]``."""
+
+    def __init__(self, folder: Path, arrays: Iterable[np.ndarray]) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open while it is read)
+        count = 0
+        for count, array in enumerate(arrays, 1):  # noqa: B007
+            self._file.write(array.tobytes())
+        self.shape, self.dtype = (count, array.size), array.dtype
+
+    def __getitem__(self, at: tuple[slice, slice]) -> np.ndarray:
+        rows, numbers = (range(*one.indices(n)) for one, n in zip(at, self.shape, strict=True))
+        found = np.empty((len(rows), len(numbers)), self.dtype)
+        for row, into in zip(rows, found, strict=True):
+            self._file.seek((row * self.shape[1] + numbers.start) * self.dtype.itemsize)
+            self._file.readinto(into.view(np.uint8))
+        return found
+
+
+def _feature(values: Any) -> dict[str, Any]:
     """As info.json has it."""
     dtype = "string" if values.dtype.kind == "U" else values.dtype.name
-    return {"dtype": dtype, "shape": [values.size // len(values)], "names": None}
+    return {"dtype": dtype, "shape": [math.prod(values.shape[1:])], "names": None}
 
 
 def _encode(
@@ -175,7 +205,8 @@ def _encode(
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))
-            sampled.append(picture.reshape(-1, 3)[:: height * width // SAMPLED_PIXELS + 1])
+            pixels = picture.reshape(-1, 3)[:: height * width // SAMPLED_PIXELS + 1]
+            sampled.append(pixels.copy())  # A view would keep the picture.
         container.mux(stream.encode(None))
         info = {
             "video.height": height, "video.width": width, "video.codec": "h264",
@@ -192,8 +223,9 @@ def _write(
     """All but the videos."""
     features = info["features"]
     videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
-    rows = []
-    for number, (start, end) in enumerate(pairwise(bounds)):
+    size = sum(feature["shape"][0] for feature in features.values())
+
+    def episode(number: int, start: int, end: int) -> dict[str, Any]:
         row = {"episode_index": number, "tasks": [task], "length": end - start}
         row |= {"dataset_from_index": start, "dataset_to_index": end}
         for place in ("data", "meta/episodes", *videos):
@@ -203,33 +235,51 @@ def _write(
             row[f"{place}/to_timestamp"] = float(end / rate)
         for key, stats in _stats(columns, features, slice(start, end)).items():
             row |= {f"stats/{key}/{name}": value for name, value in stats.items()}
-        rows.append(row)
+        return row
+
+    ends = list(enumerate(pairwise(bounds)))
     # pandas, which reads it, is told that the text is the index.
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
     tasks = pa.table({"task_index": [0], "task": [task]})
-    numbers = {key: _column(array) for key, array in columns.items() if array.ndim < 3}
-    for name, table in {
-        f"data/{FIRST}": pa.table(numbers),
-        f"meta/episodes/{FIRST}": pa.Table.from_pylist(rows),
-        "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
+    numbers = {key: column for key, column in columns.items() if len(column.shape) < 3}
+    for name, tables in {
+        f"data/{FIRST}": (
+            pa.table({key: _column(column, part) for key, column in numbers.items()})
+            for part in _parts(bounds[-1], size)
+        ),
+        f"meta/episodes/{FIRST}": (
+            pa.Table.from_pylist([episode(number, *bound) for number, bound in ends[part]])
+            for part in _parts(len(ends), 9 * size)
+        ),
+        "meta/tasks": iter([tasks.replace_schema_metadata({"pandas": json.dumps(told)})]),
     }.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_table(table, path)
-    write_json(folder / "meta/stats.json", _stats(columns, features, slice(None)))
+        table = next(tables)
+        with ParquetWriter(path, table.schema) as writer:
+            for one in chain([table], tables):
+                writer.write_table(one)
+    write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
     info |= {
         "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
-        "total_episodes": len(rows), "total_tasks": 1, "splits": {"train": f"0:{len(rows)}"},
+        "total_episodes": len(ends), "total_tasks": 1, "splits": {"train": f"0:{len(ends)}"},
         "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
         "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
     }  # fmt: skip
     write_json(folder / "meta/info.json", info)
 
 
-def _column(values: np.ndarray) -> Any:
+def _parts(count: int, size: int) -> Iterator[slice]:
+    """So many rows of this size in slices, of each of which memory holds the numbers."""
+    step = max(1, MOST_NUMBERS // size)
+    return (slice(start, min(start + step, count)) for start in range(0, count, step))
+
+
+def _column(values: Any, rows: slice) -> Any:
     """Plain numbers or texts, or lists of a fixed length."""
-    column, size = pa.array(values.ravel()), values.size // len(values)
+    part = values[rows] if len(values.shape) == 1 else values[rows, :]
+    column, size = pa.array(part.ravel()), part.size // len(part)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 
 
@@ -239,12 +289,27 @@ def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[st
     for key, feature in features.items():
         if feature["dtype"] == "string":
             continue
-        most, shape = (255, [3, 1, 1]) if feature["dtype"] == "video" else (1, feature["shape"])
-        values = columns[key][frames].reshape(-1, shape[0]) / most
-        stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
-        stats |= {"std": values.std(0)}
-        for part in (1, 10, 50, 90, 99):
-            stats[f"q{part:02d}"] = np.quantile(values, part / 100, axis=0)
-        found[key] = {name: value.reshape(shape).tolist() for name, value in stats.items()}
-        found[key]["count"] = [len(columns[key][frames])]
+        values, most, shape, rows = columns[key], 1, feature["shape"], frames
+        if feature["dtype"] == "video":
+            pixels = values[frames].reshape(-1, 3)
+            values, most, shape = pixels[:: len(pixels) // MOST_NUMBERS + 1], 255, [3, 1, 1]
+            rows = slice(0, len(values))
+        elif len(values.shape) == 1:
+            values = values[:, None]
+        columns_each = _parts(shape[0], rows.stop - rows.start)
+        parts = [_describe(values[rows, part] / most) for part in columns_each]
+        found[key] = {
+            name: np.concatenate([part[name] for part in parts]).reshape(shape).tolist()
+            for name in parts[0]
+        }
+        found[key]["count"] = [frames.stop - frames.start]
     return found
+
+
+def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Of each column, in numbers whose squares are finite."""
+    values = values.astype(np.float64)
+    stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+    quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
+    stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
+    return stats | {"std": values.std(0)}

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import tracemalloc
 
 import aiohttp
 import av
@@ -12,6 +13,7 @@ import pandas as pd  # type: ignore[import-untyped]
 import pytest
 from pyarrow import parquet
 
+from bridge import lerobot
 from bridge.messages import Scene, encode_scene
 from bridge.record import RawImage, describe
 from bridge.rerun import free_port
@@ -88,6 +90,63 @@ def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
     assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 20, 5)
     assert info["features"]["action"]["names"] == ["left", "right"]
     assert pd.read_parquet(out / "meta/tasks.parquet").loc["rover"].task_index == 0
+
+
+def drive_of(path, entry, values, action=0.5):
+    """A recording of answered states, each of one array as bytes."""
+    task = msgspec.structs.replace(ROVER, observation={"a": entry}, action=ACTIONS[:1])
+    with harness.writing(path) as writer:
+        scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
+        writer.write(heard("scene", encode_scene({}, scene)))
+        for step, value in enumerate(values):
+            state = make_state(step, session="here", observation={"a": value})
+            writer.write(heard("state", encode(state)), with_view=False)
+            writer.write(heard("command", encode(make_command(step, action=[action]))))
+    return path
+
+
+def test_large_numbers_have_finite_statistics_and_too_large_ones_are_left_out(tmp_path):
+    large = np.full(2, np.finfo(np.float32).max, np.float32)
+    values = [large.tobytes(), (-large).tobytes()] * 3
+    path = drive_of(tmp_path / "a.mcap", SEEN["b"], values, action=1e11)
+    assert harness.bridge_status(export(path, tmp_path / "a")) == 0
+    stats = json.loads((tmp_path / "a/meta/stats.json").read_text())
+    assert stats["observation.state"]["std"] == pytest.approx(large.astype(float).tolist())
+    path = drive_of(tmp_path / "b.mcap", SEEN["b"], values, action=1e308)
+    assert harness.bridge_status(export(path, tmp_path / "b")) == 2
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "frames"), [([480, 640, 3], "uint8", 50), ([20_000], "float32", 400)]
+)
+def test_memory_does_not_grow_with_the_frames(tmp_path, monkeypatch, shape, dtype, frames):
+    """Black pictures and zeros, of which a small file holds very many."""
+    monkeypatch.setattr(lerobot, "MOST_NUMBERS", 1 << 17)
+    zeros = np.zeros(shape, dtype).tobytes()
+    path = drive_of(tmp_path / "a.mcap", Entry(dtype=dtype, shape=shape), [zeros] * frames)
+    tracemalloc.start()
+    try:
+        assert harness.bridge_status(export(path, tmp_path / "a")) == 0
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 24e6 < 0.8 * frames * len(zeros)
+
+
+def test_what_memory_holds_at_once_changes_nothing(tmp_path, monkeypatch):
+    path, found = recorded(tmp_path / "a.mcap", ROVER), []
+    for number in (1 << 22, 7):
+        monkeypatch.setattr(lerobot, "MOST_NUMBERS", number)
+        out = tmp_path / f"{number}"
+        assert harness.bridge_status(export(path, out)) == 0
+        tables = [f"data/{FILE}.parquet", f"meta/episodes/{FILE}.parquet"]
+        rows = [parquet.read_table(out / table).to_pylist() for table in tables]
+        pictures = [key for key in rows[1][0] if key.startswith("stats/observation.images")]
+        for row in rows[1]:  # Of fewer pixels.
+            for key in pictures:
+                del row[key]
+        found.append(rows)
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize(
