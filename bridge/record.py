@@ -8,29 +8,25 @@ viewers can draw:
 | ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
 | ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
 | ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t; so each picture array |
-| ``view/<id>/<topic>``, of every topic of the wire | protobuf ``phil.State`` and so on |
+| ``view/<id>/<topic>``, of every topic of the wire | ``phil.State`` and so on |
 | ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
 
-The copies are protobuf: Foxglove and rerun both read it by the descriptor that the recording
-carries along, and know ``foxglove.RawImage`` and ``foxglove.Log`` by name. (rerun 0.41 decodes no
-JSON.) The descriptors are made at run time from structs: no compiler, no generated file.
+The copies are JSON with a JSON Schema of the structs: Foxglove reads any, and knows
+``foxglove.RawImage`` and ``foxglove.Log`` by name. rerun reads none; `bridge view` is for it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import enum
 import functools
 import sys
 import threading
 import time
-import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
 from bridge.messages import TOKEN_TOPICS, Heard, Scene, decode, images_of
@@ -46,13 +42,19 @@ from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable, make_directory
-from edge_runtime.manifest import Layout, Task
+from edge_runtime.manifest import Layout
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, counted
 
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 CHUNK_BYTES = 1 << 20
+NOT_COPIED = (
+    "observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal",
+)  # fmt: skip
+"""Fields that no viewer plots: bytes, lists of lists, and how a state is to be read."""
+ENCODING, SCHEMA_ENCODING = "json", "jsonschema"
+INFO, WARNING = 2, 3  # Of ``foxglove.Log.level``
 NEVER_OVER = "choose another name: no recording is lost"
 
 
@@ -135,22 +137,18 @@ class ViewerCopies:
         if heard.topic in TOKEN_TOPICS:
             who = "edge runtime" if heard.topic == "alive" else "simulator"
             what = "is here" if heard.payload == b"\x01" else "has gone"
-            self._event(heard, Level.INFO, f"{who} {what}")
+            self._event(heard, INFO, f"{who} {what}")
         elif heard.size > len(heard.payload):
-            self._event(heard, Level.WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
+            self._event(heard, WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
         else:
             self._view(heard)
 
     def _view(self, heard: Heard) -> None:
         message = decode(heard)
         if isinstance(message, wire.Rejection):
-            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {message.detail}")
+            self._event(heard, WARNING, f"unreadable {heard.topic}: {message.detail}")
             return
-        try:
-            self._copy(heard, heard.topic, message)
-        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
-            self._event(heard, Level.WARNING, f"{heard.topic} not drawn: {error}")
-            return
+        self._copy(heard, heard.topic, message)
         vehicle = _vehicle_id(heard)
         if isinstance(message, Scene):
             self._layouts[vehicle] = Layout(message.task) if message.task else None
@@ -171,17 +169,16 @@ class ViewerCopies:
             data, at = images.tobytes(), _stamp(heard.arrived_ns)
             self._copy(heard, name, RawImage(at, *size, data, _vehicle_id(heard)))
 
-    def _event(self, heard: Heard, level: Level, text: str) -> None:
+    def _event(self, heard: Heard, level: int, text: str) -> None:
         self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
 
     def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
         """Add what viewers can draw, to the vehicle's topic of that name."""
-        schema = describe(type(values))
-        known = schema.make.DESCRIPTOR.fields_by_name
-        fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
-        drawn = {name: value for name, value in fields if name in known}
-        data = schema.make(**drawn).SerializeToString()
-        self._add(f"view/{_vehicle_id(heard)}/{name}", schema, heard.arrived_ns, data)
+        fields = msgspec.structs.asdict(values).items()
+        unknown = (None, msgspec.UNSET)
+        drawn = {n: v for n, v in fields if n not in NOT_COPIED and v not in unknown}
+        topic, data = f"view/{_vehicle_id(heard)}/{name}", msgspec.json.encode(drawn)
+        self._add(topic, describe(type(values)), heard.arrived_ns, data)
 
 
 class RecordingWriter:
@@ -225,8 +222,8 @@ class RecordingWriter:
         close_torn(self._file)
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
-        schema_id = self._schema(schema.name, "protobuf", schema.descriptors)
-        self._add(topic, "protobuf", now_ns, data, schema_id)
+        schema_id = self._schema(schema.name, SCHEMA_ENCODING, schema.data)
+        self._add(topic, ENCODING, now_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
         channel_id = self._channel(topic, encoding, schema_id)
@@ -266,120 +263,56 @@ def close_torn(stream: BinaryIO) -> None:
         stream.close()
 
 
-Field: Any = descriptor_pb2.FieldDescriptorProto
-TIMESTAMP = "google.protobuf.Timestamp"
-Time = Annotated[dict[str, int], TIMESTAMP]  # As `_stamp` makes it
-Fixed32 = Annotated[int, Field.TYPE_FIXED32]
-Data = Annotated[bytes, Field.TYPE_BYTES]
-_SCALARS = {
-    str: Field.TYPE_STRING,
-    bool: Field.TYPE_BOOL,
-    int: Field.TYPE_INT64,
-    float: Field.TYPE_DOUBLE,
-    Fixed32: Field.TYPE_FIXED32,
-    Data: Field.TYPE_BYTES,
-}
+class Time(msgspec.Struct):
+    """Since 1970."""
+
+    sec: int
+    nsec: int
 
 
 class RawImage(msgspec.Struct):
-    """``foxglove.RawImage``; the order is that of Foxglove's field numbers, as in `Log`."""
+    """``foxglove.RawImage``."""
 
     timestamp: Time
-    width: Fixed32
-    height: Fixed32
+    width: int
+    height: int
     encoding: str
-    step: Fixed32
-    data: Data
+    step: int
+    data: bytes
     frame_id: str
-
-
-class Level(enum.IntEnum):
-    """``foxglove.Log.Level``."""
-
-    UNKNOWN, DEBUG, INFO, WARNING, ERROR, FATAL = range(6)
 
 
 class Log(msgspec.Struct):
     """``foxglove.Log``, of which we fill time, level, text and sender."""
 
     timestamp: Time
-    level: Level
+    level: int
     message: str
     name: str
+    file: str = ""
+    line: int = 0
 
 
-def _stamp(time_ns: int) -> dict[str, int]:
-    """Nanoseconds since 1970 as protobuf's timestamp has them."""
-    return dict(zip(("seconds", "nanos"), divmod(time_ns, 10**9), strict=True))
+def _stamp(time_ns: int) -> Time:
+    return Time(*divmod(time_ns, 10**9))
 
 
 class Schema(NamedTuple):
-    """A protobuf message type: its full name, its class, and its serialised FileDescriptorSet."""
+    """A message type: its full name, and its JSON Schema."""
 
     name: str
-    make: Any
-    descriptors: bytes
+    data: bytes
 
 
 @functools.cache
 def describe(kind: type[msgspec.Struct]) -> Schema:
-    """Mirror a struct as a protobuf message, without plain bytes and what protobuf lacks."""
+    """What of a struct is copied for viewers. A field that may be None is then left out."""
+    _, parts = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
+    fields = parts.pop(kind.__name__)["properties"].items()
+    copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
+    schema = {"type": "object", "properties": copied, "$defs": parts}  # As Foxglove wants it
     package = "foxglove" if kind in (RawImage, Log) else "phil"
-    stamp = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
-    name = f"{package}.{kind.__name__}"
-    file = descriptor_pb2.FileDescriptorProto(
-        name=f"{name}.proto", package=package, syntax="proto3", dependency=[stamp.name]
-    )
-    _add_struct(file.message_type.add(), kind, package)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(stamp)
-    pool.Add(file)
-    make = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
-    files = descriptor_pb2.FileDescriptorSet(file=[stamp, file])
-    return Schema(name, make, files.SerializeToString())
-
-
-def _add_struct(message: Any, kind: type[msgspec.Struct], package: str) -> None:
-    message.name, path = kind.__name__, f"{package}.{kind.__name__}"
-    hints = typing.get_type_hints(kind, include_extras=True)
-    for number, (name, hint) in enumerate(hints.items(), start=1):
-        inner = typing.get_args(hint)
-        if type(None) in inner:
-            hint = inner[0]
-        field = message.field.add(name=name, number=number, label=Field.LABEL_OPTIONAL)
-        origin, inner = typing.get_origin(hint), typing.get_args(hint)
-        if origin in (dict, list, Sequence):
-            field.label, hint = Field.LABEL_REPEATED, inner[0]
-        if origin is dict and inner[1] not in _SCALARS:  # an observation's bytes
-            del message.field[-1]
-        elif origin is dict:
-            field.type = Field.TYPE_MESSAGE
-            field.type_name = f".{path}.{_add_map_entry(message, name, inner)}"
-        elif hint in _SCALARS:
-            field.type = _SCALARS[hint]
-        elif hint == Time:
-            field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
-        elif isinstance(hint, type) and issubclass(hint, msgspec.Struct) and hint is not Task:
-            _add_struct(message.nested_type.add(), hint, path)
-            field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
-        elif hint is Level:
-            levels = message.enum_type.add(name=hint.__name__)
-            for one in hint:
-                levels.value.add(name=one.name, number=one.value)
-            field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
-        else:
-            del message.field[-1]
-
-
-def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
-    """Protobuf's own form of a map: a nested message of key and value."""
-    entry_name = "".join(part.title() for part in name.split("_")) + "Entry"
-    entry = message.nested_type.add(name=entry_name)
-    entry.options.map_entry = True
-    for number, (label, kind) in enumerate(zip(("key", "value"), inner, strict=True), start=1):
-        entry.field.add(name=label, number=number, label=Field.LABEL_OPTIONAL, type=_SCALARS[kind])
-    return entry_name
+    return Schema(f"{package}.{kind.__name__}", msgspec.json.encode(schema))
 
 
 RECORD_EXAMPLE = examples(

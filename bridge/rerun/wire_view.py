@@ -28,7 +28,7 @@ from bridge.messages import (
     period_of,
 )
 from bridge.ports import add_options, open_listener, wait_to_be_told
-from bridge.record import Schema, ViewerCopies
+from bridge.record import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.rerun import (
     APPLIED,
@@ -132,8 +132,8 @@ def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
 
     @functools.cache
     def channel(topic: str, schema: Schema) -> Any:
-        told = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.descriptors)
-        kind: Any = {"message_encoding": "protobuf", "schema": told, "context": context}
+        told = foxglove.Schema(name=schema.name, encoding=SCHEMA_ENCODING, data=schema.data)
+        kind: Any = {"message_encoding": ENCODING, "schema": told, "context": context}
         return foxglove.Channel(topic, **kind)
 
     def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:

@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 from bridge import lerobot
 from bridge.messages import Scene, encode_scene
-from bridge.record import RawImage, describe
+from bridge.record import RawImage
 from bridge.rerun import free_port
 from bridge.tests import harness
 from bridge.tests.test_recording import heard
@@ -199,5 +199,5 @@ def test_a_drive_is_served_to_foxglove(tmp_path, refusal):
         data = asyncio.run(first_message(port, "view/hunter01/frames", start_drive))
         run.process.kill()
         assert view.wait(30) == 0, view.errors  # with the simulator
-    assert describe(RawImage).make.FromString(data).height == 90
+    assert msgspec.json.decode(data, type=RawImage).height == 90
     assert "by itself" in refusal("view", "a.mcap", "--foxglove")
