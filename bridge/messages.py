@@ -187,12 +187,11 @@ def decode(heard: Heard) -> Any:
     message = DECODERS[heard.topic](heard.payload)
     if isinstance(message, wire.Rejection):
         return message
-    step = getattr(message, "step", 0)
+    step, period_s = getattr(message, "step", 0), MIN_PERIOD_S
     if isinstance(message, wire.State | Scene) and step:
-        is_placed = MIN_PERIOD_S / 2 < message.sim_time_s / step < MAX_PERIOD_S * 2
-    else:
-        is_placed = True
-    if is_placed and -1 <= step <= MOST_STEPS and _is_drawable(message):
+        period_s = message.sim_time_s / step
+    is_placed = MIN_PERIOD_S / 2 < period_s < 2 * MAX_PERIOD_S and -1 <= step <= MOST_STEPS
+    if is_placed and _is_drawable(message):
         return message
     return wire.Rejection(wire.Reason.MALFORMED, "numbers that cannot be drawn")
 

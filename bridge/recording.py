@@ -21,7 +21,7 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -56,7 +56,6 @@ class Stored(NamedTuple):
     """One message of a recording."""
 
     channel: Channel
-    schema: Schema | None
     message: Message
 
 
@@ -72,9 +71,7 @@ class Recording:
         self.cut_off = False
         """The file ends without its index, between two records or within one: a kill."""
         self.torn_bytes = 0  # Of the record within which the file stops
-        self.damaged_places = (
-            0  # Broken parts before the end; all that is whole between them is read
-        )
+        self.damaged_places = 0  # Between them, all that is whole is read
         self.damaged_bytes = 0
         self.nameless_messages = 0  # Whole ones whose topic stood in a broken part alone
         self._work_bytes = 0
@@ -109,47 +106,37 @@ class Recording:
         UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
         reading than its size accounts for.
         """
-        schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-
-        def learn(record: McapRecord) -> None:
-            # The first definition of an id counts: it is from a chunk, which has a checksum.
-            if isinstance(record, Schema):
-                schemas.setdefault(record.id, record)
-            elif isinstance(record, Channel):
-                channels.setdefault(record.id, record)
-
         has_looked = False
         for record in self._records():
-            learn(record)
             if isinstance(record, Metadata):
                 self.metadata |= record.metadata
+            elif isinstance(record, Channel):
+                # The first of an id counts: it is from a chunk, which has a checksum.
+                channels.setdefault(record.id, record)
             elif isinstance(record, Message):
-                channel = channels.get(record.channel_id)
-                if not has_looked and (channel is None or channel.schema_id not in (0, *schemas)):
+                if record.channel_id not in channels and not has_looked:
                     # The chunk that named it is broken; the index at the end repeats all names.
                     has_looked = True
                     for other in Recording(self.path)._records():
-                        learn(other)
-                    channel = channels.get(record.channel_id)
-                if channel is None:
-                    self.nameless_messages += 1
+                        if isinstance(other, Channel):
+                            channels.setdefault(other.id, other)
+                if channel := channels.get(record.channel_id):
+                    yield Stored(channel, record)
                 else:
-                    yield Stored(channel, schemas.get(channel.schema_id), record)
+                    self.nameless_messages += 1
 
     def _records(self) -> Iterator[McapRecord]:
         """Yield every record that can be read, a chunk as what it holds."""
         self._begin()
         try:
             with open_regular(self.path) as stream:
+                begins = stream.read(MAGIC_SIZE) == MCAP0_MAGIC
                 self._size = stream.seek(0, os.SEEK_END)
-                ends = []
-                for at in (0, max(0, self._size - MAGIC_SIZE)):
-                    stream.seek(at)
-                    ends.append(stream.read(MAGIC_SIZE))
-                if MCAP0_MAGIC not in ends or self._size <= MAGIC_SIZE:
+                stream.seek(max(0, self._size - MAGIC_SIZE))
+                self.cut_off = stream.read(MAGIC_SIZE) != MCAP0_MAGIC
+                if self._size <= MAGIC_SIZE or (self.cut_off and not begins):
                     raise UserError(f"{self.path} is no MCAP recording")
-                self.cut_off = ends[1] != MCAP0_MAGIC
                 yield from self._walk(stream)
         except OSError as error:
             raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None

@@ -17,16 +17,7 @@ import msgspec
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import (
-    DECODERS,
-    Heard,
-    Pace,
-    Scene,
-    decode,
-    images_of,
-    is_picture,
-    period_of,
-)
+from bridge.messages import DECODERS, Heard, Pace, Scene, decode, images_of, is_picture, period_of
 from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.record import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of

@@ -176,7 +176,7 @@ def read_steps(path: Path) -> Iterator[Step]:
 def _steps(recording: Recording) -> Iterator[Step]:
     """Every step that can be read."""
     path = recording.path
-    for channel, _, message in recording.messages():
+    for channel, message in recording.messages():
         if channel.topic != TOPIC:
             hint = f"`python -m bridge view {path}` shows one of the wire"
             raise UserError(f"{path}, with {channel.topic}, is no recording of a sitting; {hint}")
