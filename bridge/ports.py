@@ -64,7 +64,10 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
 class SimulatorPort:
     """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
 
-    def __init__(self, zenoh_session: zenoh.Session, vehicle_id: str) -> None:
+    def __init__(
+        self, zenoh_session: zenoh.Session, vehicle_id: str, tls: TlsFiles | None = None
+    ) -> None:
+        self._tls = tls
         self.session = secrets.token_hex(8)
         self.vehicle_id = vehicle_id
         self.edge_counts = EdgeCounts()
@@ -88,7 +91,9 @@ class SimulatorPort:
         self._declared.append(self._zenoh.declare_subscriber(own, hear))
 
     def publish_state(self, payload: bytes) -> None:
-        """Send an encoded state to the edge runtime (and to viewers)."""
+        """Send an encoded state to the edge runtime (and to viewers); UserError once expired."""
+        if self._tls is not None:
+            self._tls.require_valid(time.time())
         self._states.put(payload)
 
     def publish_scene(self, environment: Any, stamps: Scene) -> None:
@@ -102,6 +107,8 @@ class SimulatorPort:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
         while not self._edge_is_there():
+            if self._tls is not None:
+                self._tls.require_valid(time.time())
             if time.monotonic() >= give_up_s:
                 raise UserError(
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
@@ -166,7 +173,7 @@ def open_port(
         zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
     with (
         contextlib.closing(zenoh_session),
-        contextlib.closing(SimulatorPort(zenoh_session, vehicle_id)) as port,
+        contextlib.closing(SimulatorPort(zenoh_session, vehicle_id, tls)) as port,
     ):
         yield port
 
@@ -177,6 +184,7 @@ class WireListener:
     def __init__(self) -> None:
         self.simulator_seen = threading.Event()
         self.dropped = 0
+        self.end_s = math.inf  # Unix time: its certificate's
         self._simulators: set[str] = set()
         self._queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
         self._zero_ns = time.time_ns() - time.monotonic_ns()
@@ -202,7 +210,7 @@ class WireListener:
         """
         now_s = seen_s = time.monotonic()
         end_s = math.inf if duration_s is None else now_s + duration_s
-        while now_s < end_s:
+        while now_s < end_s and time.time() < self.end_s:
             yield self.next(POLL_S)
             now_s = time.monotonic()
             if self._simulators:
@@ -254,6 +262,8 @@ def open_listener(
     with contextlib.ExitStack() as stack:
         session = stack.enter_context(contextlib.closing(connect_client(connect, wait_s, tls)))
         listener, keys = WireListener(), f"phil/{vehicle_id}"
+        if tls is not None:
+            listener.end_s = tls.expires.timestamp()
         for topic in DECODERS:
             # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
             hear = zenoh.handlers.Callback(listener.hear, indirect=False)
@@ -269,6 +279,8 @@ def open_listener(
                 which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
             raise UserError(f"no simulator{which} at {connect}; {hint}")
         yield listener
+        if tls is not None:
+            tls.require_valid(time.time())
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
@@ -311,14 +323,16 @@ def add_options(parser: Any, *names: str, **changes: Any) -> None:
         parser.add_argument(name, **{**OPTIONS[name], **changes})
 
 
-def wait_to_be_told() -> NoReturn:
-    """Sleep until KeyboardInterrupt (main thread only).
+def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
+    """Sleep until KeyboardInterrupt (main thread only); UserError when ``tls`` has expired.
 
     The kernel may hand a signal to any thread, one of Zenoh's too. That does not wake this thread
     from a lock, so it looks again now and then.
     """
     while True:
         time.sleep(RETRY_S)
+        if tls is not None:
+            tls.require_valid(time.time())
 
 
 def _add_router_arguments(parser: Any) -> None:
@@ -355,7 +369,7 @@ def _run_router(arguments: Any) -> int:
                 raise UserError(f"Zenoh opens no router with {arguments.config}: {error}") from None
         with contextlib.closing(session):
             print(f"ready {ready}", flush=True)
-            wait_to_be_told()
+            wait_to_be_told(tls)
     return 0
 
 

@@ -21,10 +21,11 @@ import zenoh
 from edge_runtime import __version__, log
 from edge_runtime.transport import LEASE_MS, only_own
 from edge_runtime.util import UserError
-from edge_runtime.wire import Health, Message, encode, key
+from edge_runtime.wire import Health, Message, Rejection, encode, key
 
 if TYPE_CHECKING:
     from edge_runtime.manifest import Manifest
+    from edge_runtime.reach import Listener
 
 OpenClient = Callable[[], zenoh.Session]
 
@@ -46,6 +47,8 @@ class Link:
         self._declared: List[Any] = []
         self._presence: Optional[Presence] = None
         self.gave_way = False  # another runtime speaks for this vehicle
+        self.listener: Optional[Listener] = None
+        self._stop: Callable[[], None] = lambda: None
         self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
             topic: session.declare_publisher(
@@ -93,8 +96,10 @@ class Link:
     def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
         """Show that it is alive, and look for others with this vehicle id.
 
-        To an elder one this one gives way: it sends nothing more, and `stop` is called.
+        To an elder one this one gives way: it sends nothing more, and `stop` is called. That is
+        called, too, when its certificate has expired.
         """
+        self._stop = stop
 
         def give_way() -> None:
             self.gave_way = True
@@ -102,6 +107,7 @@ class Link:
 
         alive = key(self.vehicle_id, "alive")
         self._presence = Presence(self._session, alive, open_client, give_way)
+        self._presence.listener = self.listener
         self._declared.append(self._presence)
         self._presence.thread.start()
 
@@ -114,10 +120,16 @@ class Link:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
         if self.gave_way:
             return
+        if self.listener and time.time() >= self.listener.own_until_s:
+            self._stop()
         try:
             self._publishers[topic].put(encode(message))
         except zenoh.ZError as error:
             log.event("error", "not_sent", topic=topic, detail=error)
+
+    def refusal(self, now_s: float) -> Optional[Rejection]:
+        """Why no state is taken at this Unix time, whatever it says."""
+        return self.listener.refusal(now_s) if self.listener else None
 
     def close(self) -> None:
         """Undeclare all, the token first, then close the session (it hangs at exit otherwise)."""
@@ -184,6 +196,7 @@ class Presence:
         self, session: zenoh.Session, alive_key: str, open_client: OpenClient, give_way: Callable
     ) -> None:
         self.rivals = 0
+        self.listener: Optional[Listener] = None
         self._session, self._key, self._open_client = session, alive_key, open_client
         self._give_way: Optional[Callable] = give_way
         self._known: Set[str] = set()
@@ -200,6 +213,8 @@ class Presence:
         before, self._routers = self._routers, self._seen_routers()
         if not self._routers or self._routers == before:
             return False
+        if self.listener:
+            self.listener.look()  # before anybody sees the tokens, and sends
         tokens, self._tokens = self._tokens, []
         for token in tokens:
             token.undeclare()
@@ -252,6 +267,8 @@ class Presence:
                 if self.refresh():
                     next_look_s = time.monotonic() + _FIRST_LOOKS_S
                 if self._routers and time.monotonic() >= next_look_s:
+                    if self.listener and self.listener.refusal(time.time()):
+                        self.listener.look()
                     self.look()
                     pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
                     next_look_s = time.monotonic() + pause_s

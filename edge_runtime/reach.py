@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import socket
 import ssl
 from typing import TYPE_CHECKING, Any, List, Optional, Tuple
 
 from edge_runtime.util import UserError
+from edge_runtime.wire import Reason, Rejection
 
 if TYPE_CHECKING:
     from edge_runtime.tls import TlsFiles
@@ -74,8 +76,7 @@ def _why_not_plain(plain: socket.socket) -> str:
 
 def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
     try:
-        context = ssl.create_default_context(cafile=files.ca)
-        context.load_cert_chain(files.certificate, files.key)
+        context = _context(files)
     except OSError as error:  # They may be replaced at this moment.
         return f"cannot be asked with the certificate of {files.name}: {error.strerror or error}"
     shaken = False
@@ -95,6 +96,52 @@ def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
     except OSError:  # A link that stays open, and silent, has been accepted.
         return "" if shaken else "answers, but not with TLS"
     return ""
+
+
+def _context(files: TlsFiles) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
+    context.load_verify_locations(files.ca)
+    context.load_cert_chain(files.certificate, files.key)
+    return context
+
+
+class Listener:
+    """The far end of a TLS link, and until when its certificate and our own hold.
+
+    Zenoh closes a link when the far end's expires, and opens it again within 0.2 s: TLS believes
+    the certificate to the end of the second, and the new link stays. One over QUIC does not.
+    """
+
+    def __init__(self, endpoint: str, files: TlsFiles) -> None:
+        self._endpoint, self._files, self.own_until_s = endpoint, files, files.expires.timestamp()
+        self._until_s, self._why = -math.inf, "has not been seen yet"
+        self.look()
+
+    def refusal(self, now_s: float) -> Optional[Rejection]:
+        """Why its states are not taken, at this Unix time."""
+        if now_s >= self.own_until_s:
+            return Rejection(Reason.CERTIFICATE, f"our own, of {self._files.name}, has expired")
+        if now_s >= self._until_s:
+            return Rejection(Reason.CERTIFICATE, f"that of {self._endpoint} {self._why}")
+        return None
+
+    def look(self) -> None:
+        """See what it shows now; the last time counts on where it shows nothing."""
+        protocol, host, port = _parts(self._endpoint)
+        if protocol != "tls":
+            self._until_s = math.inf
+            return
+        try:
+            plain = socket.create_connection((host, port), timeout=_LOOK_S)
+            with plain, _context(self._files).wrap_socket(plain, server_hostname=host) as link:
+                shown: Any = link.getpeercert()
+        except ssl.SSLCertVerificationError as error:
+            self._until_s, self._why = -math.inf, f"is not believed here: {error.verify_message}"
+        except OSError:
+            pass
+        else:
+            self._until_s = ssl.cert_time_to_seconds(shown["notAfter"])
+            self._why = f"expired at {shown['notAfter']}"
 
 
 def check_port_is_free(endpoint: str) -> None:

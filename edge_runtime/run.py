@@ -184,6 +184,10 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         session = connected(mode="peer")
         undo.callback(session.close)  # An open one would hang the process at its exit.
         link = Link(session, config.vehicle_id, policy.manifest)
+        if tls is not None:
+            from edge_runtime.reach import Listener
+
+            link.listener = Listener(config.connect, tls)
         runner: Optional[VehicleRunner] = None
         if vehicle is not None:
             from edge_runtime.vehicles.base import VehicleRunner
@@ -254,6 +258,8 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         raise failures[0]
     if link.gave_way:
         raise taken(config.vehicle_id)
+    if tls is not None:
+        tls.require_valid(time.time())
     return ended
 
 

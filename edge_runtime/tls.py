@@ -30,7 +30,12 @@ class TlsFiles(NamedTuple):
     certificate: str
     key: str
     name: str  # the certificate's common name, as in `edge-hunter01`: access control goes by it
-    expires: datetime.datetime  # UTC
+    expires: datetime.datetime  # UTC: the certificate, or its authority before it
+
+    def require_valid(self, now_s: float) -> None:
+        """Raise UserError where it has expired, Unix time: Zenoh looks at the far end's only."""
+        if now_s >= self.expires.timestamp():
+            raise UserError(f"{self.certificate} expired at {self.expires:%Y-%m-%d %H:%M} UTC")
 
     def zenoh_rows(self) -> Dict[str, Any]:
         """Zenoh's `transport/link/tls`: mutual, names verified, links closed when they expire."""
@@ -101,7 +106,7 @@ def load_tls(directory: PathLike) -> TlsFiles:
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
     paths = (str(ca_path), str(path), str(key_path))
-    return TlsFiles(*paths, name, certificate.not_valid_after_utc)
+    return TlsFiles(*paths, name, min(each.not_valid_after_utc for each in certificates.values()))
 
 
 def read_private_key(path: PathLike) -> Any:

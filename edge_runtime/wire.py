@@ -73,6 +73,7 @@ class Reason(str, Enum):
     DUPLICATE = "duplicate"
     FOREIGN_SESSION = "foreign_session"
     FUTURE = "future"
+    CERTIFICATE = "certificate"  # the far end's has expired, or our own
 
 
 class Rejection(NamedTuple):

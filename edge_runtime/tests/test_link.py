@@ -1,8 +1,10 @@
 """The edge's end of the wire without a network: a session that only notes what is asked of it."""
 
 import contextlib
+import math
 import socket
 import socketserver
+import ssl
 import threading
 import time
 from datetime import datetime, timezone
@@ -13,16 +15,19 @@ from unittest.mock import MagicMock
 
 import pytest
 import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from edge_runtime import log, run
+from edge_runtime import log, reach, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.reach import free_endpoint, look
+from edge_runtime.reach import Listener, free_endpoint, look
 from edge_runtime.run import say_what_is_missing
 from edge_runtime.tests.harness import HEALTH, wait_until
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
+from edge_runtime.wire import Reason
 
 
 @pytest.fixture
@@ -74,6 +79,59 @@ def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, cla
     assert presence.rivals == rivals
 
 
+OWN_S = 250
+FILES = TlsFiles("ca", "cert", "key", "edge-a", datetime.fromtimestamp(OWN_S, timezone.utc))
+LOOKS = st.one_of(st.integers(0, 300), st.sampled_from(["gone", "not believed"]))
+"""The second of 1970 at which the certificate expires that a look finds, or what it finds else."""
+
+
+@settings(max_examples=1000, deadline=None)
+@given(st.lists(st.tuples(LOOKS, st.lists(st.floats(-10.0, 310.0)))))
+def test_states_are_taken_only_while_our_certificate_holds_and_the_one_seen_last(story):
+    disbelieved = ssl.SSLCertVerificationError()
+    disbelieved.verify_message = "of another authority"
+    found: Any = "gone"  # nobody is there yet
+
+    def connect(*_: Any, **__: Any) -> Any:
+        if found == "gone":
+            raise OSError(found)
+        return contextlib.nullcontext()
+
+    def shown() -> Any:
+        if found == "not believed":
+            raise disbelieved
+        return {"notAfter": time.strftime("%b %d %H:%M:%S %Y GMT", time.gmtime(found))}
+
+    link = contextlib.nullcontext(SimpleNamespace(getpeercert=shown))
+    context = SimpleNamespace(wrap_socket=lambda *_, **__: link)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reach, "_context", lambda files: context)
+        patch.setattr(reach.socket, "create_connection", connect)
+        listener = Listener("tls/board:7447", FILES)
+        until_s = -math.inf
+        for found, times_s in story:
+            if found != "gone":
+                until_s = found if isinstance(found, int) else -math.inf
+            listener.look()
+            for now_s in times_s:
+                refusal = listener.refusal(now_s)
+                assert (refusal is None) == (now_s < min(until_s, OWN_S))
+                assert refusal is None or refusal.reason is Reason.CERTIFICATE
+
+
+def test_a_listener_is_looked_at_before_the_tokens_are_shown_to_it(session):
+    presence = Presence(session, "k", lambda: session, lambda: None)
+    presence.listener = listener = MagicMock()
+    session.info.routers_zid.return_value = ["router"]
+    before = len(declared(session))
+    listener.look.side_effect = lambda: calls.append(len(declared(session)))
+    calls: List[int] = []
+    for routers in (["router"], ["router"], ["another"]):
+        session.info.routers_zid.return_value = routers
+        presence.refresh()
+    assert calls == [before, before + 4]
+
+
 def test_nobody_there_is_nobody_else(session):
     fail = MagicMock(side_effect=UserError("nobody answers"))
     presence = Presence(session, "k", fail, fail)
@@ -106,6 +164,18 @@ def test_a_link_that_gave_way_sends_nothing(session, link):
     for link.gave_way in (False, True):
         link.send("health", HEALTH)
     assert session.declare_publisher().put.call_count == 1
+
+
+def test_a_link_whose_own_certificate_has_expired_ends_the_run(session, link):
+    stop = MagicMock()
+    link.listener = SimpleNamespace(own_until_s=time.time() + 3600.0)
+    link.appear(lambda: session, stop)
+    link.send("health", HEALTH)
+    assert not stop.called
+    link.listener.own_until_s = time.time()
+    link.send("health", HEALTH)
+    assert stop.called
+    link.close()
 
 
 def test_only_a_query_by_its_own_name_re_arms(session, link):

@@ -192,6 +192,9 @@ class FakeLink:
     def declare(self, on_state: Any, *_: Any) -> None:
         self.state_comes = on_state
 
+    def refusal(self, now_s: float) -> None:
+        return None
+
     def send(self, topic: str, message: Any) -> None:
         self.sent[topic] = self.sent[topic][0] + 1, message
 

@@ -1,5 +1,7 @@
 """The table of rights as Zenoh will read it; that Zenoh obeys: hil_tests/tests/test_tls.py."""
 
+from datetime import datetime, timezone
+
 import pytest
 from cryptography.hazmat.primitives import serialization as form
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -72,6 +74,14 @@ def test_a_wrong_name_says_which_would_be_right():
         tls.check_name("viewer", tls.common_name(tls.ROUTER))
     with pytest.raises(UserError, match="vehicle id"):
         tls.common_name(tls.EDGE, "a/b")
+
+
+def test_a_certificate_is_valid_until_the_second_of_its_end():
+    ends = datetime(2026, 1, 2, tzinfo=timezone.utc)
+    files = tls.TlsFiles("ca.pem", "cert.pem", "key.pem", "edge-a", ends)
+    files.require_valid(ends.timestamp() - 0.001)
+    with pytest.raises(UserError, match=r"cert.pem expired at 2026-01-02"):
+        files.require_valid(ends.timestamp())
 
 
 SM2 = """-----BEGIN PRIVATE KEY-----

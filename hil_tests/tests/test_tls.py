@@ -2,18 +2,24 @@
 
 import contextlib
 import datetime
+import ipaddress
+import itertools
 import json
 import re
 import shutil
+import signal
+import threading
 import time
 from typing import Any
 
 import pytest
 import zenoh
+from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from bridge.__main__ import main as bridge
 from bridge.ports import SimulatorPort, open_listener
+from bridge.recording import Recording
 from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from deploy.__main__ import main as deploy
 from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
@@ -21,6 +27,7 @@ from edge_runtime import wire
 from edge_runtime.commands import ask
 from edge_runtime.reach import free_endpoint, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
+from edge_runtime.tests.policies import T
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -167,24 +174,147 @@ def test_a_listener_needs_its_own_servers_certificate(parties, who, host, mode, 
         open_session(connect=place, mode=mode, tls=load_tls(parties / as_whom))
 
 
-def test_a_link_ends_when_its_certificate_does(parties, endpoint, tmp_path):
-    folder = tmp_path / "edge-hunter01"
-    shutil.copytree(parties / "edge-hunter01", folder)
-    authority = read_authority(parties / "ca")
-    born = datetime.datetime.now(datetime.UTC) - CLOCK_SLACK
-    life = datetime.timedelta(seconds=2.0)
-    issued = issue(authority, folder.name, "edge", [], born + life, days=1)
+def short_lived(parties, folder, life_s):
+    """A party's files, named by their folder, whose certificate ends in so many seconds."""
+    shutil.copytree(parties / folder.name, folder)
+    born = datetime.datetime.now(datetime.UTC) - CLOCK_SLACK + datetime.timedelta(seconds=life_s)
+    hosts = [x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+    role = folder.name.partition("-")[0]
+    issued = issue(read_authority(parties / "ca"), folder.name, role, hosts, born, days=1)
     (folder / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
     (folder / "key.pem").write_bytes(_pem(issued.key))
+    return folder
+
+
+def expired_in(line, folder):
+    return line.startswith(f"error: {folder}/cert.pem expired at ")
+
+
+def test_a_link_ends_when_its_certificate_does(parties, endpoint, tmp_path):
+    folder = short_lived(parties, tmp_path / "edge-hunter01", 4.0)
     with session(endpoint, folder, "peer", rules_for_edge("hunter01")) as edge:
         assert edge.info.routers_zid()
-        wait_until(lambda: not edge.info.routers_zid(), "the end of the link", 7.0)
+        wait_until(lambda: not edge.info.routers_zid(), "the end of the link", 9.0)
     with pytest.raises(UserError, match="expired at"):
         load_tls(folder)
 
 
-def drive(port, answered, first_step):
+@contextlib.contextmanager
+def simulating(place, files):
+    """A simulator's end that sends a state each 50 ms, and the commands that come."""
+    commands: list[Any] = []
+    over = threading.Event()
+    with (
+        listener(place, files, rules_for_listener(["hunter01"])) as ours,
+        contextlib.closing(SimulatorPort(ours, "hunter01")) as port,
+    ):
+
+        def send():
+            for step in itertools.takewhile(lambda _: not over.wait(0.05), itertools.count()):
+                port.publish_state(wire.encode(make_state(step, session=port.session)))
+
+        port.hear("command", lambda payload: commands.append(wire.decode_command(payload)))
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield commands
+        finally:
+            over.set()
+            thread.join()
+
+
+def test_states_behind_an_expired_certificate_are_not_taken(parties, tmp_path):
+    """Also where the link stays: the clock of the edge's Python steps, that of Zenoh does not."""
+    place = free_endpoint("tls")
+    flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
+    files = short_lived(parties, tmp_path / "simulator-hunter01", 1800.0)
+    operator = load_tls(parties / "operator-hunter01")
+    inside = ("hil_tests.faults.inside", "edge_runtime", "run", *flags, "--vehicle", "mock")
+    edge = Process(*inside, ready="ready")
+    with contextlib.ExitStack() as ends, simulating(place, files) as commands:
+        ends.callback(edge.end)
+        wait_until(lambda: commands and commands[-1].mode == wire.DRIVE, "a drive")
+        edge.send(signal.SIGUSR1)
+        time.sleep(1.0)
+        stopped = len(commands)
+        for number in (signal.SIGUSR1, signal.SIGUSR2):  # It stays as it is, or holds again
+            edge.send(number)
+            time.sleep(0.5)
+            status = ask(place, "hunter01", "status", operator)
+            assert (status["mode"], status["needs_rearm"]) == ("safe_stop", True)
+            assert status["rejected"]["certificate"] >= 20
+            holds = number is signal.SIGUSR2
+            assert ask(place, "hunter01", "rearm", operator)["accepted"] is holds
+        assert {each.mode for each in commands[stopped : stopped + 5]} == {wire.SAFE_STOP}
+        wait_until(lambda: commands[-1].mode == wire.DRIVE, "the drive after the re-arm")
+        assert edge.end() == 0
+    assert any(f"that of {place} expired at" in line for _, line in edge.lines)
+
+
+def test_a_certificate_that_really_expires_stops_the_vehicle(parties, tmp_path):
+    """This listener does not end by itself. Zenoh closes the link, and mostly has it again."""
+    place = free_endpoint("tls")
+    flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
+    with EdgeProcess(*flags, "--vehicle", "mock") as edge:
+        files = short_lived(parties, tmp_path / "simulator-hunter01", 6.0)
+        ends_s = load_tls(files).expires.timestamp()
+        with simulating(place, files) as commands:
+            wait_until(lambda: time.time() > ends_s + 3.0, "the end of the certificate")
+        assert edge.end() == 0
+    drives = [each.sent_ns / 1e9 for each in commands if each.mode == wire.DRIVE]
+    assert len(drives) > 5
+    # Of a state that came before, and answered within T.
+    assert max(drives) < ends_s + 2 * T
+    modes = [line for line in edge.errors.splitlines() if " mode was=" in line]
+    assert "now=safe_stop" in modes[-1]
+    assert "waits_for_rearm" in edge.errors
+
+
+@pytest.mark.parametrize("vehicle", ["none", "mock"])
+def test_an_edge_ends_with_its_certificate(parties, tmp_path, vehicle):
+    place, files = free_endpoint("tls"), tmp_path / "edge-hunter01"
+    flags, answered = edge_flags(place, tmp_path, files), list[bytes]()
+    with (
+        listener(place, parties / "simulator-hunter01", rules_for_listener(["hunter01"])) as ours,
+        contextlib.closing(SimulatorPort(ours, "hunter01")) as port,
+    ):
+        short_lived(parties, files, 9.0)
+        with EdgeProcess(*flags, "--vehicle", vehicle) as edge:
+            drive(port, answered, 0, hears=True)
+            assert edge.wait() == 2
+        assert answered
+    *log, last = edge.errors.splitlines()
+    assert expired_in(last, files)
+    assert not [line for line in log if "Traceback" in line or "not_sent" in line]
+    again = run_command("run", *flags)
+    assert (again.returncode, expired_in(again.stderr, files)) == (2, True)
+
+
+def test_simulator_router_and_recorder_end_with_their_certificates(parties, tmp_path):
+    place, out = free_endpoint("tls"), tmp_path / "drive.mcap"
+    router = short_lived(parties, tmp_path / "router", 12.0)
+    files = [short_lived(parties, tmp_path / n, 9.0) for n in ("simulator-hunter01", "viewer")]
+    simulator, viewer = (["--connect", place, "--tls", str(folder)] for folder in files)
+    with (
+        BridgeProcess("router", "--listen", place, "--tls", str(router)) as hub,
+        BridgeProcess(
+            "simulate", "--env", SLOW_TOY, "--episodes", "999", *simulator, "--clock", "realtime"
+        ) as run,
+        EdgeProcess(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge,
+        BridgeProcess("record", "--out", str(out), *viewer) as recorder,
+    ):
+        for process, folder in zip((run, recorder, hub), (*files, router), strict=True):
+            assert process.wait() == 2
+            assert expired_in(process.errors.splitlines()[-1], folder), process.errors
+            assert "Traceback" not in process.errors
+        assert edge.end() == 0
+    assert Recording(out).trouble() == ""
+
+
+def drive(port, answered, first_step, hears=False):
     answered.clear()
+    if hears:
+        port.hear("command", answered.append)
     for step in range(first_step, first_step + 200):
         port.publish_state(wire.encode(make_state(step, session=port.session)))
         time.sleep(0.05)
