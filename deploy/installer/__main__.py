@@ -12,7 +12,6 @@ import argparse
 import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,15 +23,16 @@ from deploy.installer.layout import (
     POLICY,
     PUBLIC_KEY,
     Layout,
-    check_room,
     let_read_key,
     make_release,
+    read_state,
     why_not_whole,
     write_whole,
 )
 from deploy.installer.systemd import WAYS, Limits, NoService, choose, remember
 from deploy.installer.verify import (
     MANIFEST,
+    VERSION,
     Bundle,
     Manifest,
     UnhealthyError,
@@ -145,7 +145,7 @@ def _status(layout: Layout, service: NoService, as_json: bool) -> int:
         "vehicle_id": manifest.vehicle_id if manifest else "not known",
         "policy_id": manifest.policy_id if manifest else "not known",
         "service": service.describe(),
-        "trusts": key_name(layout.trusted.read_bytes()),
+        "trusts": key_name(read_public_key(str(layout.trusted))),
     }
     print(json.dumps(rows) if as_json else "\n".join(f"{k:<11} {v}" for k, v in rows.items()))
     return UNHEALTHY if fault else 0
@@ -162,7 +162,6 @@ class Installer:
         self._layout = layout
         self._service = service
         self._limits = limits
-        self._is_stopped = False
 
     def install(self, bundle_path: str, trust: str | None) -> str:
         """Install or upgrade; return the version. Nothing is written before the bundle is verified.
@@ -177,7 +176,7 @@ class Installer:
         _say(f"verified {version} for {bundle.manifest.vehicle_id}")
         check_fits(bundle.manifest.target)
         with layout.locked():
-            layout.tidy()
+            layout.make_ready()
             if not layout.trusted.exists():
                 write_whole(layout.trusted, key)
             self._unpack(bundle)
@@ -190,7 +189,7 @@ class Installer:
         if not layout.releases.is_dir():  # Before the lock, which would make the folder.
             raise UserError(f"nothing is installed in {layout.root}")
         with layout.locked():
-            layout.tidy()
+            layout.make_ready()
             version = layout.linked("previous")
             if version is None or version == layout.linked("current"):
                 raise UserError(f"{layout.root} holds no earlier release to go back to")
@@ -203,20 +202,12 @@ class Installer:
     def uninstall(self) -> None:
         """Stop the service and remove all that was installed, the trusted key last."""
         layout = self._layout
-        if not layout.releases.is_dir() and not layout.trusted.exists():
+        if not layout.trusted.is_file() and not layout.versions():
             raise UserError(f"nothing is installed in {layout.root}")
         with layout.locked():
             self._service.remove()
-            for name in ("current", "previous"):
-                layout.unlink(name)
-            layout.tidy()
-            for path in (layout.releases, layout.state):
-                shutil.rmtree(str(path), ignore_errors=True)
-            layout.trusted.unlink(missing_ok=True)
-            (layout.root / ".lock").unlink()
-        try:
-            layout.root.rmdir()
-        except OSError:
+            layout.remove_all()
+        if layout.root.exists():
             _say(f"{layout.root} stays: it holds what is not ours")
 
     def activate(self, version: str, is_new: bool) -> None:
@@ -225,31 +216,25 @@ class Installer:
         try:
             self._prove(version)
         except UnhealthyError as error:
-            if is_new and version not in (before, layout.linked("previous")):
-                layout.remove_release(version)
-            # It was stopped to be made again, and what was made does not run.
-            goes_on = "is stopped" if self._is_stopped else "goes on"
-            stays = f"{before} {goes_on}" if before else "nothing is installed"
+            if is_new:
+                layout.remove_unused(version)
+            stays = f"{before} goes on" if before else "nothing is installed"
             raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
         remember(self._service.name, layout.root)
         self._switch(version, before)
-        for other in layout.versions():
-            if other not in (layout.linked("current"), layout.linked("previous")):
-                layout.remove_release(other)
+        layout.remove_unused(*layout.versions())
 
     def _unpack(self, bundle: Bundle) -> None:
         layout, version = self._layout, bundle.manifest.version
-        if layout.release(version).is_dir():
-            fault = why_not_whole(layout.release(version))
+        folder = layout.release(version)
+        if os.path.lexists(str(folder)):
+            if version not in layout.versions():
+                raise UserError(f"{folder} is no release: move it away")
+            fault = why_not_whole(folder)
             if not fault:
                 _say(f"{version} lies here already, whole")
                 return
-            check_room(bundle, layout, layout.release(version))  # Before it is taken away
             _say(f"{version} lies here damaged ({fault}): made again")
-            if layout.linked("current") == version:
-                self._service.stop()
-                self._is_stopped = self._service.name != "none"
-            layout.remove_release(version)
         _say(f"unpacked {make_release(bundle, layout, self._service.group())}")
 
     def _prove(self, version: str) -> None:
@@ -275,64 +260,65 @@ class Installer:
             _say("trial: healthy, in a network of its own")
 
     def _switch(self, version: str, before: str | None) -> None:
-        layout, earlier = self._layout, self._layout.linked("previous")
-        try:
-            self._service.stop()
-            if before is not None and before != version:
-                layout.link("previous", before)
-            layout.link("current", version)
-            self._start(version)
-            write_whole(layout.served, version.encode())
-        # The old service is stopped: whatever goes wrong, somebody must start it again.
-        except (UserError, OSError, KeyboardInterrupt) as error:
-            why = str(error) or "interrupted"
-            _say(f"{version} is not healthy: {why}")
-            # Cut off between the rename and here, `current` is this very release already, and has
-            # not served yet.
-            served = layout.served.is_file() and layout.served.read_text() == version
-            good = before if before != version or served else earlier
-            with contextlib.ExitStack() as undisturbed:
-                # A second one would leave the board without a service.
-                take_signals(SIGNALS, signal.SIG_IGN, undisturbed)
-                self._go_back(version, good, earlier)
-            raise UnhealthyError(
-                f"release {version} was not healthy as a service,"
-                f" {f'went back to {good}' if good else 'nothing is installed'}: {why}"
-            ) from None
+        """Stop, switch and start; whatever goes wrong after the stop, start what was good.
 
-    def _start(self, version: str) -> None:
-        """Let the service run; the vehicle hears nothing of it until it is healthy."""
-        service = self._service
-        if service.name == "none":
-            return  # Whoever runs it could not be watched, nor perhaps be allowed to read the hold.
-        with self._layout.holding(service.group()):
+        Raises UserError or OSError where it cannot begin: the service was not stopped then.
+        """
+        layout, service, earlier = self._layout, self._service, self._layout.linked("previous")
+        # Cut off after the switch, `current` is this very release already, and has not served yet.
+        served = read_state(layout.served)
+        if served and not VERSION.fullmatch(served):
+            raise UserError(f"{layout.served} names no release: remove it")
+        good = before if before and (before != version or served == version) else earlier
+        write_whole(layout.served, served.encode())  # What is written later can be written.
+        with contextlib.ExitStack() as until_judged:
+            # The vehicle hears nothing of a release that is not proven. Whoever runs the service
+            # "none" could not be watched, nor perhaps be allowed to read the hold.
+            if service.name != "none":
+                until_judged.enter_context(layout.holding(service.group()))
             try:
-                service.start(self._layout.release(version))
-                service.watch(self._limits)
-            except BaseException:  # while the hold lasts, so that nothing unproven is ever heard
                 service.stop()
-                raise
+                if before not in (None, version):
+                    layout.link("previous", before)
+                layout.link("current", version)
+                service.prepare(layout.release(version))
+                service.start(layout.release(version))
+                service.watch(self._limits)
+                write_whole(layout.served, version.encode())
+            except BaseException as error:
+                # A second signal would leave the board without a service.
+                take_signals(SIGNALS, signal.SIG_IGN, until_judged)
+                why = str(error) or "interrupted"
+                _say(f"{version} is not healthy: {why}")
+                self._go_back(version, good, earlier)
+                raise UnhealthyError(
+                    f"release {version} was not healthy as a service,"
+                    f" {f'went back to {good}' if good else 'nothing is installed'}: {why}"
+                ) from None
 
     def _go_back(self, version: str, good: str | None, earlier: str | None) -> None:
-        layout = self._layout
-        if good is None:
-            self._service.remove()
-            layout.unlink("current")
-            layout.remove_release(version)
-            return
-        self._service.stop()
-        layout.link("current", good)
-        if earlier is not None and earlier != good:
-            layout.link("previous", earlier)
-        else:
-            layout.unlink("previous")
-        if version not in (good, earlier):  # One that has served stays, to be gone back to again.
-            layout.remove_release(version)
+        layout, service = self._layout, self._service
         try:
-            self._start(good)
-        except UnhealthyError as error:
+            # Each step whatever becomes of the others, in the reverse order: the start is the last.
+            with contextlib.ExitStack() as steps:
+                if good is None:
+                    steps.callback(layout.remove_unused, version)
+                    steps.callback(layout.link, "current", None)
+                    steps.callback(service.remove)
+                    return
+                steps.callback(service.start, layout.release(good))
+                steps.callback(service.prepare, layout.release(good))
+                if version not in (good, earlier):  # One that has served can be gone back to again.
+                    steps.callback(layout.remove_unused, version)
+                steps.callback(layout.link, "previous", earlier if earlier != good else None)
+                if layout.linked("current") != good:
+                    # `previous` is that link by now, which needs no room on a full disk.
+                    steps.callback(os.replace, layout.root / "previous", layout.root / "current")
+                steps.callback(service.stop)
+            service.watch(self._limits)
+        except Exception as error:
             raise UnhealthyError(
-                f"{version} was not healthy, nor is {good} again: {error}"
+                f"{version} was not healthy, nor is {good or 'the board'} as before: {error}"
             ) from None
 
 
@@ -354,7 +340,8 @@ def trusted_key(layout: Layout, trust: str | None) -> bytes:
 
 def _say(text: str) -> None:
     try:
-        print(text, flush=True)
+        with contextlib.suppress(ValueError):  # a name that has no letters here
+            print(text, flush=True)
     except OSError:
         # A reader that is gone, as an ssh link that broke, must not keep us from going back. What
         # is left of the line would fail again at the next flush.

@@ -4,11 +4,13 @@ ROOT/trusted.pub            the key that this board trusts; never taken from a b
 ROOT/releases/VERSION/      whole releases only: made beside, named when all of it is on the disk
 ROOT/current -> releases/V  what the service runs; changed by one rename
 ROOT/previous -> releases/V where `rollback` goes
+ROOT/state/                 the files of STATE
 ROOT/.lock                  one installer at a time
 ROOT/releases/.making-*     what a run that was cut off left; the next run removes it
 
-A release holds what the bundle holds (manifest.json, install.pyz, policy.*, config.toml, tls/,
-units/), and besides
+A release is a folder with our manifest. Whatever else lies there is not ours, and stays. A release
+holds what the bundle holds (manifest.json, install.pyz, policy.*, config.toml, tls/, units/), and
+besides
 
 site-packages/              the wheels, unpacked and compiled
 launch.py, bin/phil-edge    start the runtime with this Python and these packages alone
@@ -32,10 +34,10 @@ import time
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Iterator, TextIO
+from typing import BinaryIO, Iterator
 
-from deploy.installer.verify import Bundle
-from edge_runtime.util import UserError
+from deploy.installer.verify import MANIFEST, VERSION, Bundle, parse_manifest
+from edge_runtime.util import UserError, printable, read_bytes, read_json
 
 NO_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)  # What a damaged archive raises
 
@@ -43,6 +45,8 @@ DEFAULT_ROOT = "/opt/phil"
 SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
 WHEELS, TLS = "wheels/", "tls/"
 POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
+LINKS = ("current", "previous")
+STATE = HOLD, SERVED, WAY, UNITS = ("hold", "served", "way", "phil-units")
 _MAKING = ".making-"
 _HOLD_LIMIT_S = 2.0  # A runtime that asks whether it may send has the lock for microseconds
 _NOT_COMPILED = re.compile(f"/{SITE}/(.*/)?tests/")
@@ -68,59 +72,95 @@ class Layout:
         self.releases = self.root / "releases"
         self.trusted = self.root / "trusted.pub"
         self.state = self.root / "state"
-        self.hold = self.state / "hold"
-        self.served = self.state / "served"  # The release that was last found healthy
+        self.hold = self.state / HOLD
+        self.served = self.state / SERVED  # The release that was last found healthy
+        state = [self.state / name for name in STATE]
+        self._files = [*state, *map(_draft_of, state)]
 
     def release(self, version: str) -> Path:
         """The folder of a release."""
         return self.releases / version
 
     def making(self, version: str) -> Path:
-        """Where a release is made, or lies while it is taken away."""
+        """Where a release is made."""
         return self.releases / (_MAKING + version)
 
     def linked(self, name: str) -> str | None:
         """The version that `current` or `previous` names; None without one."""
         try:
-            version = os.path.basename(os.readlink(str(self.root / name)))
+            folder, version = os.path.split(os.readlink(str(self.root / name)))
         except OSError:
             return None
-        return version if self.release(version).is_dir() else None
+        ours = folder == "releases" and VERSION.fullmatch(version)
+        return version if ours and self.release(version).is_dir() else None
 
     def versions(self) -> list[str]:
-        """All whole releases, by name."""
-        if not self.releases.is_dir():
-            return []
-        return sorted(p.name for p in self.releases.iterdir() if not p.name.startswith("."))
+        """All releases, by name: folders with our manifest of it, and those that a link names."""
+        found = set(filter(None, map(self.linked, LINKS)))
+        for folder in self.releases.glob("*"):
+            with contextlib.suppress(UserError):
+                manifest = parse_manifest(read_bytes(folder / MANIFEST, "manifest", 1))
+                if manifest.version == folder.name and not folder.is_symlink():
+                    found.add(folder.name)
+        return sorted(found)
 
-    def link(self, name: str, version: str) -> None:
-        """Let `current` or `previous` name a release, in one step."""
+    def link(self, name: str, version: str | None) -> None:
+        """Let `current` or `previous` name a release, or nothing, in one step."""
         draft = self.root / f".{name}"
         draft.unlink(missing_ok=True)
-        os.symlink(os.path.join("releases", version), str(draft))
-        os.replace(str(draft), str(self.root / name))
+        if version is None:
+            (self.root / name).unlink(missing_ok=True)
+        else:
+            os.symlink(os.path.join("releases", version), str(draft))
+            os.replace(str(draft), str(self.root / name))
         sync_folder(self.root)
 
-    def unlink(self, name: str) -> None:
-        """Let `current` or `previous` name nothing."""
-        (self.root / name).unlink(missing_ok=True)
-        sync_folder(self.root)
+    def take_away(self, version: str) -> Path:
+        """Take its name from a release, so that no half of it ever bears it; where it is then."""
+        old = self.making(f"{version}.old")
+        remove_tree(old)
+        with contextlib.suppress(FileNotFoundError):
+            self.release(version).rename(old)
+            sync_folder(self.releases)
+        return old
 
-    def remove_release(self, version: str) -> None:
-        """Take a release away: first its name, so that no half of it ever bears it."""
-        draft = self.making(version)
-        remove_tree(draft)
-        self.release(version).rename(draft)
-        sync_folder(self.releases)
-        remove_tree(draft)
+    def remove_unused(self, *versions: str) -> None:
+        """Remove releases that no link names, as far as the disk lets us."""
+        for version in set(versions) - set(map(self.linked, LINKS)):
+            with contextlib.suppress(OSError):
+                remove_tree(self.take_away(version))
 
     def tidy(self) -> None:
         """Remove what a run that was cut off has left."""
         for path in (self.root / ".current", self.root / ".previous", _draft_of(self.trusted)):
-            path.unlink(missing_ok=True)
-        if self.releases.is_dir():
-            for path in self.releases.glob(f"{_MAKING}*"):
-                remove_tree(path)
+            with contextlib.suppress(OSError):
+                path.unlink()
+        for path in self.releases.glob(f"{_MAKING}*"):
+            remove_tree(path)
+
+    def make_ready(self) -> None:
+        """Tidy. Raise UserError where what is not ours bears a name that a switch gives."""
+        self.tidy()
+        links = [self.root / f"{dot}{name}" for name in LINKS for dot in ("", ".")]
+        for path in filter(os.path.lexists, map(str, (*links, *self._files))):
+            is_link = os.path.islink(path)
+            if not (is_link if Path(path) in links else os.path.isfile(path) and not is_link):
+                raise UserError(f"{path} is in the way: move it away")
+
+    def remove_all(self) -> None:
+        """Remove what is ours, the trusted key last. What else lies there stays."""
+        versions = self.versions()
+        for name in LINKS:
+            if (self.root / name).is_symlink():
+                self.link(name, None)
+        self.tidy()
+        self.remove_unused(*versions)
+        for path in (*self._files, self.trusted, self.root / ".lock"):
+            with contextlib.suppress(OSError):
+                path.unlink()
+        for folder in (self.state, self.releases, self.root):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
     @contextlib.contextmanager
     def holding(self, gid: int | None = None) -> Iterator[None]:
@@ -151,10 +191,9 @@ class Layout:
         """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            stream = self._open_lock(self.root / ".lock")
         except OSError as error:
             raise UserError(f"cannot write to {self.root}: {error.strerror}") from None
-        with stream:
+        with self._open_lock(self.root / ".lock") as stream:
             try:
                 fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -164,12 +203,16 @@ class Layout:
             yield
 
     @staticmethod
-    def _open_lock(path: Path, gid: int | None = None) -> TextIO:
-        """Open a file to lock that nobody else can read, but for the group `gid`."""
-        stream = open(str(path), "w")  # noqa: SIM115 - whoever locks it closes it
-        os.fchmod(stream.fileno(), 0o600 if gid is None else 0o640)
-        if gid is not None:
-            os.fchown(stream.fileno(), -1, gid)
+    def _open_lock(path: Path, gid: int | None = None) -> BinaryIO:
+        """Open a file to lock that nobody else can read, but for the group `gid`. UserError."""
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK  # Of a pipe: do not wait
+        try:
+            stream = open(os.open(str(path), flags, 0o600), "rb")  # noqa: SIM115 - the caller's
+            os.fchmod(stream.fileno(), 0o600 if gid is None else 0o640)
+            if gid is not None:
+                os.fchown(stream.fileno(), -1, gid)
+        except OSError as error:
+            raise UserError(f"{path} cannot be locked: {error.strerror}") from None
         return stream
 
 
@@ -189,6 +232,14 @@ def write_whole(path: Path, data: bytes) -> None:
     sync_folder(path.parent)
 
 
+def read_state(path: Path) -> str:
+    """The text of a small file; empty where there is none."""
+    try:
+        return read_bytes(path, "state file", 1).decode("utf-8", "replace")
+    except UserError:
+        return ""
+
+
 def sync_folder(folder: Path) -> None:
     """Put the names in a folder on the disk."""
     descriptor = os.open(str(folder), os.O_RDONLY | os.O_DIRECTORY)
@@ -199,9 +250,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder and all in it, if it is there."""
-    with contextlib.suppress(FileNotFoundError):
-        shutil.rmtree(str(path))
+    """Remove a folder and all in it, as far as it is there and the disk lets us."""
+    if path.is_dir():  # rmtree would wait for a pipe
+        shutil.rmtree(str(path), ignore_errors=True)
 
 
 def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
@@ -217,8 +268,10 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
         _fill(bundle, draft, folder, group)
         _write(draft / CONTENTS, json.dumps(hashes(draft), indent=0).encode())
         os.sync()
+        old = layout.take_away(version)  # a damaged one, if any
         draft.rename(folder)
         sync_folder(layout.releases)
+        remove_tree(old)
     except (OSError, UserError) as error:
         remove_tree(draft)
         if isinstance(error, OSError):
@@ -230,19 +283,24 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
 def why_not_whole(folder: Path) -> str:
     """What is missing or changed in a release; empty where every file is as it was made."""
     try:
-        wanted = dict(json.loads((folder / CONTENTS).read_bytes()))
-    except (OSError, TypeError, ValueError):
+        wanted = read_json(folder / CONTENTS, "list")
+    except UserError:
         return f"{CONTENTS} cannot be read"
     found = hashes(folder)
     wrong = sorted(p for p in wanted.keys() | found.keys() if wanted.get(p) != found.get(p))
-    return f"{len(wrong)} files are missing or changed, {wrong[0]} first" if wrong else ""
+    return (
+        printable(f"{len(wrong)} files are missing or changed, {wrong[0]} first") if wrong else ""
+    )
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a release but `contents.json`, by path."""
+    """SHA-256 of every file below a release but `contents.json`, by path; empty of no file."""
     found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if not p.is_dir()}
     found.pop(CONTENTS, None)
-    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()}
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for name, path in found.items()
+    }
 
 
 def unpack_wheel(data: bytes, name: str, site: Path) -> None:
@@ -311,11 +369,10 @@ def _write(path: Path, data: bytes, mode: int = 0o644) -> None:
     os.chmod(str(path), mode)
 
 
-def check_room(bundle: Bundle, layout: Layout, replaced: Path | None = None) -> None:
-    """Unpacked and compiled, wheels take some four times their size. UserError; `replaced` goes."""
+def check_room(bundle: Bundle, layout: Layout) -> None:
+    """Unpacked and compiled, wheels take some four times their size. UserError."""
     needed = 5 * sum(map(len, bundle.files.values()))
     free = shutil.disk_usage(str(layout.releases)).free
-    free += sum(path.lstat().st_size for path in replaced.rglob("*")) if replaced else 0
     if free < needed:
         raise UserError(
             f"not enough room in {layout.root}: {needed // 10**6} MB are needed,"

@@ -7,7 +7,6 @@ its own. Whatever is wrong with it, the vehicle gets no command from it.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pwd
 import re
@@ -17,7 +16,16 @@ import time
 from pathlib import Path
 from typing import Callable, NamedTuple
 
-from deploy.installer.layout import CONFIG, DEFAULT_ROOT, LAUNCHER, TLS, write_whole
+from deploy.installer.layout import (
+    CONFIG,
+    DEFAULT_ROOT,
+    LAUNCHER,
+    TLS,
+    UNITS,
+    WAY,
+    read_state,
+    write_whole,
+)
 from deploy.installer.verify import UnhealthyError
 from edge_runtime.util import UserError
 
@@ -26,9 +34,9 @@ USER = "phil"
 WAYS = ("systemd", "none")
 UNIT_FOLDER = Path("/etc/systemd/system")
 _BOOTED = Path("/run/systemd/system")
-_WAY = "way"
 _FITS_A_UNIT = re.compile(r"[A-Za-z0-9._+@/-]+")
 """Spaces would cut a unit's line in two, and a % would be a specifier (systemd.unit(5))."""
+_UNIT = re.compile(r"(?m)^[A-Za-z0-9][A-Za-z0-9@._-]*$")
 _NOWHERE = "127.0.0.1:9"
 """The discard port: nobody listens there, and in a network of its own nobody can."""
 _TRIAL_STOP_S = 3.0
@@ -57,8 +65,11 @@ class NoService:
     def stop(self) -> None:
         """End the service; nothing where there is none."""
 
+    def prepare(self, release: Path) -> None:
+        """Put in place what starts a release, now and at every boot."""
+
     def start(self, release: Path) -> None:
-        """Start the service of a release, now and at every boot."""
+        """Start the service of a release."""
 
     def watch(self, limits: Limits) -> None:
         """Raise UnhealthyError unless it is active within the limit and stays so for a while."""
@@ -68,7 +79,7 @@ class NoService:
         return "not run by the installer"
 
     def remove(self) -> None:
-        """Stop it and take away what `start` has made."""
+        """Stop it and take away what `prepare` has made."""
 
 
 class Systemd(NoService):
@@ -79,7 +90,7 @@ class Systemd(NoService):
     def __init__(self, root: Path, unit_folder: Path = UNIT_FOLDER) -> None:
         self._root = str(root)
         self._unit_folder = unit_folder
-        self._list = root / "state" / "phil-units"
+        self._list = root / "state" / UNITS
 
     def group(self) -> int | None:
         """The group of the service's user, made where missing: no rights, no home, no shell."""
@@ -94,6 +105,7 @@ class Systemd(NoService):
 
         `systemd-run` waits for READY=1, and systemd kills what does not say WATCHDOG=1.
         """
+        self._units(folder)
         protocol = "tls" if (folder / TLS).is_dir() else "tcp"
         with tempfile.TemporaryDirectory(prefix="phil-trial-") as place:
             log = Path(place) / "log"
@@ -134,12 +146,9 @@ class Systemd(NoService):
         if (self._unit_folder / MAIN_UNIT).exists():
             _run("systemctl", "stop", MAIN_UNIT)
 
-    def start(self, release: Path) -> None:
-        """As `NoService`: install the release's units first."""
-        paths = sorted((release / "units").glob("*.*"))
-        units = {path.name: path.read_text().replace(DEFAULT_ROOT, self._root) for path in paths}
-        if MAIN_UNIT not in units:
-            raise UnhealthyError(f"the bundle holds no {MAIN_UNIT}")
+    def prepare(self, release: Path) -> None:
+        """As `NoService`: install the release's units."""
+        units = self._units(release)
         self._forget(set(units))
         write_whole(self._list, "".join(f"{name}\n" for name in units).encode())
         for name, text in units.items():
@@ -148,6 +157,9 @@ class Systemd(NoService):
         for name, text in units.items():
             if "[Install]" in text:
                 _run("systemctl", "enable", name)
+
+    def start(self, release: Path) -> None:
+        """As `NoService`."""
         _run("systemctl", "reset-failed", MAIN_UNIT, check=False)
         _run("systemctl", "start", MAIN_UNIT)
 
@@ -167,14 +179,22 @@ class Systemd(NoService):
         self._list.unlink(missing_ok=True)
         _run("systemctl", "daemon-reload")
 
+    def _units(self, release: Path) -> dict[str, str]:
+        """The text of a release's units by name, for this root. UnhealthyError without the main."""
+        paths = sorted((release / "units").glob("*.*"))
+        units = {path.name: path.read_text().replace(DEFAULT_ROOT, self._root) for path in paths}
+        if MAIN_UNIT not in units:
+            raise UnhealthyError(f"the bundle holds no {MAIN_UNIT}")
+        return units
+
     def _end_trial(self) -> None:
         for verb in ("stop", "reset-failed"):
             _run("systemctl", verb, TRIAL_UNIT, check=False)
 
     def _forget(self, kept: set[str]) -> None:
         """Take away the units of an earlier release that are not among those kept."""
-        names = self._list.read_text().split() if self._list.exists() else []
-        for name in sorted(set(names) - kept):
+        names = set(_UNIT.findall(read_state(self._list)))
+        for name in sorted(names - kept):
             _run("systemctl", "disable", "--now", name, check=False)
             (self._unit_folder / name).unlink(missing_ok=True)
 
@@ -211,9 +231,7 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
     if way == "systemd" and not is_there():
         # Before it makes a user and unpacks for a start that cannot come.
         raise UserError("--service systemd: no systemd runs this computer; use --service none")
-    kept = None
-    with contextlib.suppress(OSError, ValueError):
-        kept = (root / "state" / _WAY).read_text()
+    kept = read_state(root / "state" / WAY)
     if (way, kept) == ("none", "systemd") and is_there() and not only_look:
         raise UserError("systemd runs this board: leave --service out, or `uninstall` first")
     if way is None:
@@ -229,7 +247,7 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
 
 def remember(way: str, root: Path) -> None:
     """Keep the way, so that `status` and `rollback` need not be told."""
-    write_whole(root / "state" / _WAY, way.encode())
+    write_whole(root / "state" / WAY, way.encode())
 
 
 def _is_active(unit: str) -> bool:

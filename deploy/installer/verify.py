@@ -35,7 +35,7 @@ _ED25519 = bytes.fromhex("302a300506032b6570032100")
 _SSH_ED25519 = b"\0\0\0\x0bssh-ed25519\0\0\0\x20"
 """What stands before the same 32 bytes in a public key of OpenSSH (RFC 8709)."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+-]*(/[A-Za-z0-9_][A-Za-z0-9._+-]*)*")
-_VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
+VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
 
 
 class UnhealthyError(UserError):
@@ -160,7 +160,7 @@ def parse_manifest(data: bytes) -> Manifest:
             raise UserError(f"its format is {value['format']}, this installer reads {FORMAT}")
         names = ("version", "vehicle_id", "policy_id")
         manifest = Manifest(target=Target(**value["target"]), **{n: value[n] for n in names})
-        if not _VERSION.fullmatch(manifest.version):
+        if not VERSION.fullmatch(manifest.version):
             raise ValueError(manifest.version)
     except (ValueError, TypeError, KeyError, RecursionError):
         raise UserError("its manifest is not valid") from None

@@ -47,6 +47,8 @@ class ProcessService(NoService):
 
     def remove(self) -> None:
         self.stop()
+        for path in (self._pid, self._log):
+            path.unlink(missing_ok=True)
 
     def pid(self) -> int | None:
         """The process while it lives, and is no zombie of ours."""

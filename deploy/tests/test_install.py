@@ -442,26 +442,19 @@ def test_whatever_cuts_the_watch_off_the_old_release_runs_again(layout, monkeypa
     assert service.heard == []
 
 
-def test_a_current_release_that_cannot_be_made_again_serves_on_or_is_said_to_be_stopped(
-    layout, monkeypatch
-):
+def test_a_damaged_current_release_is_made_again_beside_the_service(layout, monkeypatch):
     bundle: Any = SimpleNamespace(manifest=SimpleNamespace(version=OLD), files={"a": b"1"})
     service = Service(layout, KeyboardInterrupt())
     service.start(layout.release(OLD))
+    board = installer.Installer(layout, service)
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
         with pytest.raises(UserError, match="not enough room"):
-            installer.Installer(layout, service)._unpack(bundle)
-    assert (layout.versions(), service.runs) == ([NEW, OLD], OLD)
-    layout.hold.touch()
-    monkeypatch.setattr(installer, "make_release", lambda *_: layout.release(OLD).mkdir())
-    expired = mock.Mock(side_effect=UnhealthyError("expired"))
-    monkeypatch.setattr(installer.Installer, "_prove", expired)
-    again = installer.Installer(layout, service)
-    again._unpack(bundle)
-    with pytest.raises(UnhealthyError, match=f"may not run here, {OLD} is stopped: expired"):
-        again.activate(OLD, is_new=True)
-    assert service.runs == ""
+            board._unpack(bundle)
+    assert why_not_whole(layout.release(OLD)) != ""
+    board._unpack(bundle)
+    assert (why_not_whole(layout.release(OLD)), service.runs) == ("", OLD)
+    assert not list(layout.releases.glob(".*"))
 
 
 def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout, monkeypatch):

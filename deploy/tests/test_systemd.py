@@ -137,7 +137,9 @@ def told(tmp_path) -> list[str]:
 def test_units_are_installed_enabled_started_and_taken_away(systemd, tmp_path):
     systemd.stop()
     assert told(tmp_path) == []  # there is no service yet
-    systemd.start(release(tmp_path / "one", MAIN_UNIT, "phil-can.service"))
+    one = release(tmp_path / "one", MAIN_UNIT, "phil-can.service")
+    systemd.prepare(one)
+    systemd.start(one)
     verbs = [f"{verb} {MAIN_UNIT}" for verb in ("enable", "reset-failed", "start")]
     assert told(tmp_path) == ["daemon-reload", *verbs]
     unit = (tmp_path / "etc" / MAIN_UNIT).read_text()
@@ -147,7 +149,7 @@ def test_units_are_installed_enabled_started_and_taken_away(systemd, tmp_path):
     systemd.stop()
     assert told(tmp_path) == [f"stop {MAIN_UNIT}"]
     # The next release has no unit for the bus any more.
-    systemd.start(release(tmp_path / "two", MAIN_UNIT))
+    systemd.prepare(release(tmp_path / "two", MAIN_UNIT))
     assert told(tmp_path)[0] == "disable --now phil-can.service"
     assert [p.name for p in (tmp_path / "etc").iterdir()] == [MAIN_UNIT]
     systemd.remove()
@@ -173,14 +175,28 @@ def test_a_start_that_systemd_or_a_bundle_refuses_is_said(systemd, tmp_path):
     (tmp_path / "s").write_text("refuse")
     with pytest.raises(UnhealthyError, match=r"systemctl start .* failed"):
         systemd.start(release(tmp_path / "one", MAIN_UNIT))
-    with pytest.raises(UnhealthyError, match=r"no phil-edge\.service"):
-        systemd.start(release(tmp_path / "two", "phil-can.service"))
+    told(tmp_path)
+    with pytest.raises(
+        UnhealthyError, match=r"no phil-edge\.service"
+    ):  # before anything is stopped
+        systemd.try_release(release(tmp_path / "two", "phil-can.service"), "abc", Limits())
+    assert told(tmp_path) == []
+
+
+def test_a_damaged_list_of_units_names_no_file_outside(systemd, tmp_path):
+    systemd.prepare(release(tmp_path / "one", MAIN_UNIT))
+    outside = tmp_path / "outside"
+    outside.touch()
+    (tmp_path / "state/phil-units").write_bytes(b"\xff\xfe\n../outside\n\0\n" + MAIN_UNIT.encode())
+    systemd.remove()
+    assert outside.exists()
+    assert list((tmp_path / "etc").iterdir()) == []
 
 
 def try_release(systemd, tmp_path, said: str, state: str = ACTIVE) -> list[str]:
     (tmp_path / "log.said").write_text(said)
     (tmp_path / "s").write_text(state)
-    systemd.try_release(tmp_path / "one", "abc", Limits(0.2, 0.1))
+    systemd.try_release(release(tmp_path / "one", MAIN_UNIT), "abc", Limits(0.2, 0.1))
     return told(tmp_path)
 
 
