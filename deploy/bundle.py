@@ -45,7 +45,7 @@ from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.policy import MAX_POLICY_MIB, Policy, load_policy
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_bytes
-from edge_runtime.vehicles import GROUP, vehicle_limits
+from edge_runtime.vehicles import GROUP, find_vehicle, vehicle_limits
 
 NAME = "install.pyz"
 EDGE_PACKAGE = "phil-edge-runtime"
@@ -203,10 +203,10 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
 def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
     """Raise UserError for a vehicle that the board could not load, or whose settings do not hold.
 
-    Those of another package's driver are not read: it need not be installed here.
+    Those of another package's driver are read where it is installed here, too: it need not be.
     """
     name, colon, _ = config.vehicle.partition(":")
-    if name in (NONE, *BUILT_IN):
+    if name in (NONE, *BUILT_IN) or (name in brought and _is_readable(name)):
         limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
         shared_limits(policy.manifest.action, limits)
     elif name + colon not in brought:
@@ -215,6 +215,14 @@ def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
             f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
             f" --with, or choose from {known}"
         )
+
+
+def _is_readable(name: str) -> bool:
+    """Whether a driver can be loaded here, and says its limits without being opened."""
+    try:
+        return hasattr(find_vehicle(name), "limits")
+    except UserError:
+        return False
 
 
 def _drivers_in(path: Path) -> set[str]:

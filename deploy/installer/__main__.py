@@ -310,9 +310,10 @@ class Installer:
                 steps.callback(service.prepare, layout.release(good))
                 if version not in (good, earlier):  # One that has served can be gone back to again.
                     steps.callback(layout.remove_unused, version)
+                steps.callback(layout.link, "current", good)
                 steps.callback(layout.link, "previous", earlier if earlier != good else None)
                 if layout.linked("current") != good:
-                    # `previous` is that link by now, which needs no room on a full disk.
+                    # `previous` is that link by now, which needs no room on a full disk, else made.
                     steps.callback(os.replace, layout.root / "previous", layout.root / "current")
                 steps.callback(service.stop)
             service.watch(self._limits)

@@ -108,6 +108,8 @@ class Layout:
         """Let `current` or `previous` name a release, or nothing, in one step."""
         draft = self.root / f".{name}"
         draft.unlink(missing_ok=True)
+        if version is not None and self.linked(name) == version:
+            return
         if version is None:
             (self.root / name).unlink(missing_ok=True)
         else:

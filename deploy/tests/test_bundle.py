@@ -7,6 +7,7 @@ import random
 import shutil
 import stat
 import subprocess
+import sys
 import tarfile
 import zipfile
 from pathlib import Path
@@ -159,6 +160,8 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
         ('vehicle = "tank"', "in no wheel of the bundle: .*--with, or choose from none, mock, hu"),
         ('vehicle = "carts:Cart"', "'carts:Cart' is in no wheel"),
         ('[vehicle]\ndriver = "hunter"\nhunter.speed = 3', "vehicle.hunter: .*unknown field"),
+        ('[vehicle]\ndriver = "hunter"\nhunter.bus = "can0"', "bus 'can0'"),
+        ('[vehicle]\ndriver = "mock"\nmock.slew_per_s = -1.0', "slew_per_s -1.0"),
         ("no toml", "is no TOML"),
         ("\udcff", "is no TOML"),
     ],
@@ -170,7 +173,9 @@ def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text, match):
         workshop.make(config=config)
 
 
-def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(workshop, board, tmp_path):
+def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(
+    workshop, board, tmp_path, monkeypatch
+):
     words = ("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path))
     built = ("build", "*.egg-info")  # What pip left there would be packed, too.
     source, ignored = tmp_path / "my_vehicle", shutil.ignore_patterns(*built)
@@ -196,6 +201,16 @@ def test_a_drivers_wheel_is_packed_summed_and_installed_with_the_rest(workshop, 
         config.write_text(f'vehicle = "{vehicle}"\n')
         with pytest.raises(UserError, match="in no wheel"):
             workshop.make(wheels=inputs, config=config)
+    text = f'connect = "{workshop.endpoint}"\n[vehicle]\ndriver = "rover"\nrover.adress = "a:1"\n'
+    config.write_text(text)
+    workshop.make(wheels=inputs, config=config)  # not installed here, so nobody can tell
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(str(wheel))
+        with pytest.raises(UserError, match="'adress'; known are address"):
+            workshop.make(wheels=inputs, config=config)
+        config.write_text(text.replace("adress", "address"))
+        workshop.make(wheels=inputs, config=config)
+    sys.modules.pop("my_vehicle", None)
     with pytest.raises(UserError, match="the bundle has another my_vehicle"):
         workshop.make(wheels=[*inputs, wheel])
 

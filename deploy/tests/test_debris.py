@@ -62,7 +62,9 @@ KINDS: dict[str, Callable[[Path, Path], Any]] = {
     "link to itself": lambda path, outside: path.symlink_to(path.name),
     "link outside": lambda path, outside: path.symlink_to(outside),
     "pipe": lambda path, outside: os.mkfifo(path),
-    "copy of a release": lambda path, outside: shutil.copytree(outside / OLD, path),
+    "copy of a release": lambda path, outside: shutil.copytree(
+        outside.parent / f"spare/releases/{OLD}", path
+    ),
 }
 
 
@@ -231,7 +233,7 @@ def test_among_debris_a_whole_release_runs_and_nothing_foreign_is_gone(
                 make_release(bundle_of(version), layout, None)
             spare = Layout(str(Path(place) / "spare"))
             spare.releases.mkdir(parents=True)
-            make_release(bundle_of(OLD), spare, None).rename(outside / OLD)
+            make_release(bundle_of(OLD), spare, None)
             if is_installed:
                 layout.link("current", OLD)
                 layout.link("previous", EARLIER)
@@ -253,7 +255,13 @@ def test_among_debris_a_whole_release_runs_and_nothing_foreign_is_gone(
                 if place in STATE_FILES or not os.path.lexists(root / place):
                     lay(root / place, kind, outside)
 
-        before = {place: seen(root / place) for place, kind in laid if is_foreign(place, kind)}
+        # A file with a name of ours, in a folder that is not ours, is ours.
+        foreign = [
+            f"{one}/within" if kind == "folder" else one
+            for one, kind in laid
+            if is_foreign(one, kind)
+        ]
+        before = {place: seen(root / place) for place in foreign}
         kept_outside = seen(outside)
         number, what = trouble or (10**9, None)
         with at_step(number, root, act, once=what != "full"):

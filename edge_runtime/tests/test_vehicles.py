@@ -136,6 +136,25 @@ def test_limits_that_bound_nothing_are_refused_wherever_they_are_read(limit, mon
         vehicle_limits("carts:Unknown", {}, a_manifest())
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
+        ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`"),
+        ("mock", {"slew_per_s": -1.0}, "slew_per_s -1.0 .*above 0"),
+        ("hunter", {"bus": "can0"}, "bus 'can0'.*INTERFACE:CHANNEL"),
+        ("hunter", {"profile": "v9"}, "vehicle.hunter.profile 'v9'"),
+        ("ros2", {"connect": "nowhere"}, "endpoint 'nowhere'"),
+        ("ros2", {"twist_topic": "a b"}, "topic 'a b'"),
+    ],
+)
+def test_a_wrong_setting_is_found_without_opening_anything(name, settings, words):
+    with pytest.raises(UserError, match=words):
+        vehicle_limits(name, {name: settings}, a_manifest())
+    opens = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
+    vehicle_limits(name, {name: opens.get(name, {})}, a_manifest())
+
+
 def test_a_driver_of_another_package_gets_its_own_table():
     tables = {"milk_cart": {"wheels": 3}, "cart": {"wheels": 2}, "other": {"speed": 1}}
     for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):

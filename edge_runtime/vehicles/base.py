@@ -70,12 +70,7 @@ class Vehicle(abc.ABC):
         By default they are the constructor's arguments. Raises UserError for settings that are
         not valid, and where what it hangs on cannot be opened.
         """
-        known = inspect.signature(cls)
-        try:
-            known.bind(**settings)
-        except TypeError as error:
-            names = ", ".join(known.parameters) or "none"
-            raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
+        cls._check_names(settings)
         return cls(**settings)
 
     @classmethod
@@ -84,9 +79,21 @@ class Vehicle(abc.ABC):
 
         By default those of the class. Raises UserError where it has none, or as `open` does.
         """
+        if cls.open.__func__ is Vehicle.open.__func__:  # type: ignore[attr-defined]
+            cls._check_names(settings)
         if not hasattr(cls, "limits"):
             raise UserError(f"vehicle {cls.name}: what it lets an action be is not known unopened")
         return cls.limits
+
+    @classmethod
+    def _check_names(cls, settings: Mapping[str, Any]) -> None:
+        """Raise UserError for settings that are no arguments of the constructor."""
+        known = inspect.signature(cls)
+        try:
+            known.bind(**settings)
+        except TypeError as error:
+            names = ", ".join(known.parameters) or "none"
+            raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
 
     @abc.abstractmethod
     def enable(self, now_s: float) -> None:

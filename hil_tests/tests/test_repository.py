@@ -239,6 +239,7 @@ def test_examples_and_paragraphs_keep_their_lines():
 
 
 KINDS = ("*.md", "*/README.md", "docs/*.md")
+OWN_PAGES = ("own_environment", "own_policy", "own_vehicle")
 READMES = sorted({Path(name) for kind in KINDS for name in glob(kind, root_dir=ROOT)})
 
 
@@ -263,6 +264,24 @@ def test_links_and_kept_files_exist_and_nothing_is_left_to_fill_in(readme):
     for path in re.findall(r"\bresults/[\w./-]+\.(?:onnx|pub|json|csv|md)\b", text):
         assert (ROOT / path).exists(), path
     assert "<!--" not in text
+
+
+@pytest.mark.parametrize(
+    "readme", ["deploy/README.md", *(f"docs/{name}.md" for name in ("first_day", *OWN_PAGES))]
+)
+def test_what_a_page_leaves_in_this_folder_is_ignored(readme):
+    blocks = re.findall(r"(?ms)^ *```(?:sh|bash|toml)(.*?)^ *```", (ROOT / readme).read_text())
+    text = "\n".join(blocks)
+    made = re.findall(r"(?:--out|--vehicles|--with|> |cp -r \S+/|open\(')[ =]?([\w./-]+)", text)
+    assert made
+    # A folder is one by what is in it.
+    paths = [name if "." in name else f"{name}/x" for name in made]
+    asked = subprocess.run(
+        ["git", "check-ignore", "--no-index", *paths], cwd=ROOT, capture_output=True, text=True
+    )
+    if asked.returncode == 128:
+        pytest.skip("this is no git checkout")
+    assert set(paths) - set(asked.stdout.split()) == set()
 
 
 @pytest.mark.parametrize("readme", ["docs/first_day.md", "deploy/README.md"])

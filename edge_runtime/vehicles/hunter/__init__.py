@@ -196,6 +196,10 @@ class HunterSettings(RobotSettings, frozen=True, kw_only=True):
     bus: str = DEFAULT_BUS
     profile: str = DEFAULT_PROFILE
 
+    def __post_init__(self) -> None:
+        parse_bus(self.bus)
+        check_choice("vehicle.hunter.profile", self.profile, tuple(PROFILES))
+
 
 class HunterVehicle(StreamedVehicle):
     """Opens its bus when made (UserError where it cannot), and sends nothing before `enable`."""
@@ -204,14 +208,13 @@ class HunterVehicle(StreamedVehicle):
     settings_type: ClassVar[Type[RobotSettings]] = HunterSettings
 
     def __init__(self, settings: HunterSettings, similarity: Similarity) -> None:
-        bus, profile = parse_bus(settings.bus), settings.profile
-        check_choice("vehicle.hunter.profile", profile, tuple(PROFILES))
+        bus = parse_bus(settings.bus)
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
         # Our own frames come back there: a command need not be somebody else's.
         self._ignores_commands = bus.interface == "udp_multicast"
         self._core: HunterCore
-        super().__init__(HunterCore(similarity, profile))
+        super().__init__(HunterCore(similarity, settings.profile))
         self._stopping = False
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
         self._stream.start()

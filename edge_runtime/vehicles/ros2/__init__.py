@@ -78,6 +78,9 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
     odometry_topic: str = "odom"
     odometry_angular: str = YAW_RATE
 
+    def __post_init__(self) -> None:
+        check_settings(self)
+
 
 def check_settings(settings: Ros2Settings) -> None:
     """Raise UserError where the settings are not valid, or name nothing to be driven by."""
@@ -192,7 +195,6 @@ class Ros2Vehicle(StreamedVehicle):
     settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings
 
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
-        check_settings(settings)
         from edge_runtime.vehicles.ros2 import node as ros
 
         self._core: Ros2Core
