@@ -180,7 +180,7 @@ class Installer:
             if not layout.trusted.exists():
                 write_whole(layout.trusted, key)
             self._unpack(bundle)
-            self.activate(version, is_new=True)
+            self.activate(version)
         return version
 
     def rollback(self) -> str:
@@ -196,7 +196,7 @@ class Installer:
             fault = why_not_whole(layout.release(version))
             if fault:
                 raise UserError(f"release {version} is damaged: {fault}")
-            self.activate(version, is_new=False)
+            self.activate(version)
         return version
 
     def uninstall(self) -> None:
@@ -210,14 +210,13 @@ class Installer:
         if layout.root.exists():
             _say(f"{layout.root} stays: it holds what is not ours")
 
-    def activate(self, version: str, is_new: bool) -> None:
+    def activate(self, version: str) -> None:
         """Prove a release, let the service run it, and go back where it is not healthy."""
         layout, before = self._layout, self._layout.linked("current")
         try:
             self._prove(version)
         except UnhealthyError as error:
-            if is_new:
-                layout.remove_unused(version)
+            layout.remove_unused(version)
             stays = f"{before} goes on" if before else "nothing is installed"
             raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
         remember(self._service.name, layout.root)

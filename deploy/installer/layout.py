@@ -108,11 +108,9 @@ class Layout:
         """Let `current` or `previous` name a release, or nothing, in one step."""
         draft = self.root / f".{name}"
         draft.unlink(missing_ok=True)
-        if version is not None and self.linked(name) == version:
-            return
         if version is None:
             (self.root / name).unlink(missing_ok=True)
-        else:
+        elif self.linked(name) != version:
             os.symlink(os.path.join("releases", version), str(draft))
             os.replace(str(draft), str(self.root / name))
         sync_folder(self.root)

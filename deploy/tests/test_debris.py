@@ -55,7 +55,7 @@ KINDS: dict[str, Callable[[Path, Path], Any]] = {
     "odd bytes": lambda path, outside: path.write_bytes(b"\xff\xfe\0"),
     "empty": lambda path, outside: path.touch(),
     "locked": lambda path, outside: path.touch(0),
-    "huge": lambda path, outside: (path.touch(), os.truncate(path, 1 << 21)),
+    "huge": lambda path, outside: path.write_bytes(bytes(2 << 20)),
     "folder": _folder,
     "empty folder": lambda path, outside: path.mkdir(),
     "link into nowhere": lambda path, outside: path.symlink_to("nowhere"),

@@ -436,7 +436,7 @@ def test_whatever_cuts_the_watch_off_the_old_release_runs_again(layout, monkeypa
         monkeypatch.setattr(closed, "write", broken, raising=False)
         monkeypatch.setattr(sys, "stdout", closed)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        installer.Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
     assert layout.versions() == [OLD]
     assert service.heard == []
@@ -461,7 +461,7 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
     layout.link("previous", NEW)
     service = Service(layout, KeyboardInterrupt())
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        installer.Installer(layout, service).activate(NEW, is_new=False)
+        installer.Installer(layout, service).activate(NEW)
     assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, NEW, OLD)
     stops = [KeyboardInterrupt]
 
@@ -472,7 +472,7 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
 
     monkeypatch.setattr(service, "stop", stop)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
-        installer.Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
 
 
@@ -487,7 +487,7 @@ def test_a_second_signal_while_it_goes_back_changes_nothing(layout, monkeypatch)
     monkeypatch.setattr(service, "start", start)
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
-        installer.Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
     assert signal.getsignal(signal.SIGINT) is handler
 
@@ -505,10 +505,10 @@ def test_the_running_release_installed_again_stays_whatever_happens(layout, monk
 
     monkeypatch.setattr(service, "watch", watch)
     with pytest.raises(UnhealthyError, match=f"went back to {NEW}"):
-        installer.Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW)
     assert (layout.linked("current"), layout.linked("previous"), service.runs) == (NEW, OLD, NEW)
     assert sorted(layout.versions()) == [NEW, OLD]
-    installer.Installer(layout, service).activate(OLD, is_new=False)
+    installer.Installer(layout, service).activate(OLD)
     assert layout.served.read_text() == OLD
 
 
