@@ -149,7 +149,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     flags = [*make_policy().flags, "--connect", endpoint, "--config", str(settings)]
     with EdgeProcess(*flags, environment=environment) as edge:
         assert edge.ready_line.startswith("ready ")
-        assert systemd.next() == "READY=1\nSTATUS=standby"
+        assert systemd.until("READY") == "READY=1\nSTATUS=standby"
         assert [systemd.next() for _ in range(3)] == ["WATCHDOG=1"] * 3
         edge.process.send_signal(signal.SIGSTOP)
         assert systemd.is_told_nothing(0.6)
