@@ -38,13 +38,17 @@ def a_manifest(car=CARS["left_turn"], **changes):
 
 
 class Rig:
-    """`obeys`: the vehicle does what it is told; `talks`: it reports, after each tick."""
+    """`obeys`: the vehicle does what it is told; `talks`: it reports, after each tick.
+
+    `jammed_rad`: its inner wheel's angle, whatever is asked.
+    """
 
     def __init__(self, core):
         self.core, self.now_s, self.ticks = core, 100.0, 0
         core.follow_period(T)
         self.obeys = self.talks = True
         self.speed_mps = self.inner_rad = 0.0
+        self.jammed_rad = None
         self.sent_in = core.state
         self.sent = []  # each frame or message with its time
         self.asked = []  # each speed with its time
@@ -92,8 +96,8 @@ class HunterRig(Rig):
 
     silence, lie, battery_v = "the chassis sends no 0x221", "the chassis reports 3.0 m/s", 24.0
 
-    def __init__(self, scenario="left_turn"):
-        super().__init__(HunterCore(similarity_to(CARS[scenario], SPEC), "v2"))
+    def __init__(self, scenario="left_turn", scale=None):
+        super().__init__(HunterCore(similarity_to(CARS[scenario], SPEC, scale), "v2"))
         self.status = OK
         self.counter = 0  # of 0x211; None: it stands still
 
@@ -105,6 +109,8 @@ class HunterRig(Rig):
                 self.asked.append((self.now_s, message.speed_mps))
                 if self.obeys:
                     self.speed_mps, self.inner_rad = message
+        if self.jammed_rad is not None:
+            self.inner_rad = self.jammed_rad
         if self.talks:
             motion = protocol.MotionStatus(self.speed_mps, self.inner_rad)
             self.tell(protocol.MOTION_STATUS, motion)
@@ -134,9 +140,9 @@ class Ros2Rig(Rig):
 
     silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.00 m/s", None
 
-    def __init__(self, scenario="left_turn", **settings):
+    def __init__(self, scenario="left_turn", scale=None, **settings):
         self.settings = Ros2Settings(**settings)
-        super().__init__(Ros2Core(self.settings, similarity_to(CARS[scenario], SPEC)))
+        super().__init__(Ros2Core(self.settings, similarity_to(CARS[scenario], SPEC, scale)))
         self.angular = None
         self.centre_rad = 0.0
 
@@ -150,6 +156,8 @@ class Ros2Rig(Rig):
             if self.obeys:
                 self.speed_mps, self.centre_rad = motion
                 self.inner_rad = SPEC.inner_rad(self.centre_rad)
+        if self.jammed_rad is not None:
+            self.centre_rad = SPEC.centre_rad(self.jammed_rad)
         if self.talks:
             angular = self.centre_rad
             if self.settings.odometry_angular != ANGLE:

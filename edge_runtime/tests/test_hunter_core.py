@@ -211,6 +211,12 @@ def test_no_more_than_the_model_can_do_with_three_tenths_is_believed(rig, field,
         assert (rig.core.reports.lie() is not None) is lies
 
 
+def test_no_more_steering_is_reported_than_the_wheels_reach():
+    rig = HunterRig("congestion", scale=0.02)
+    rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(0.1, -0.7))
+    assert rig.report.action["steering"] == rig.core.similarity.limits()["steering"].high < 0.6
+
+
 @pytest.mark.parametrize(
     ("counters", "alive"),
     [
@@ -301,7 +307,7 @@ def test_feedback_that_could_not_be_confirms_nothing(rig, before):
     assert rig.core.state is State.STOPPED
 
 
-@pytest.mark.parametrize("speed_mps", [0.0, 0.7])
+@pytest.mark.parametrize("speed_mps", [0.0, 0.7, -0.7])
 def test_a_drive_that_does_not_follow_is_stuck_and_its_brake_is_locked_at_once(driving, speed_mps):
     driving.obeys, driving.speed_mps = False, speed_mps
     pedal = {"pedal": -1.0 if speed_mps else 1.0}
@@ -310,7 +316,7 @@ def test_a_drive_that_does_not_follow_is_stuck_and_its_brake_is_locked_at_once(d
         driving.step(1, pedal)
     driving.step(1, pedal)
     assert "the speed stays at" in driving.words[0]
-    assert (LOCK in driving.frames()) == (speed_mps > 0)
+    assert (LOCK in driving.frames()) == (speed_mps != 0)
 
 
 FULL = "Transmit buffer full"

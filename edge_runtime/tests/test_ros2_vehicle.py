@@ -84,6 +84,17 @@ def test_the_steering_comes_back_from_the_odometry(angular):
         assert rig.report.action["steering"] == pytest.approx(found, abs=1e-6)
 
 
+def test_an_angle_that_no_wheel_has_is_not_believed():
+    """1.3 times full lock, as of the inner wheel: some drivers report that one."""
+    for angular, believed in ((0.748, True), (-0.748, True), (0.749, False), (-0.749, False)):
+        rig = Ros2Rig(odometry_angular=STEERING)
+        rig.core.enable(rig.now_s)
+        rig.angular = angular
+        rig.step(2)
+        assert rig.core.state is (State.ENABLED if believed else State.STOPPED)
+        assert rig.core.cause is (None if believed else Event.LYING)
+
+
 def test_at_a_stand_a_yaw_rate_tells_nothing_and_the_asked_steering_is_reported():
     rig = Ros2Rig("congestion").enabled()
     rig.obeys = False

@@ -12,12 +12,13 @@ from edge_runtime.tests.harness import render_table
 from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from edge_runtime.vehicles.core import (
     DEVIATES_S,
+    FOLLOWS_S,
     LEADS_TO,
     STANDS_MPS,
     Event,
     Finding,
+    FollowWatch,
     Speeds,
-    SpeedWatch,
     State,
 )
 from edge_runtime.vehicles.mapping import wish_of
@@ -95,7 +96,7 @@ def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
 
 
 def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_while():
-    watch = SpeedWatch(10.0)  # 1 m/s to each side
+    watch = FollowWatch(1.0, FOLLOWS_S)
     for now_s, asked_mps, measured_mps, stuck in [
         (-3.0, 9.0, 0.0, False),  # it has had no time to follow
         (-2.0625, 9.0, 0.0, False),
@@ -114,6 +115,115 @@ def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_
         (DEVIATES_S + 0.001, 2.0, 0.5, True),
     ]:
         assert watch.is_stuck(asked_mps, measured_mps, now_s) is stuck, now_s
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wheel_from_elsewhere_has_the_time_to_come_at_its_rate(sign):
+    """0.1 rad to each side, 0.5 s to follow, 1 rad/s."""
+    watch = FollowWatch(0.1, 0.5, 1.0)
+    for now_s, asked, measured, stuck in [
+        (0.0, 0.0, 1.0, False),
+        (0.4375, 0.0, 1.0, False),
+        (0.5, 0.0, 1.0, False),  # it may begin to turn now
+        (0.5, 0.0, 1.0, False),  # twice in one moment
+        (0.75, 0.0, 0.78, False),
+        (1.0, 0.0, 0.53, False),
+        (1.25, 0.0, 0.29, False),  # too slow, but only just now
+        (1.3125, 0.0, 0.29, False),
+        (1.375, 0.0, 0.29, True),
+        (1.5, 0.0, 0.09, False),
+        (1.625, 1.0, -0.09, False),
+        (2.0, 1.0, -0.09, False),
+        (2.0625, 1.0, 0.0, False),  # it has stuck
+        (2.125, 1.0, 0.0, False),  # 0.0 was asked for 0.625 s ago, and still 0.5 s ago
+        (2.1875, 1.0, 0.0, False),  # no more: now it turns by 1 rad/s
+        (2.25, 1.0, 0.0, False),
+        (2.375, 1.0, 0.0, True),
+        (2.625, 1.0, None, False),  # nothing is asked of it, or known
+        (2.75, 0.0, 1.0, False),  # anew
+        (3.1875, 0.0, 1.0, False),
+        (3.25, 0.0, 1.2, False),
+        (3.3125, 0.0, 1.0, False),
+        (3.375, 0.0, 1.0, True),
+    ]:
+        measured = None if measured is None else sign * measured
+        assert watch.is_stuck(sign * asked, measured, now_s) is stuck, now_s
+
+
+TOLERANCE_RAD = 0.1 * SPEC.centre_rad(SPEC.max_inner_steering_rad)
+FOUND_WITHIN_S = 0.7
+"""0.4 s to follow, 0.1 s of deviation, and 46 mrad at 1 rad/s, as for one that came from there."""
+
+
+@pytest.mark.parametrize("steering", [0.0, 0.1, -0.79, 0.79, 1.0])
+@pytest.mark.parametrize("jammed", [-0.570, 0.570, 0.0, "asked"])
+@pytest.mark.parametrize("excess", [0.95, 1.05])
+def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
+    make, steering, jammed, excess
+):
+    """The wheel, not the action: 0.081 rad are full action, and all beyond is reported as that."""
+    rig = make("congestion").enabled()
+    rig.step(100, {"steering": steering}, scenario_speed_mps=4.0)
+    asked_rad = rig.core.similarity.centre_rad(steering)
+    wheel_rad = SPEC.centre_rad(0.0 if jammed == "asked" else jammed)
+    if jammed == "asked":
+        wheel_rad = asked_rad - excess * TOLERANCE_RAD
+    rig.jammed_rad = math.copysign(SPEC.inner_rad(wheel_rad), wheel_rad)
+    wrong = abs(wheel_rad - asked_rad) > TOLERANCE_RAD
+    rig.step(round(FOUND_WITHIN_S / STREAM_S), {"steering": steering}, scenario_speed_mps=4.0)
+    assert rig.core.cause is (Event.ASTRAY if wrong else None)
+    assert rig.core.set_point.speed_mps == 0.0 if wrong else rig.speed_mps > 0.9
+
+
+def test_a_wheel_need_not_turn_before_it_is_to_drive(rig):
+    rig.jammed_rad = 0.5
+    rig.enabled().step(200, {"pedal": -1.0, "steering": -1.0})
+    assert rig.core.state is State.ENABLED
+    rig.step(60, PEDAL)
+    assert rig.core.cause is Event.ASTRAY
+    assert 0.0 < max(rig.speeds()) < 0.75
+
+
+@pytest.mark.parametrize(("speed_mps", "pedal"), [(0.0, 1.0), (0.1, -1.0)])
+def test_a_wheel_need_not_turn_where_it_stands_nor_where_it_is_to_stand(rig, speed_mps, pedal):
+    rig.jammed_rad = 0.5
+    rig.enabled().obeys, rig.speed_mps = False, speed_mps
+    rig.step(100, {"pedal": pedal})
+    assert rig.core.cause is (Event.STUCK if pedal > 0 else None)
+
+
+@pytest.mark.parametrize(("period_s", "lag_s"), [(0.1, 0.36), (0.5, 1.16)])
+def test_a_wheel_may_lag_behind_all_the_time(rig, period_s, lag_s):
+    """By 0.2 s and by 2 T, for what is heard of it may be as old."""
+    rig.core.follow_period(period_s)
+    rig.enabled()
+    asked_rad = [0.0] * round(lag_s / STREAM_S)
+    for tick in range(600):
+        asked_rad.append(rig.core.set_point.inner_rad)
+        rig.jammed_rad = asked_rad.pop(0)
+        rig.step(1, {**PEDAL, "steering": 1.0 if tick // 75 % 2 else -1.0})
+        assert rig.core.state is State.ENABLED, rig.words
+    assert max(asked_rad) > 0.5
+
+
+def test_of_two_findings_the_graver_is_named(rig, monkeypatch):
+    rig.driving()
+    monkeypatch.setattr(rig.core._steering_watch, "is_stuck", lambda *_: True)
+    rig.core.tick(rig.core.late_at_s + 1.0)
+    assert rig.core.cause is Event.SILENT
+
+
+@pytest.mark.parametrize("pedal", [0.05, 1.0])
+@pytest.mark.parametrize("scale", [0.02, 0.05, 0.1, 0.25])
+def test_a_runaway_is_found_at_any_scale_and_throttle(make, scale, pedal):
+    """What is asked stays behind the measured speed: at small scales by more than a full lead."""
+    rig = make(scale=scale).enabled()
+    rig.step(55, {"pedal": pedal})
+    rig.obeys = False
+    for _ in range(60):
+        rig.speed_mps = min(rig.speed_mps + 2.0 * STREAM_S, 1.6)
+        rig.step(1, {"pedal": pedal})
+    assert rig.core.cause is Event.STUCK
 
 
 def test_a_drive_with_a_lag_is_not_stuck(rig):
@@ -217,11 +327,18 @@ def be_stuck(rig):
     return "the speed stays at 0.00 m/s"
 
 
+def be_astray(rig):
+    rig.jammed_rad = -0.3
+    rig.step(40, PEDAL)
+    rig.jammed_rad = None
+    return "the steering stays at -0.2"
+
+
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
         (fall_silent, Event.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
-        (lie, Event.LYING), (be_stuck, Event.STUCK),
+        (lie, Event.LYING), (be_stuck, Event.STUCK), (be_astray, Event.ASTRAY),
     ],
 )  # fmt: skip
 def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):

@@ -30,7 +30,8 @@ ENABLE_TIMEOUT_S = 1.0
 STOP_TAKES_S = 1.0
 
 FOLLOWS_S = 1.0  # a drive may still follow a set-point of this age
-DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
+STEERS_S = 0.2  # so may a wheel, by its dead time and lag; what is heard of it is older still
+DEVIATION = 0.1  # of top speed, or of full lock (a wheel has play), outside of all that was asked
 DEVIATES_S = 0.1
 STANDS_MPS = 0.02
 IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
@@ -63,6 +64,7 @@ class Event(str, Enum):
     SILENT = "feedback_silent"
     LYING = "feedback_impossible"
     STUCK = "speed_stuck"
+    ASTRAY = "steering_stuck"
     BUS = "bus_error"
     FOREIGN = "foreign_command"  # somebody else commands the chassis
 
@@ -85,6 +87,7 @@ LEADS_TO: Dict[Event, Dict[State, State]] = {
     Event.SILENT: {_E: _X},
     Event.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
     Event.STUCK: {_E: _X},
+    Event.ASTRAY: {_E: _X},
     Event.BUS: {_G: _X, _E: _X},
     Event.FOREIGN: {_G: _X, _E: _X},
 }
@@ -135,24 +138,35 @@ class Speeds:
         return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
 
 
-class SpeedWatch:
-    """Whether the measured speed stays outside of every speed that was lately asked for."""
+class FollowWatch:
+    """Whether what is measured stays outside of all that a healthy actuator can do.
 
-    def __init__(self, max_speed_mps: float) -> None:
-        self._tolerance_mps = DEVIATION * max_speed_mps
+    It is, give or take `tolerance`, where it was asked to be within `follows_s`. At first, or where
+    it was not judged for a time, it comes from elsewhere: by `rate` a second.
+    """
+
+    def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
+        self._tolerance, self._follows_s, self._rate = tolerance, follows_s, rate
         self._asked: Deque[Tuple[float, float]] = deque()
+        self._low = self._high = 0.0  # a healthy one is in between
         self._deviates_since_s = math.inf
 
-    def is_stuck(self, asked_mps: float, measured_mps: float, now_s: float) -> bool:
-        """Note what is asked and measured now, and judge."""
-        self._asked.append((now_s, asked_mps))
-        while len(self._asked) > 1 and self._asked[1][0] < now_s - FOLLOWS_S:
+    def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
+        """Note what is asked and measured now, and judge; a None is not judged."""
+        if measured is None:
+            self._asked.clear()
+            return False
+        nearer = self._rate * (now_s - self._asked[-1][0]) if self._asked else 0.0
+        self._asked.append((now_s, asked))
+        while len(self._asked) > 1 and self._asked[1][0] < now_s - self._follows_s:
             self._asked.popleft()
-        if self._asked[0][0] > now_s - FOLLOWS_S:
+        if self._asked[0][0] > now_s - self._follows_s:
+            self._low, self._high, self._deviates_since_s = measured, measured, math.inf
             return False  # it has had no time to follow
-        speeds = [speed for _, speed in self._asked]
-        low, high = min(speeds) - self._tolerance_mps, max(speeds) + self._tolerance_mps
-        follows = low <= measured_mps <= high
+        values = [value for _, value in self._asked]
+        self._low = min(*values, self._low + nearer)
+        self._high = max(*values, self._high - nearer)
+        follows = self._low - self._tolerance <= measured <= self._high + self._tolerance
         self._deviates_since_s = math.inf if follows else min(self._deviates_since_s, now_s)
         return now_s - self._deviates_since_s > DEVIATES_S
 
@@ -167,8 +181,8 @@ class StreamedCore(abc.ABC):
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
         self._reach = similarity.reach  # Worked out once: reports come with every frame.
-        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
         self.follow_period(MIN_PERIOD_S)
+        self._watch_anew()
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
@@ -180,7 +194,7 @@ class StreamedCore(abc.ABC):
 
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
-        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)  # a new chance to follow
+        self._watch_anew()  # a new chance to follow
         self._apply(Finding(Event.ENABLE, ""), now_s)
         self._since_s = now_s
 
@@ -207,14 +221,13 @@ class StreamedCore(abc.ABC):
     def report(self, now_s: float) -> VehicleReport:
         """What the vehicle does, in the policy's terms and in its own."""
         speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
+        centre_rad = self._centre_rad()
+        steering = self.similarity.steering(self._asked_rad() if centre_rad is None else centre_rad)
         words = [self.words] if self.words else []
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
             # A milliradian beyond its reach would count as a lie.
-            action={
-                "pedal": self._pedal(),
-                "steering": clamp(self._steering(), self._reach),
-            },
+            action={"pedal": self._pedal(), "steering": clamp(steering, self._reach)},
             speed_mps=speed_mps,
             self_braking=self.state is not State.ENABLED,
             faults=faults if self.state is State.STOPPED else [],
@@ -241,8 +254,17 @@ class StreamedCore(abc.ABC):
         """In words why the vehicle did not confirm an `enable` in time."""
 
     @abc.abstractmethod
-    def _steering(self) -> float:
-        """The steering in -1 to 1 that the vehicle reports."""
+    def _centre_rad(self) -> Optional[float]:
+        """The steering angle that the vehicle reports, not clamped; None where it is not known."""
+
+    def _asked_rad(self) -> float:
+        return self._spec.centre_rad(self.set_point.inner_rad)
+
+    def _watch_anew(self) -> None:
+        spec, follows_s = self._spec, STEERS_S + self._heard.silence_s
+        most_rad = DEVIATION * spec.centre_rad(spec.max_inner_steering_rad)
+        self._speed_watch = FollowWatch(DEVIATION * spec.max_speed_mps, FOLLOWS_S)
+        self._steering_watch = FollowWatch(most_rad, follows_s, spec.max_steering_rate_radps)
 
     def _obstacles(self, now_s: float) -> List[str]:
         """In words what stands between the vehicle and our commands."""
@@ -270,6 +292,11 @@ class StreamedCore(abc.ABC):
         if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
             words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"
             found = Finding(Event.STUCK, words)
+        drives = asked_mps > 0.0 and not self._heard.stands  # a wheel need not turn at a stand
+        asked_rad, turned_rad = self._asked_rad(), self._centre_rad() if drives else None
+        if self._steering_watch.is_stuck(asked_rad, turned_rad, now_s) and found is None:
+            words = f"the steering stays at {turned_rad:.2f} rad, asked for {asked_rad:.2f}"
+            found = Finding(Event.ASTRAY, words)
         if found is not None:
             self._apply(found, now_s)
 

@@ -24,6 +24,7 @@ from edge_runtime.util import UserError
 # The set-point runs ahead of the speed by what full acceleration gives in this time, and no
 # further: a vehicle that was held up must not leap when it comes free (anti-windup).
 LEAD_S = 0.5
+RUNAWAY = 0.2  # of top speed, twice core.DEVIATION: the set-point does not follow a runaway closer
 _LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for it
 
 
@@ -97,7 +98,8 @@ class Similarity(NamedTuple):
         lead_mps = self.acceleration_mps2(1.0) * LEAD_S
         speed_mps = min(speed_mps + self.acceleration_mps2(pedal) * step_s, measured_mps + lead_mps)
         if pedal > 0:  # a brake that does not bite is asked for all the more
-            speed_mps = max(speed_mps, measured_mps - lead_mps)
+            least_mps = RUNAWAY * self.spec.max_speed_mps
+            speed_mps = max(speed_mps, measured_mps - max(lead_mps, least_mps))
         return min(max(speed_mps, 0.0), self.spec.max_speed_mps)
 
     def follow_speed(self, speed_mps: float, scenario_mps: float, step_s: float) -> float:

@@ -6,7 +6,7 @@ the mock would drive on by itself when the fault is over; feedback names the fau
 re-arm lets it move. When the edge can know:
 - silent, bus off, late: at the last frame that came in time, for the next ones were due;
 - frozen: the same, and STATUS_SILENCE_S later, for it goes on sending;
-- the others: at the first frame on the bus that shows it;
+- the others: at the first frame on the bus that shows it (full lock: and DEVIATES_S later);
 - stuck: at the first set-point that the vehicle should follow and does not (it may lag FOLLOWS_S).
 """
 
@@ -41,6 +41,8 @@ STANDS_WITHIN_S = 2.0
 _FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
 _IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
 _DIFFERS_MPS = 0.15
+_ASTRAY_RAD = 0.048  # a tenth of full lock, at the inner wheel; the rows' policies go straight on
+_LATER_S = {"frozen": STATUS_SILENCE_S, "full_lock": DEVIATES_S}
 _REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
 """While these last, the runtime refuses to be re-armed: it would be in vain."""
 
@@ -55,7 +57,11 @@ class Expect(NamedTuple):
 
 def speed_mps(frame: Heard) -> float:
     """Of 0x111 and 0x221, by hand."""
-    return int.from_bytes(frame.data[:2], "big", signed=True) * 1e-3
+    return _number(frame.data[:2])
+
+
+def _number(data: bytes) -> float:
+    return int.from_bytes(data, "big", signed=True) * 1e-3
 
 
 def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
@@ -167,6 +173,11 @@ _EXPECTS = (
     Expect("bus_off", "sends no 0x2"),
     Expect("late", "sends no 0x2"),
     Expect(
+        "full_lock",
+        "the steering stays",
+        lambda frame: frame.can_id == 0x221 and abs(_number(frame.data[6:])) > _ASTRAY_RAD,
+    ),
+    Expect(
         "lying",
         "reports",
         lambda frame: frame.can_id == 0x221 and speed_mps(frame) > _IMPOSSIBLE_MPS,
@@ -187,7 +198,7 @@ for _expect in _EXPECTS:
         measured="last frame in time on the bus to set-point 0"
         if _expect.shown is None
         else "first frame on the bus that shows it to set-point 0",
-        reaction_limit_s=REACTION_LIMIT_S + (STATUS_SILENCE_S if _expect.name == "frozen" else 0.0),
+        reaction_limit_s=REACTION_LIMIT_S + _LATER_S.get(_expect.name, 0.0),
         policy="full",
     )(partial(at_fault, _expect))
 

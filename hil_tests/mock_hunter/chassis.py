@@ -57,6 +57,7 @@ FAULTS: dict[str, str] = {
     "silent": "it sends nothing, and obeys",
     "frozen": "it repeats its last frames, and obeys",
     "stuck": "its motors stay as they are, whatever is asked; its brake works",
+    "full_lock": "its wheels go to full lock, whatever is asked",
     "lying": "it reports a speed that cannot be",
     "late": "all that it sends comes late",
     "bus_off": "it neither sends nor hears",

@@ -206,7 +206,9 @@ class MockHunter:
         if message is None or "bus_off" in self.faults:
             return
         if isinstance(message, codec.MotionCommand):
-            asked = Setpoint(message.speed_mps, message.inner_steering_rad)
+            right_rad = -self._parameters.max_inner_rad
+            inner_rad = right_rad if "full_lock" in self.faults else message.inner_steering_rad
+            asked = Setpoint(message.speed_mps, inner_rad)
             self.chassis = rules.take_command(self.chassis, now_s)
             self._under_way.append((now_s + self._parameters.dead_time_s, asked))
         elif isinstance(message, codec.ModeCommand):

@@ -263,7 +263,6 @@ class HunterCore(StreamedCore):
         data = protocol.encode_motion(asked.speed_mps, asked.inner_rad, self._spec)
         return Sent(protocol.MOTION_COMMAND, data)
 
-    def _steering(self) -> float:
+    def _centre_rad(self) -> Optional[float]:
         motion = self.reports.motion
-        inner_rad = motion.inner_steering_rad if motion else 0.0
-        return self.similarity.steering(self._spec.centre_rad(inner_rad))
+        return self._spec.centre_rad(motion.inner_steering_rad) if motion else None

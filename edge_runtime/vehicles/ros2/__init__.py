@@ -148,6 +148,8 @@ class Ros2Core(StreamedCore):
         self._heard.note(speed_mps, now_s)
         if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
             self._apply(Finding(Event.LYING, f"the odometry says {speed_mps:.2f} m/s"), now_s)
+        elif self._is_angle and abs(angular) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
+            self._apply(Finding(Event.LYING, f"the odometry says {angular:.2f} rad"), now_s)
         else:
             self._apply(Finding(Event.CONFIRMED, ""), now_s)
 
@@ -157,8 +159,7 @@ class Ros2Core(StreamedCore):
         if self.state is State.DISABLED:
             return None
         self._step(now_s)
-        set_point = self.set_point
-        return Motion(set_point.speed_mps, self._spec.centre_rad(set_point.inner_rad))
+        return Motion(self.set_point.speed_mps, self._asked_rad())
 
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nothing was ever asked of it."""
@@ -173,16 +174,14 @@ class Ros2Core(StreamedCore):
             return None
         return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
 
-    def _steering(self) -> float:
-        """From the odometry; what was asked for where a yaw rate tells nothing: it hardly moves."""
+    def _centre_rad(self) -> Optional[float]:
+        """From the odometry; None where a yaw rate tells nothing: it hardly moves."""
         angular, speed_mps = self._angular, self._heard.speed_mps
-        if angular is None or (not self._is_angle and abs(speed_mps) < STEERS_FROM_MPS):
-            centre_rad = self._spec.centre_rad(self.set_point.inner_rad)
-        elif self._is_angle:
-            centre_rad = angular
-        else:
-            centre_rad = math.atan(self._spec.wheelbase_m * angular / speed_mps)
-        return self.similarity.steering(centre_rad)
+        if angular is None or self._is_angle:
+            return angular
+        if abs(speed_mps) < STEERS_FROM_MPS:
+            return None
+        return math.atan(self._spec.wheelbase_m * angular / speed_mps)
 
 
 class Ros2Vehicle(StreamedVehicle):

@@ -7,16 +7,18 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import can
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.rigs import CARS, SPEC, STREAM_S, Rig
+from edge_runtime.tests.rigs import CARS, STREAM_S, Rig
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
+from edge_runtime.vehicles.core import Event as CoreEvent
 from edge_runtime.vehicles.hunter import open_bus, parse_bus, protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
@@ -461,6 +463,7 @@ WORDS = {
     "frozen": "the counter of 0x211 stands still",
     "lying": "the chassis reports",
     "stuck": "the speed stays at",
+    "full_lock": "the steering stays at",
     "remote": "the remote control drives",
     "estop": "the emergency stop is pressed",
     **{name: bit.words for name, bit in rules.BITS.items()},
@@ -472,16 +475,20 @@ STANDS_WITHIN_S = 1.5  # from 1.5 m/s at the mock's 2 to 3 m/s2, or by the brake
 
 
 class Pair(Rig):
-    """The driver's ticks, the mock's frames between them, and a policy's pedal."""
+    """The driver's ticks, the mock's frames between them, and a policy's pedal and steering."""
 
-    def __init__(self):
-        super().__init__(HunterCore(similarity_to(CARS["left_turn"], SPEC), "v2"))
-        self.mock = MockHunter(P, self.now_s - STREAM_S / 2)
+    def __init__(self, car="left_turn", model="2.0", **changes):
+        super().__init__(HunterCore(similarity_to(CARS[car], SPECS[model]), "v2"))
+        parameters = make_parameters(f"hunter-{model}", changes)
+        self.mock = MockHunter(parameters, self.now_s - STREAM_S / 2)
         self.moved_s = self.moving_set_point_s = self.now_s
-        self.pedal = 1.0
+        self.pedal, self.steering = 1.0, None
+        self.delays_s = itertools.repeat(0.0)  # of the frames of each tick, on their way to us
+        self.coming = []
 
     def run(self, seconds):
-        return self.step(round(seconds / STREAM_S), {"pedal": self.pedal})
+        steering = {} if self.steering is None else {"steering": self.steering}
+        return self.step(round(seconds / STREAM_S), {"pedal": self.pedal, **steering})
 
     def exchange(self, due):
         for frame, data in due:
@@ -490,8 +497,12 @@ class Pair(Rig):
                 self.asked.append(int.from_bytes(data[:2], "big", signed=True) / 1000)
                 if self.asked[-1]:
                     self.moving_set_point_s = self.now_s
-        for can_id, data in self.mock.due(self.now_s):
-            self.core.hear(can_id, data, self.now_s)
+        if self.jammed_rad is not None:
+            self.mock.body = self.mock.body._replace(inner_rad=self.jammed_rad)
+        delay_s = next(self.delays_s)
+        self.coming += [(self.now_s + delay_s, each) for each in self.mock.due(self.now_s)]
+        while self.coming and self.coming[0][0] <= self.now_s:  # A bus keeps their order.
+            self.core.hear(*self.coming.pop(0)[1], self.now_s)
         if not self.mock.body.stands:
             self.moved_s = self.now_s
 
@@ -530,6 +541,75 @@ def test_a_whole_drive_without_a_fault_is_never_stopped():
         pair.pedal = (-1.0, 1.0, 0.3, -0.4, 1.0)[number % 5]
         pair.run(0.2 + 0.03 * (number % 7))
         assert pair.core.state is State.ENABLED, pair.words
+
+
+class Manoeuvre(NamedTuple):
+    """Of one second: what the steering swings about, by how much and how often a second."""
+
+    steering: float
+    swing: float
+    swings_hz: float
+    pedal: float
+
+    def drive(self, pair):
+        """Square for whole swings, that is steps and reversals; else a sine."""
+        pair.pedal = self.pedal
+        for tick in range(50):
+            wave = math.sin(2 * math.pi * self.swings_hz * tick * STREAM_S)
+            wave = math.copysign(1.0, wave) if self.swings_hz.is_integer() else wave
+            pair.steering = min(max(self.steering + self.swing * wave, -1.0), 1.0)
+            pair.step(1, {"pedal": pair.pedal, "steering": pair.steering})
+
+
+unit = st.floats(-1, 1)
+pairs = st.builds(
+    Pair, st.sampled_from(sorted(CARS)), st.sampled_from(sorted(SPECS)),
+    dead_time_s=st.floats(0.0, 0.1), steering_rate_radps=st.floats(1.0, 2.0),
+)  # fmt: skip
+jitter = st.lists(st.floats(0.0, 0.06), min_size=1, max_size=20).map(itertools.cycle)
+
+
+@settings(max_examples=50)
+@given(
+    pairs, jitter, unit,
+    st.lists(st.builds(Manoeuvre, unit, unit, st.integers(1, 3).map(float) | st.floats(0, 3), unit),
+             min_size=1, max_size=6),
+)  # fmt: skip
+def test_no_steering_of_a_healthy_chassis_is_accused(pair, delays_s, parked, manoeuvres):
+    """Steps, reversals and swings at and above its rate, a bus that is late, any pedal, and wheels
+    that stood anywhere when it was switched on."""
+    parked_rad = parked * pair.core.similarity.spec.max_inner_steering_rad
+    pair.mock.body = pair.mock.body._replace(inner_rad=parked_rad)
+    pair.enabled().delays_s = delays_s
+    for one in manoeuvres:
+        one.drive(pair)
+        assert pair.core.state is State.ENABLED, pair.words
+
+
+FOUND_WITHIN_S = 0.8  # As by the core's own tests, and what a late bus adds.
+
+
+@settings(max_examples=50)
+@given(pairs, jitter, unit, unit, st.booleans(), st.floats(0.2, 1.0))
+def test_a_wheel_that_stays_anywhere_else_is_found(
+    pair, delays_s, jammed, steering, at_once, pedal
+):
+    """From the first moment on, or in the middle of a drive."""
+    pair.pedal, pair.steering, similarity = pedal, steering, pair.core.similarity
+    spec, asked_rad = similarity.spec, similarity.centre_rad(steering)
+    full_rad = spec.centre_rad(spec.max_inner_steering_rad)
+    jammed_rad = jammed * spec.max_inner_steering_rad
+    pair.jammed_rad = jammed_rad if at_once else None
+    asked_rad = min(max(asked_rad, -full_rad), full_rad)
+    wrong_rad = abs(asked_rad - spec.centre_rad(jammed_rad)) - 0.1 * full_rad
+    assume(wrong_rad > 0.001)
+    pair.enabled().delays_s = delays_s
+    pair.run(0.5 if at_once else 3.0)  # It moves
+    assert pair.core.state is State.ENABLED
+    pair.jammed_rad = jammed_rad
+    turns_s = abs(pair.core.set_point.inner_rad - spec.inner_rad(asked_rad))  # at 1 rad/s
+    pair.run(turns_s + FOUND_WITHIN_S)
+    assert pair.core.cause is CoreEvent.ASTRAY
 
 
 def test_a_pause_of_the_edge_longer_than_the_chassiss_time_out_does_not_move_it_on():
