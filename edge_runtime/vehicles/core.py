@@ -18,13 +18,12 @@ from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
-from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.base import ENABLE_TIMEOUT_S, VehicleReport
 from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
 
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
 LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
-ENABLE_TIMEOUT_S = 1.0
 # At the end zeros go out for so long, unless it is known to stand before; and what is then not
 # known to stand gets the parking brake, where there is one.
 STOP_TAKES_S = 1.0
