@@ -17,7 +17,7 @@ COMMANDS = {
         "find the policy of a run from which on a drive ends differently",
     ),
     "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
-    "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
+    "view": ("bridge.rerun.command:view", "show the wire in rerun, live or in a file"),
 }
 main = program(
     "python -m bridge",

@@ -14,7 +14,7 @@ import signal
 import sys
 import time
 from importlib import import_module
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple, Union
 
 from edge_runtime import __version__
 from edge_runtime.util import UserError, ending_signals, printable, take_signals
@@ -96,11 +96,18 @@ def add_public_key(parser: argparse.ArgumentParser) -> None:
 
 
 class Command(NamedTuple):
-    """A command, in a module that has several."""
+    """A command, in a module that has several. `run` may be a `module:function` that loads long."""
 
     EXAMPLE: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
+    run: Union[str, Callable[[argparse.Namespace], int]]
+
+
+def command(
+    run: str, *shown: str
+) -> Callable[[Callable[[argparse.ArgumentParser], None]], Command]:
+    """Decorate what declares a command's options; `shown` are examples of the help."""
+    return lambda add_arguments: Command(examples(*shown), add_arguments, run)
 
 
 def program(
@@ -126,15 +133,21 @@ def program(
             text = f"{summary[0].upper()}{summary[1:]}."
             one = parsers.add_parser(command, help=summary, description=text)
             if command == word:
-                module, _, member = place.partition(":")
-                chosen = import_module(module)
-                chosen = getattr(chosen, member) if member else chosen
+                chosen = _load(place)
                 one.epilog = chosen.EXAMPLE
                 chosen.add_arguments(one)
         arguments = parser.parse_args(argv or ["--help"])
-        return int(chosen.run(arguments))
+        run = _load(chosen.run) if isinstance(chosen.run, str) else chosen.run
+        return int(run(arguments))
 
     return main
+
+
+def _load(place: str) -> Any:
+    """A module, or `module:name` in it."""
+    module, _, name = place.partition(":")
+    found = import_module(module)
+    return getattr(found, name) if name else found
 
 
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:

@@ -16,17 +16,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bridge.environments import CONDITIONS, NOMINAL
 from bridge.progress import ProgressBar
 from bridge.report import markdown_table
 from edge_runtime.cli import (
-    add_public_key,
-    examples,
-    not_negative,
-    positive,
-    share,
     sigterm_as_interrupt,
-    whole_number,
 )
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
@@ -35,41 +28,11 @@ from hil_tests import sweep
 from hil_tests.faults.rows import ROWS, Row
 from hil_tests.faults.run import run_faults
 from hil_tests.sweep import Found
-from trainer.options import add_scenario
 from trainer.pictures import write_figure
-from trainer.util import cores
+from trainer.util import cores, kept
 
 SHOWN_WRONG = 5
 COLUMNS = 3
-EXAMPLE = examples(
-    "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
-    "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
-    parser.add_argument("--out", required=True, metavar="R.json", help=out)
-    default = "policy file (default: results/policies/SCENARIO.onnx)"
-    parser.add_argument("--policy", metavar="P.onnx", help=default)
-    add_public_key(parser)
-    add_scenario(parser)
-    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    for name, kind, value, text in (
-        ("--runs", whole_number(2), 100, "episodes of each row, the same seeds"),
-        ("--seed", not_negative, 0, "of the first episode"),
-        ("--target", share, 0.98, "success that is asked for"),
-    ):
-        parser.add_argument(name, type=kind, default=value, help=text)
-    only = "one part (default: both)"
-    parser.add_argument("--only", choices=("latency", "faults"), help=only)
-    jobs = "drives or faults side by side; 0: one a core"
-    parser.add_argument("--jobs", type=not_negative, default=0, help=jobs)
-    axes = ", ".join(axis.name for axis in sweep.NETWORK_AXES)
-    rows = f"only these latency axes ({axes}) and faults, by name or pattern (hunter_*)"
-    parser.add_argument("--rows", metavar="NAME,...", help=rows)
-    parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
 @sigterm_as_interrupt()  # whoever ends a campaign ends its processes
@@ -81,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     jobs = arguments.jobs or cores()
     command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
     result: dict[str, Any] = {"command": command}
-    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
+    policy = Path(arguments.policy or kept(f"results/policies/{arguments.scenario}.onnx"))
     text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{command}`", ""]
     if axes:
         latency = run_latency(_task(arguments, policy), axes, arguments.target, jobs, out)

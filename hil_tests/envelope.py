@@ -51,7 +51,7 @@ from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.experiments.data import success_estimate
 from trainer.options import set_threads
-from trainer.util import cores, die_with_parent
+from trainer.util import cores, die_with_parent, kept
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
 ZONE = 0.7
@@ -343,31 +343,6 @@ def confirm(drivers: Drivers, known: Known, seeds: range) -> dict[str, Any]:
     return {"runs": len(seeds), "rows": rows, "confirmed": all(row["as_told"] for row in rows)}
 
 
-EXAMPLE = cli.examples(
-    "python -m hil_tests envelope --policy P.onnx --env left_turn --out E.json",
-    "python -m hil_tests envelope --confirm E.json --runs 500 --out C.json",
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
-    add, count = parser.add_argument, cli.not_negative
-    add("--out", required=True, metavar="F.json", help="what is found")
-    add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
-    cli.add_public_key(parser)
-    add("--env", default="left_turn", help="scenario, gymnasium id or module:id")
-    add("--condition", choices=CONDITIONS, default="nominal", help="of the scene")
-    add("--promise", type=inner, default=0.95, help="share of successes")
-    add("--confidence", type=inner, default=0.95, help="of each axis's limit")
-    add("--seed", type=count, default=0, help="of the first drive")
-    add("--jobs", type=count, default=0, help="processes that drive; 0: one a core")
-    confirms = "drive just inside and outside of this file's edges, with fresh seeds; scene and "
-    confirms += "promise are the file's"
-    add("--confirm", metavar="F.json", help=confirms)
-    add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Find an envelope, or confirm one: 0, or 1 where an edge is not confirmed."""
     check_writable(arguments.out)
@@ -375,7 +350,7 @@ def run(arguments: argparse.Namespace) -> int:
     known = read_known(arguments.confirm) if arguments.confirm else None
     told = known or arguments  # A file tells what was driven.
     env, condition = told.env, told.condition
-    policy = arguments.policy or told.policy or f"results/policies/{env}.onnx"
+    policy = arguments.policy or told.policy or kept(f"results/policies/{env}.onnx")
     environment = make_environment(env, condition)
     policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
     if known and known.policy_id != policy_id:

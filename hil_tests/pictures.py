@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
-from edge_runtime.cli import Command, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, read_bytes, read_json
@@ -39,9 +38,10 @@ from trainer.drivers import load_driver
 from trainer.environments import make_environment
 from trainer.pictures import write_figure
 from trainer.training.metrics import read_metrics
+from trainer.util import kept
 
 MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s
-SHIPPED = Path("results/latency/left_turn/shipped.json")
+SHIPPED = Path(kept("results/latency/left_turn/shipped.json"))
 WINDOW = "1400x900"
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
@@ -56,21 +56,13 @@ SOME_MISSING = 1  # Exit status where a picture could not be made here
 Make = Callable[[Path, Path], None]
 """Writes a picture, given its path and a directory for what is made on the way."""
 
-LEFT_TURN = Path("hil_tests/recordings/left_turn.mcap")
 EPISODES = 4
 MAX_BYTES = 300_000
 DRIVEN_BEFORE_S, STOPPED_S = 2.0, 0.5
 PATIENCE_S = 60.0
 
 
-def _add_pictures_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "names", metavar="NAME", nargs="*", help=f"of {', '.join(PICTURES)} (default: all)"
-    )
-    parser.add_argument("--out", metavar="DIR", default="docs", help="where they go")
-
-
-def _run_pictures(arguments: argparse.Namespace) -> int:
+def run_pictures(arguments: argparse.Namespace) -> int:
     """Make them, each as far as it can be made here. UserError for one that is not known."""
     names = arguments.names or list(PICTURES)
     for name in names:
@@ -191,11 +183,7 @@ PICTURES: dict[str, Make] = {
 }
 
 
-def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="F.mcap", default=str(LEFT_TURN), help="where it is kept")
-
-
-def _run_recording(arguments: argparse.Namespace) -> int:
+def run_recording(arguments: argparse.Namespace) -> int:
     """Make the recording and check it by replay; the old one stays where anything goes wrong."""
     out = Path(arguments.out)
     check_writable(out)
@@ -233,18 +221,3 @@ def _record(out: Path) -> None:
                 second.succeed(PATIENCE_S)
         recorder.send(signal.SIGTERM)
         recorder.succeed(PATIENCE_S)
-
-
-PICTURES_COMMAND = Command(
-    examples(
-        "python -m hil_tests pictures --out docs",
-        "python -m hil_tests pictures cockpit.png rerun.png --out runs",
-    ),
-    _add_pictures_arguments,
-    _run_pictures,
-)
-RECORDING_COMMAND = Command(
-    examples("python -m hil_tests recording --out runs/left_turn.mcap"),
-    _add_recording_arguments,
-    _run_recording,
-)

@@ -22,10 +22,11 @@ from typing import Any, Self, TypeVar
 from edge_runtime.commands import ask
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
+from trainer.util import kept
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-POLICY = Path("results/policies/left_turn.onnx")
+POLICY = Path(kept("results/policies/left_turn.onnx"))
 PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what it is verified with
 PATIENCE_S = 30.0
 STOP_TIMEOUT_S = 10.0

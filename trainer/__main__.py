@@ -5,15 +5,15 @@ import sys
 from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("trainer.training.command", "train a policy with human guidance"),
-    "drive": ("trainer.person.session", "drive yourself, or take over from a policy; recorded"),
-    "human": ("trainer.human.dagger", "train the human model from interventions (DAgger)"),
-    "evaluate": ("trainer.evaluation", "drive test episodes and report how well it does"),
-    "export": ("trainer.policy_file", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.pictures:PLOT", "draw the learning curve of a run"),
-    "view": ("trainer.view", "show recorded sittings in rerun"),
-    "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
-    "experiment": ("trainer.experiments.command", "run the paper's experiments, judge its claims"),
+    "train": ("trainer.commands:train", "train a policy with human guidance"),
+    "drive": ("trainer.commands:drive", "drive yourself, or take over from a policy; recorded"),
+    "human": ("trainer.commands:human", "train the human model from interventions (DAgger)"),
+    "evaluate": ("trainer.commands:evaluate", "drive test episodes and report how well it does"),
+    "export": ("trainer.commands:export", "write a run's actor as the file that a board drives"),
+    "plot": ("trainer.commands:plot", "draw the learning curve of a run"),
+    "view": ("trainer.commands:view", "show recorded sittings in rerun"),
+    "bench": ("trainer.commands:bench", "measure learner, environments and training beside peers"),
+    "experiment": ("trainer.commands:experiment", "run the paper's experiments, judge its claims"),
 }
 
 

@@ -22,14 +22,13 @@ from torch import nn
 
 from bridge.progress import ProgressBar
 from bridge.report import markdown_table
-from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
-from trainer.options import add_threads, set_threads
+from trainer.options import set_threads
 from trainer.policy_file import real_observations
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
@@ -37,10 +36,6 @@ from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.util import processor_model, source_revision
 
-EXAMPLE = examples(
-    "python -m trainer bench --quick --threads 1",
-    "python -m trainer bench --threads 2 --out b.json",
-)
 OURS, FLOAT32, SB3 = "ours", "ours_float32", "stable_baselines3"
 PEERS = {FLOAT32: "the same in float32", SB3: "Stable-Baselines3 TD3"}
 BAR = 5.0  # Ours is to be at least so many times as fast as Stable-Baselines3's
@@ -69,13 +64,6 @@ class Effort:
 
 
 FULL, QUICK = Effort(), Effort(rounds=4, updates_per_round=3, training_episodes=3)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
-    parser.add_argument("--quick", action="store_true", help="take few rounds: a look only")
-    add_threads(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -22,8 +22,9 @@ from trainer.environments import (
     make_environment,
     task_of,
 )
+from trainer.human.config import MODEL_FILE
 from trainer.human.guide import Action, Driver, Observation
-from trainer.human.model import MODEL_FILE, load_human_model
+from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
 from trainer.training.delayed import DelayAware
 from trainer.util import load_torch

@@ -25,8 +25,7 @@ from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason
 from trainer.learner.replay import Layout
-from trainer.scenarios import SCENARIOS
-from trainer.scenarios.environment import Scene
+from trainer.scenarios import SCENARIOS, Scene
 from trainer.util import PERIOD_S
 
 COMMAND_NOISE = 0.05 * 2.0

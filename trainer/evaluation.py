@@ -15,55 +15,18 @@ from bridge.episode import finite
 from bridge.network import LatencySpec, Link, parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
-from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, counted, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
-from trainer.options import add_latency, add_scenario, add_seed, limited_threads
+from trainer.options import limited_threads
 from trainer.training.config import period_of
 from trainer.training.delayed import VehicleEnd
 from trainer.util import PERIOD_S
 
-EXAMPLE = examples(
-    "python -m trainer evaluate expert --runs 20",
-    "python -m trainer evaluate constant:0 --scenario congestion",
-    "python -m trainer evaluate runs/phil_1 --runs 50 --out result.json",
-    "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
-)
 NO_NETWORK = LatencySpec()
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "policy",
-        metavar="POLICY",
-        help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, module:Class of another one, "
-        "or constant:ACTION for one action from -1 to 1 throughout",
-    )
-    add_public_key(parser)
-    add_scenario(parser, "what the policy was trained in")
-    parser.add_argument(
-        "--condition",
-        choices=CONDITIONS,
-        default="nominal",
-        help="; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items()).replace(
-            "%", "%%"
-        ),
-    )
-    add_latency(parser, "the network between policy and vehicle")
-    parser.add_argument(
-        "--runs", type=positive, default=50, metavar="N", help="how many episodes are driven"
-    )
-    add_seed(parser, "the first episode; each next one has one more")
-    parser.add_argument(
-        "--out",
-        metavar="R.json",
-        help="write the report, with each episode, to this file instead of printing it",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:

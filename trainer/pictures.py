@@ -9,12 +9,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bridge.report import GOAL
-from edge_runtime.cli import Command, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
+from trainer.training.config import CURVE_FILE
 from trainer.training.metrics import read_metrics
 
-CURVE_FILE = "learning_curve.png"
 DOTS_PER_INCH = 110
 WINDOW = 20  # Episodes of the moving average
 PANELS = {
@@ -26,34 +25,12 @@ PANELS = {
 Values = NDArray[np.float64]
 
 
-def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
-    runs = "directory of a training run; several are drawn thinly, and their mean"
-    parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
-    out = f"the picture (default: RUN_DIR/{CURVE_FILE})"
-    parser.add_argument("--out", type=_png, metavar="F.png", help=out)
-
-
-def _png(out: str) -> str:
-    if not out.endswith(".png"):
-        raise argparse.ArgumentTypeError(f"{out}: a picture is a .png")
-    return out
-
-
-def _plot(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
+    """Draw it; returns the exit status."""
     if arguments.out is None and len(arguments.run_dirs) > 1:
         raise UserError("several runs go into one picture: --out F.png")
     print(write_learning_curve(*map(Path, arguments.run_dirs), out=arguments.out))
     return 0
-
-
-PLOT = Command(
-    examples(
-        "python -m trainer plot runs/phil_1",
-        "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
-    ),
-    _add_plot_arguments,
-    _plot,
-)
 
 
 def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:

@@ -16,8 +16,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from bridge.policy_file import add_envelope, make_policy, write_policy
-from edge_runtime.cli import examples
+from bridge.policy_file import make_policy, write_policy
 from edge_runtime.files import check_writable
 from edge_runtime.policy import policy_id_of
 from edge_runtime.tls import read_signing_key
@@ -27,20 +26,9 @@ from trainer.environments import entries_of, make_environment, task_of
 from trainer.learner.networks import Actor
 from trainer.training.config import CONFIG_FILE, period_of
 
-EXAMPLE = examples(
-    "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key"
-)
 OPSET = 17  # The oldest onnxruntime that a board may have reads it
 PARITY_OBSERVATIONS = 1000
 PARITY_TOLERANCE = 1e-5
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
-    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
-    parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
-    add_envelope(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

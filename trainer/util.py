@@ -184,6 +184,12 @@ def die_with_parent() -> None:
     os._exit(1)
 
 
+def kept(path: str) -> str:
+    """The path of what the repository keeps, from whatever folder; in its root as it is."""
+    root = Path(__file__).parents[1]
+    return path if Path.cwd() == root else str(root / path)
+
+
 @cache
 def source_revision(directory: Path = Path(__file__).parent) -> str:
     """A repository's commit, ``-dirty`` where files differ from it, or ``unknown``.

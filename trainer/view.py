@@ -28,7 +28,6 @@ from bridge.rerun import (
     POLICY,
     SERVE,
     ViewerGone,
-    add_sink,
     check_sink,
     draw,
     flush,
@@ -42,7 +41,7 @@ import rerun.blueprint as rrb
 from bridge.messages import Pace, SeenScene, read_scene
 from bridge.report import GOAL
 from bridge.rerun.draw import Plot
-from edge_runtime.cli import examples, sigterm_as_interrupt
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.util import UserError, counted
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS, Reason
@@ -52,10 +51,6 @@ from trainer.person.recording import Step, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun
 
-EXAMPLE = examples(
-    "python -m trainer view runs/drives --serve",
-    "python -m trainer view runs/mine/sittings/sitting-0001.mcap --save sitting.rrd",
-)
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
 MOST_WAITING = 500
@@ -107,13 +102,6 @@ LINES = {
 }
 DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    what = "sitting-NNNN.mcap, a directory of such, or a run that a person guided"
-    parser.add_argument("recordings", metavar="RECORDING", nargs="+", help=what)
-    add_sink(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

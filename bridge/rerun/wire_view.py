@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bridge.messages import DECODERS, Heard, Pace, Scene, decode, images_of, is_picture, period_of
-from bridge.ports import add_options, open_listener, wait_to_be_told
+from bridge.ports import open_listener, wait_to_be_told
 from bridge.record import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.rerun import (
@@ -27,7 +27,6 @@ from bridge.rerun import (
     POLICY,
     SERVE,
     SUFFIX,
-    add_sink,
     check_sink,
     draw,
     flush,
@@ -36,7 +35,7 @@ from bridge.rerun import (
 from bridge.rerun.draw import Plot
 from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt, whole_number
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.commands import link_words
 from edge_runtime.manifest import Layout
 from edge_runtime.tls import tls_for
@@ -44,31 +43,6 @@ from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
-FOXGLOVE_PORT = 8765  # Where Foxglove looks first
-EXAMPLE = examples(
-    "python -m bridge view --serve",
-    "python -m bridge view --save drive.rrd --wait-s 60",
-    "python -m bridge view drive.mcap --save drive.rrd",
-    "python -m bridge view --foxglove",
-)
-
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "recording",
-        nargs="?",
-        metavar="F.mcap",
-        help="show what bridge record has written, instead of listening",
-    )
-    text = f"serve Foxglove, on this machine's loopback only (port {FOXGLOVE_PORT} if none is said)"
-    port: dict[str, Any] = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
-    add_sink(parser).add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **port)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    help_text = (
-        f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    )
-    add_options(parser, "--vehicle-id", default=None, help=help_text)
 
 
 def run(arguments: Any) -> int:

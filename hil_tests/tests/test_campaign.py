@@ -109,6 +109,7 @@ def test_a_row_joins_its_parts():
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
     few = sweep.Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
     monkeypatch.setattr(sweep, "NETWORK_AXES", (few,))
+    monkeypatch.chdir(tmp_path)  # The default policy is the repository's.
     out = tmp_path / "r.json"
     arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "2", "--out", str(out)]
     assert run_cli(main, arguments) == 0

@@ -28,6 +28,7 @@ from edge_runtime.vehicles.ros2 import DEFAULT_ROS2_ENDPOINT
 from hil_tests import pictures
 from hil_tests.__main__ import main
 from hil_tests.pictures import policy_sees, success_against_latency
+from trainer.util import kept
 
 ROOT = Path(__file__).parents[2]
 
@@ -182,6 +183,37 @@ def test_every_command_shows_examples_that_it_takes(folder, only_parse):
             with pytest.raises(SystemExit if lists else ParsedError) as ended:
                 main_of(folder)(example[1:])
             assert not lists or ended.value.args == (0,)
+
+
+HEAVY = ("torch", "highway_env", "matplotlib", "rerun", "scipy", "tensorboard", "pandas", "pygame")
+"""Each takes half a second or more to load."""
+SHOW_ALL = """
+import importlib, sys
+program = importlib.import_module(f"{sys.argv[1]}.__main__")
+for words in [[], *([name] for name in program.COMMANDS)]:
+    try:
+        program.main([*words, "--help"])
+    except SystemExit:
+        pass
+print(*sorted(set(sys.argv[2:]) & set(sys.modules)), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("folder", ARROWS)
+def test_no_help_waits_for_what_takes_long_to_load(folder):
+    command = [sys.executable, "-c", SHOW_ALL, folder, *HEAVY]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stderr.split() == []
+
+
+def test_what_the_repository_keeps_is_found_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    assert kept("results/policies") == "results/policies"  # As reports name it
+    monkeypatch.chdir(tmp_path)
+    assert Path(kept("results/policies")) == ROOT / "results/policies"
+    assert main_of("trainer")(["experiment", "status"]) == 0
+    done, _, units = capsys.readouterr().out.splitlines()[-1].partition(" of ")
+    assert int(done) == int(units.split()[0]) > 0
 
 
 @pytest.mark.parametrize(("folder", "least"), LEAST_WRITING.items())

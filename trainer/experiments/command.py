@@ -4,88 +4,15 @@ import argparse
 import time
 from pathlib import Path
 
-from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.util import UserError
 from trainer.experiments import plan
 from trainer.experiments.guidance import write_guidance, write_typical
-from trainer.experiments.plan import EXPERIMENTS, FOREIGN, GUIDANCE
+from trainer.experiments.plan import ALL, FOREIGN, GUIDANCE, REPORT, STATUS, TYPICAL
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
-from trainer.options import add_device, add_time_limit, check_device, deadline_s
+from trainer.options import check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
-from trainer.util import cores
-
-EXAMPLE = examples(
-    "python -m trainer experiment status",
-    "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
-    "python -m trainer experiment all --scenario congestion",
-    "python -m trainer experiment report",
-    "python -m trainer experiment guidance --max-minutes 60",
-    "python -m trainer experiment status guidance",
-)
-ALL, STATUS, REPORT, TYPICAL = "all", "status", "report", "typical"
-MOST_SEEDS = 1000
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    what = parser.add_argument_group("what is computed")
-    what.add_argument(
-        "names",
-        nargs="+",
-        metavar="NAME",
-        choices=[*EXPERIMENTS, ALL, STATUS, REPORT, GUIDANCE, TYPICAL],
-        help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need, and report; {STATUS}: "
-        f"how much is done; {REPORT}: draw the figures and judge the claims from what is done; "
-        f"{GUIDANCE}: "
-        "compute and report the table of human guidance, which is not the paper's, or with "
-        f"{STATUS} how much of it is done; "
-        f"{TYPICAL}: write the curves that a person's coach shows, from both tables' records",
-    )
-    what.add_argument(
-        "--seeds",
-        type=whole_number(1, MOST_SEEDS),
-        default=plan.DEFAULT_SEEDS,
-        help="trainings of each algorithm in each setting; the page tells of these alone",
-    )
-    what.add_argument(
-        "--scenario",
-        choices=[*plan.SCENARIOS, *FOREIGN],
-        help=f"compute this one only (default: all; {', '.join(FOREIGN)}: of {GUIDANCE})",
-    )
-    what.add_argument(
-        "--quick",
-        action="store_true",
-        help="a few steps of everything, kept in RUNS/quick: a look whose numbers mean nothing",
-    )
-    how = parser.add_argument_group("how it is computed")
-    how.add_argument(
-        "--jobs",
-        type=not_negative,
-        default=0,
-        metavar="N",
-        help="processes of one thread each; 0: one a core",
-    )
-    how.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="compute on a Ray cluster instead of this machine: HOST:PORT, auto or local",
-    )
-    add_device(how)
-    add_time_limit(
-        how,
-        "begin nothing after this time, and stop what runs after its next episode; the same "
-        "command goes on from there",
-    )
-    where = parser.add_argument_group("where it is kept")
-    for option, default, text in (
-        ("--results", None, f"records, figures and report (default: results/paper, or "
-         f"results/{GUIDANCE}; {TYPICAL}: the directory of both, results)"),
-        ("--runs", None, f"checkpoints and actors (default: runs/paper, or runs/{GUIDANCE})"),
-        ("--humans", "results/humans/paper",
-         "holds the human model of each scenario: DIR/left_turn, DIR/congestion"),
-    ):  # fmt: skip
-        where.add_argument(option, default=default, metavar="DIR", help=text)
+from trainer.util import cores, kept
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -97,15 +24,15 @@ def run(arguments: argparse.Namespace) -> int:
             f"{STATUS}, {REPORT}, {GUIDANCE} and {TYPICAL} stand alone, or {STATUS} with {GUIDANCE}"
         )
     if names == [TYPICAL]:
-        results = Path(arguments.results or "results")
+        results = Path(arguments.results or kept("results"))
         write_typical(results, Path(arguments.humans), arguments.seeds, TYPICAL_FILE)
         print(f"wrote {TYPICAL_FILE}")
         return 0
     work, quick, place = plan.PLAN, plan.QUICK, "paper"
     if GUIDANCE in names:
         work, quick, place = plan.GUIDANCE_PLAN, plan.QUICK_GUIDANCE, GUIDANCE
-    results = Path(arguments.results or f"results/{place}")
-    runs, humans = Path(arguments.runs or f"runs/{place}"), Path(arguments.humans)
+    results = Path(arguments.results or kept(f"results/{place}"))
+    runs, humans = Path(arguments.runs or kept(f"runs/{place}")), Path(arguments.humans)
     store = Store(work, results, runs, humans)
     if arguments.quick:
         store = Store(quick, runs / "quick" / "results", runs / "quick", humans)

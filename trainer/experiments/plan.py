@@ -15,8 +15,8 @@ import numpy as np
 
 from edge_runtime.util import read_bytes
 from trainer.environments import COMMAND_NOISE, CONDITIONS, expert_of, make_environment
+from trainer.human.config import MODEL_FILE
 from trainer.human.guide import HumanGuide, steps_held
-from trainer.human.model import MODEL_FILE
 from trainer.learner.config import ALGORITHMS, FASTER, Algorithm
 from trainer.training.config import BIASED as BIASED_GUIDANCE
 from trainer.training.config import LATER, PRESETS, RunConfig
@@ -133,7 +133,9 @@ LINES: Lines = (
     (NORMAL, WEIGHTS, SCENARIOS, MANY),
 )
 """All of the paper's, in the order of work."""
-GUIDANCE = "guidance"  # The fair table of human guidance, which is not the paper's
+WORDS = ALL, STATUS, REPORT, GUIDANCE, TYPICAL = "all", "status", "report", "guidance", "typical"
+"""What may stand in an experiment's place. Guidance is the fair table of human guidance, which is
+not the paper's."""
 ROWS = (
     *FOUR, "cloning_only", "rlif_td3", "pvp_td3", "pvp4real_td3", "rlpd_td3", "ppl_td3",
     "phil_gated",

@@ -36,7 +36,7 @@ from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together
 from trainer.experiments import plan
 from trainer.experiments.plan import Plan, Unit
-from trainer.human.model import MODEL_FILE
+from trainer.human.config import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE

@@ -7,51 +7,20 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.progress import ProgressBar
-from edge_runtime.cli import examples
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import options
 from trainer.environments import expert_of, make_environment
+from trainer.human.config import FIELDS, MODEL_FILE, HumanModelConfig
 from trainer.human.guide import HumanGuide, steps_held
-from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
+from trainer.human.model import REFINING_PARTS, HumanModel
 from trainer.person.recording import demonstrate, find_recordings
 from trainer.util import PERIOD_S, Purpose, claimed, episode_seed
-
-EXAMPLE = examples(
-    "python -m trainer human --scenario left_turn --out runs/human",
-    "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
-    "python -m trainer human --from runs/drives --out runs/me",
-)
-FIXED = ("learning_rate", "batch_size")
-FIELDS = [field.name for field in fields(HumanModelConfig) if field.name not in FIXED]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    options.add_scenario(parser)
-    parser.add_argument(
-        "--out", required=True, metavar="HUMAN_DIR", help="the directory of the model"
-    )
-    options.add_seed(parser, "everything that is drawn at random")
-    options.add_fields(parser, HumanModelConfig(), *FIELDS)
-    parser.add_argument(
-        "--from",
-        dest="recordings",
-        nargs="+",
-        metavar="RECORDING",
-        help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
-        "their directories, or such a training run (default: the scripted expert)",
-    )
-    options.add_time_limit(
-        parser,
-        "begin no episode after this time; the refining steps shrink in proportion to the episodes",
-    )
-    options.add_threads(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

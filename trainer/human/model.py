@@ -1,7 +1,6 @@
 """The DAgger human model of section V: imitates the human from what the human did so far."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,46 +11,12 @@ from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
 from trainer.environments import check_trained_in
+from trainer.human.config import MODEL_FILE, HumanModelConfig
 from trainer.human.guide import Driver
 from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
-from trainer.util import FROM_ONE, Purpose, check_ranges, load_torch, random_stream, save_torch
+from trainer.util import Purpose, load_torch, random_stream, save_torch
 
-MODEL_FILE = "human_model.pt"
 REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is refined
-RANGES = {(1, 2): ("frames",), FROM_ONE: ("batch_size", "episodes", "updates_per_episode")}
-"""What these numbers may be; all others are at least 0."""
-
-
-@dataclass(frozen=True)
-class HumanModelConfig:
-    """Tables A4 and A7, and what they leave open."""
-
-    frames: int = 1
-    """Frames the model sees (table A4: one). Two show speed, as a person sees it: in the left turn
-    the model then gets about 20.5 m far instead of 18.4 to 20.2. The congestion needs only one."""
-    learning_rate: float = 1e-4
-    """Table A7."""
-    batch_size: int = 128
-    """Table A7."""
-    episodes: int = 50
-    """Table A7: maximum episode number of its training."""
-    updates_per_episode: int = 60
-    """Gradient steps after each episode. Not in the paper."""
-    demonstrate_every: int = 2
-    """The person drives the whole of one episode in this many, from the second on; 0: never.
-    Interventions alone, the paper's only source, show little of what right driving looks like
-    when nothing goes wrong."""
-    label_every_step: bool = False
-    """Whether the person also says, at every step that the model drives, what they would do. A
-    scripted expert can (DAgger as of Ross et al. 2011), a person cannot. Interventions alone do
-    not correct errors too small to step in for, such as standing too far from the line."""
-    refining_updates: int = 0
-    """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
-    paper. On few examples 2,000 made no difference; on 22,000 examples 12,000 brought the left
-    turn's loss from 0.15 to 0.05."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, RANGES)
 
 
 class HumanModel(Driver):

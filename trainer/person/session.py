@@ -17,23 +17,21 @@ from typing import Any
 
 from msgspec import structs
 
-from bridge.fork import ForkedEnvironment, add_place, find_fork
+from bridge.fork import ForkedEnvironment, find_fork
 from bridge.report import DISCARDED, RESTARTED, STOPPED, failed
-from edge_runtime.cli import add_public_key, examples, positive, quit_on_signals
+from edge_runtime.cli import quit_on_signals
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
 from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import trained_in
 from trainer.human.guide import Action, Driver, Observation
-from trainer.options import add_scenario, add_seed, add_threads, set_threads
+from trainer.options import set_threads
 from trainer.person.coach import Coach, Episode
 from trainer.person.interface import (
-    HUMANS,
     Amount,
     Person,
     Reading,
     View,
-    add_person,
     amount,
     open_person,
     vector,
@@ -43,38 +41,12 @@ from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
 from trainer.util import PERIOD_S, Purpose, episode_seed
 
-EXAMPLE = examples(
-    "python -m trainer drive --human keyboard --out runs/drives",
-    "python -m trainer drive --policy runs/phil_1 --human wheel --profile my.toml \\\n"
-    "    --out runs/drives",
-    "python -m trainer drive --from drive.mcap --at 3s --human web --out runs/drives",
-)
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
 """What an environment's scene may leave out."""
 LATE_S = 0.02
 """A control period that begins later than this counts as late: a fifth of a period, about what a
 person notices."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    add_scenario(parser, "what was recorded")
-    add = parser.add_argument
-    device = "the device that your hands are on"
-    add("--human", "--device", dest="human", choices=list(HUMANS), default="keyboard", help=device)
-    driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
-    add("--policy", metavar="POLICY", help=driver)
-    add_public_key(parser)
-    forked = "each episode repeats this recorded drive until --at, and goes on from there"
-    add("--from", dest="recording", metavar="F.mcap", help=forked)
-    add_place(parser)
-    out = "the directory of the recordings; sittings add up there"
-    add("--out", metavar="REC_DIR", default="runs/drives", help=out)
-    add("--episodes", type=positive, metavar="N", help="stop after so many (default: no end)")
-    add_seed(parser, "the episodes, which are others in every sitting")
-    add_person(parser)
-    add_threads(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,7 +1,12 @@
 """The driving scenarios; importing this registers them with gymnasium."""
 
+from typing import Literal
+
 from gymnasium.envs.registration import register, registry
 
+Scene = Literal["nominal", "variant", "dense"]
+"""The trained scene; one with more vehicles and other types of them (section VII-D); one whose
+traffic stands closer and leaves less to do right."""
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario name on the command line -> gymnasium id."""
 LEFT_TURN, CONGESTION = SCENARIOS.values()

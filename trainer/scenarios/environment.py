@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import gymnasium
 import numpy as np
@@ -14,6 +14,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 from trainer.learner.replay import FRAMES_LAYOUT
+from trainer.scenarios import Scene
 from trainer.scenarios.picture import BODY, COLUMNS, ROWS, Rasteriser, Rectangle, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle, footprint
 
@@ -21,9 +22,6 @@ Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 Range = tuple[float, float]
-Scene = Literal["nominal", "variant", "dense"]
-"""The trained scene; one with more vehicles and other types of them (section VII-D); one whose
-traffic stands closer and leaves less to do right."""
 FAILURES = ("collision", "off_road")
 
 

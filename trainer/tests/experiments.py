@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from bridge.report import COLLISION, GOAL
-from trainer.drivers import MODEL_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.data import Result, Results
 from trainer.experiments.plan import (
@@ -21,7 +20,8 @@ from trainer.experiments.plan import (
     Unit,
 )
 from trainer.experiments.run import Store
-from trainer.human.model import HumanModel, HumanModelConfig
+from trainer.human.config import MODEL_FILE, HumanModelConfig
+from trainer.human.model import HumanModel
 
 TINY = replace(
     QUICK, steps=dict.fromkeys(SCENARIOS, 290), learner={"batch_size": 4, "warmup_steps": 240}

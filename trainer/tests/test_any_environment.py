@@ -34,7 +34,8 @@ from trainer.environments import (
     outer,
     task_of,
 )
-from trainer.human.model import HumanModel, HumanModelConfig
+from trainer.human.config import HumanModelConfig
+from trainer.human.model import HumanModel
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import Layout, ReplayBuffer

@@ -18,6 +18,7 @@ from trainer.__main__ import main
 from trainer.options import add_time_limit, deadline_s
 from trainer.training.command import SETTINGS
 from trainer.training.config import RunConfig
+from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
 
 POLICY = str(Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx")
@@ -143,17 +144,19 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
     train = "train --human human --out run --episodes"
     small = "--set batch_size=4 --set evaluation_runs=1"
     for words in (
-        human, f"{train} 2 {small}", f"{train} 3 {small} --resume", "export run --out policy.onnx",
+        human, f"{train} 2 {small}", f"{train} 3 {small} --resume",
+        "train --resume --out run", "train --resume --episodes 4 --out run",
+        "export run --out policy.onnx",
         "evaluate policy.onnx --runs 1", f"evaluate {CONGESTION} --runs 1",
         "evaluate run --runs 1", "evaluate human --runs 1", "plot run",
     ):  # fmt: skip
         status, _, err = call(capsys, *words.split())
         assert status == 0, err
-    changed = "--seed 0 (now 8), --set evaluation_runs=1 (now 30), --set batch_size=4 (now 128)"
+    assert len(read_metrics(Path("run"))) == 4
     for words, said in (
         (f"{train} 2", "--resume"),
-        (f"{train} 2 {small} --resume", "is a run of --episodes 3: repeat that, or more"),
-        (f"{train} 4 --seed 8 --resume", changed),
+        (f"{train} 2 {small} --resume", "is a run of --episodes 4: repeat that, or more"),
+        (f"{train} 4 --seed 8 --resume", "was trained with --seed 0 (now 8): repeat"),
         (human, "holds a human model"),
     ):
         assert said in refusal(capsys, *words.split())
@@ -196,6 +199,7 @@ def config(tmp_path, capsys):
     return values, refused
 
 
+OTHERS = "--seed 0 --human expert --set evaluate_every_steps=500 --set batch_size=128"
 GIVEN = "--seed 3 --episodes 4 --human keyboard --set batch_size=8 --set evaluate_every_steps=7"
 
 
@@ -204,13 +208,30 @@ def test_changed_settings_are_named_as_they_are_given(config):
     assert (
         "was trained with --seed 3 (now 0), --human keyboard|gamepad|wheel|web (now expert), "
         "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
-    ) in refused(values)
+    ) in refused(values, *OTHERS.split())
+    assert "name --human keyboard" in refused(values)  # Which of them, no file says.
+    assert "averaged_actor=True (now False)" in refused(
+        values, "--preset", "printed", "--human", "web"
+    )
     given = GIVEN.replace("keyboard", "expert").split()
     assert "is not a checkpoint of this project" in refused({**values, "human": "expert"}, *given)
     # What came later had its default.
     del values["learner"]["gamma"], values["averaged_actor"], values["period_s"]
     err = refused(values, *GIVEN.split())
     assert "no averaged_actor (now True), no gamma (now 0.95): repeat" in err
+
+
+def test_no_file_of_a_run_decides_what_is_imported(config, tmp_path, monkeypatch):
+    values, refused = config
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
+    for name, default in (
+        ("scenario", "left_turn"),
+        ("algorithm", "phil_td3"),
+        ("human", "expert"),
+    ):
+        changed = f"--{name} planted:Any (now {default}): repeat"
+        assert changed in refused({**values, "human": "expert", name: "planted:Any"})
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from trainer import drivers
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import CONDITIONS, Drive, drive_episodes, drive_together, evaluate
-from trainer.human.model import MODEL_FILE
+from trainer.human.config import MODEL_FILE
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 

@@ -10,9 +10,10 @@ import torch
 from edge_runtime.util import UserError
 from trainer.drivers import constant_driver, load_driver
 from trainer.environments import expert_of, make_environment
+from trainer.human.config import HumanModelConfig
 from trainer.human.dagger import imitate
 from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, steps_held
-from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
+from trainer.human.model import HumanModel, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv

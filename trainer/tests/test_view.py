@@ -26,10 +26,9 @@ from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
 from trainer.person.recording import Recorder, packed, read_steps
 from trainer.person.tests.people import record, recorded_step
-from trainer.pictures import CURVE_FILE
 from trainer.tests.test_td3 import same_weights
 from trainer.tests.test_training import rows_of
-from trainer.training.config import RunConfig
+from trainer.training.config import CURVE_FILE, RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.view import Episode, Steps, Watcher

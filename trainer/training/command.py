@@ -22,38 +22,28 @@ from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from bridge.rerun import check_sink
-from edge_runtime.cli import INTERRUPTED, examples, positive_number, quit_on_signals
+from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, read_json, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
 from trainer.environments import scenario_of
-from trainer.learner.config import ALGORITHMS, LearnerConfig, find_algorithm
+from trainer.learner.config import LearnerConfig, find_algorithm
 from trainer.person.interface import (
     FASTEST,
     HUMANS,
     PERSON,
     SLOWEST,
-    add_person,
     check_person_options,
 )
 from trainer.pictures import write_learning_curve
-from trainer.training.config import CONFIG_FILE, LATER, PRESETS, RunConfig
+from trainer.training.config import CONFIG_FILE, EXTENT, LATER, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import PERIOD_S, claimed
+from trainer.util import claimed
 
-EXAMPLE = examples(
-    "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
-    "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
-    "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
-    "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
-    "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
-    "python -m trainer train --set    # lists the settings",
-)
 DEFAULTS = RunConfig()
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
-EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 SETTINGS: dict[str, Any] = {
     **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
     **asdict(DEFAULTS.learner),
@@ -64,76 +54,13 @@ _STDERR = 2
 _ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.register("action", None, _Noted)
-    what = parser.add_argument_group("what is trained")
-    options.add_scenario(what)
-    what.add_argument(
-        "--algorithm",
-        default=DEFAULTS.algorithm,
-        metavar="NAME",
-        help=f"the learner: {', '.join(ALGORITHMS)}, one of an installed package, or module:ROW",
-    )
-    options.add_seed(what, "everything that is drawn at random")
-    options.add_fields(what, DEFAULTS, *EXTENT)
-    what.add_argument(
-        "--preset",
-        choices=list(PRESETS),
-        default="ours",
-        help="the settings to start from: this project's, or the paper's as they are printed",
-    )
-    what.add_argument(
-        "--config",
-        metavar="F.toml",
-        help="take options and settings from this file, as a run's own config.toml; options on "
-        "the command line win, but no setting may come from both",
-    )
-    what.add_argument(
-        "--set",
-        action=_Set,
-        nargs="?",
-        default=[],
-        metavar="NAME=VALUE",
-        help="change a setting, as often as you like; without a value: list all with their "
-        "defaults and meanings",
-    )
-    what.add_argument(
-        "--period",
-        action=_Set,
-        dest="set",
-        type=lambda text: f"period_s={positive_number(text)}",
-        default=[],
-        metavar="SECONDS",
-        help=f"seconds of a step, for an environment that does not say (default: {PERIOD_S})",
-    )
-    options.add_latency(what, "the network between policy and vehicle, also in validation")
-    guide = parser.add_argument_group("the human")
-    guide.add_argument(
-        "--human",
-        default=DEFAULTS.human,
-        metavar=f"expert|module:Class|HUMAN_DIR|{'|'.join(HUMANS)}",
-        help="the scripted expert, a model trained by `trainer human`, or you",
-    )
-    add_person(parser)
-    how = parser.add_argument_group("the run")
-    how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
-    how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
-    options.add_time_limit(how, "stop after the episode that passes this time")
-    options.add_device(how)
-    options.add_threads(how)
-    how.add_argument(
-        "--rerun",
-        metavar="spawn|serve|F.rrd",
-        help="show the run in rerun: in a window, on a page on this machine, or into a file",
-    )
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Train, showing progress; returns the exit status."""
-    settings = arguments.set
+    settings, own = arguments.set, Path(arguments.out) / CONFIG_FILE
     if arguments.config is not None:
         settings = [*_take_config(arguments), *settings]
+    elif arguments.resume and own.is_file():
+        settings = [*_take_own(arguments, own), *settings]
     known = {**vars(arguments), "settings": settings}
     done = train(**{name: known[name] for name in inspect.signature(train).parameters})
     return INTERRUPTED if done.interrupted else 0
@@ -327,7 +254,27 @@ def _take_config(arguments: argparse.Namespace) -> list[str]:
     for option, names in both.items():
         if clash := [name for name in values if name in names]:
             raise UserError(f"config {path} sets {clash[0]}, and so does --{option}: leave one out")
-    assignments = []
+    return _take(arguments, path, values)
+
+
+def _take_own(arguments: argparse.Namespace, path: Path) -> list[str]:
+    """The same of the run's own config, where it goes on; `check_directory` compares the rest.
+
+    What ``--preset`` may change is the preset's where one is given. A name of a module is to be
+    typed again: no file decides what is imported.
+    """
+    kept = {*SETTINGS, *OPTIONS, *EXTENT}
+    if "preset" in getattr(arguments, "given", ()):
+        kept -= set().union(*map(_preset_names, PRESETS))
+    values = {name: v for name, v in _flat(read_json(path, "run config")).items() if name in kept}
+    for name in ("scenario", "algorithm", "human"):
+        if ":" in str(values.get(name)):
+            del values[name]
+    return _take(arguments, path, values)
+
+
+def _take(arguments: argparse.Namespace, path: Path, values: dict[str, Any]) -> list[str]:
+    assignments, given = [], getattr(arguments, "given", ())
     for name, value in values.items():
         if name not in (*OPTIONS, *EXTENT, "preset"):
             assignments.append(f"{name}={value}")
@@ -342,29 +289,6 @@ def _preset_names(preset: str) -> set[str]:
     """The settings that it changes."""
     changed = _flat(asdict(PRESETS[preset]))
     return {name for name, default in SETTINGS.items() if changed[name] != default}
-
-
-class _Noted(argparse._StoreAction):
-    """Stores an option's value, and that it was given: such a value wins over ``--config``."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
-        super().__call__(parser, namespace, values, option)
-        namespace.given = {*getattr(namespace, "given", ()), self.dest}
-
-
-class _Set(argparse.Action):
-    """``--set NAME=VALUE``, collected; ``--set`` alone lists the settings, as --help does options.
-
-    Other options need not be there for that.
-    """
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: Any, value: Any, option: str | None = None
-    ) -> None:
-        if value is None:
-            print("\n".join(setting_lines()))
-            parser.exit()
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
 def setting_lines() -> Iterator[str]:

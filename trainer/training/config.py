@@ -29,6 +29,8 @@ LATER = (
 )  # fmt: skip
 """Fields of a run's config and of an algorithm's row that came after the first records. A run or a
 record without one had its default."""
+CURVE_FILE = "learning_curve.png"
+EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
 """A run's settings in its directory; the first with the source's revision, the second for
 ``--config``."""
