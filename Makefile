@@ -19,8 +19,9 @@ help:  ## this list
 $(STAMP): pyproject.toml requirements/workstation.txt
 	@$(PYTHON) -c 'import sys; assert sys.version_info[:2] >= (3, 11)' 2>/dev/null || \
 		{ echo "make: Python 3.11 or newer is needed; name it with PYTHON=/path/to/python" >&2; exit 2; }
+	@echo "make: installs what requirements/workstation.txt locks into $(VENV): 2.7 GB, about two minutes" >&2
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[dev]'
+	$(BIN)/python -m pip install $$(test -t 2 || echo --quiet) --constraint requirements/workstation.txt --editable '.[dev]'
 	@touch $@
 
 install: $(STAMP)  ## the virtual environment with the locked dependencies

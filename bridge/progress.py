@@ -56,9 +56,9 @@ class ProgressBar:
         now_s = time.monotonic()
         if told:
             self.say(told)
-        elif now_s - self._line_s > LINE_INTERVAL_S or self.done == self.total:
+        elif now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total:
             self._line_s = now_s
             each_s = (now_s - self._began_s) / max(self.done - self._began_at, 1)
-            left = f"ETA {each_s * (self.total - self.done):.0f} s"
+            left = f"ETA {each_s * max(self.total - self.done, 0):.0f} s"
             line = f"{self.what}: {self.done}/{self.total}  {text}  {left}"
             print(line, file=sys.stderr, flush=True)

@@ -12,8 +12,10 @@ import math
 import os
 import signal
 import sys
+import textwrap
 import time
 from importlib import import_module
+from itertools import takewhile
 from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple, Union
 
 from edge_runtime import __version__
@@ -28,14 +30,18 @@ _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Shows the default of every option that has one, and keeps paragraphs and examples."""
+    """Shows the default of every option that has one, and keeps paragraphs, examples and words."""
+
+    def _split_lines(self, text: str, width: int) -> List[str]:
+        # An option's name broken at its hyphen could not be copied.
+        return textwrap.wrap(text, width, break_on_hyphens=False, break_long_words=False)
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         # Examples are copied into a shell: their lines stay as they are.
         return "\n\n".join(
             paragraph
             if paragraph.startswith("example")
-            else super(HelpFormatter, self)._fill_text(paragraph, width, indent)
+            else "\n".join(indent + line for line in self._split_lines(paragraph, width))
             for paragraph in text.strip().split("\n\n")
         )
 
@@ -61,7 +67,7 @@ class ArgumentParser(argparse.ArgumentParser):
         """As argparse, but an empty value is an error: no option here means anything by it.
 
         An unset shell variable expands to an empty string, which as a path is the current
-        directory.
+        directory. An unknown option is told before one that is missing.
         """
         given = sys.argv[1:] if args is None else list(args)
         before = ""
@@ -72,6 +78,12 @@ class ArgumentParser(argparse.ArgumentParser):
             if value.startswith("--") and value.find("=") == len(value) - 1:
                 self.error(f"an empty value after {value[:-1]}")
             before = value
+        for value in takewhile("--".__ne__, given if self._subparsers is None else ()):
+            name, known = value.partition("=")[0], self._option_string_actions
+            if name.startswith("--") and " " not in value and name not in known:
+                near = difflib.get_close_matches(name, known, 1)
+                guess = f"; did you mean {near[0]}?" if near else ""
+                self.error(f"there is no option {name}{guess}")
         return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -124,7 +136,7 @@ def program(
         parser = ArgumentParser(prog=name, description=description, epilog=examples(*shown))
         parser.add_argument("--version", action="version", version=__version__)
         word = argv[0] if argv else "--help"
-        near = difflib.get_close_matches(word, commands, 1)
+        near = difflib.get_close_matches(word, (*commands, "--help", "--version"), 1)
         if near and near[0] != word:
             parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
         parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

@@ -88,13 +88,23 @@ def _judge(bench: Bench) -> None:
     """Say what is wrong by each rule, in their order."""
     for is_kept in RULES.values():
         try:
-            words = "" if is_kept(bench) else f"last report: {bench.last}"
+            words = "" if is_kept(bench) else _in_words(bench.last)
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
             words = f"{type(error).__name__}: {error}"
         if bench.is_over:
             return
         bench.say(words)
+
+
+def _in_words(report: VehicleReport | None) -> str:
+    """The last report, for a person."""
+    if report is None:
+        return "it has not reported yet"
+    values = {**report.action, "speed_mps": report.speed_mps}
+    told = [f"{name} {value}" for name, value in values.items()]
+    told += ["braking by itself"] * bool(report.self_braking)
+    return f"last report: {', '.join(told)}; faults: {', '.join(report.faults) or 'none'}"
 
 
 class Bench:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bridge import report as reports
+from bridge.progress import ProgressBar
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
@@ -73,6 +74,12 @@ def test_summarise_by_hand():
 def test_a_table_in_markdown_keeps_its_columns():
     lines = reports.markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
     assert list(lines) == ["| row | p50 |", "|---|---|", "| a/b | 1 |", "| c | None |", ""]
+
+
+def test_no_progress_tells_of_less_than_nothing_to_come(capsys):
+    with ProgressBar("training", 10) as bar:
+        bar.advance({"return": "3.0"}, 14)  # An episode is driven to its end.
+    assert capsys.readouterr().err == "training: 14/10  return 3.0  ETA 0 s\n"
 
 
 def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):

@@ -214,6 +214,31 @@ def test_help_shows_every_default_that_says_something():
     assert (text.count("(default: "), text.count("None"), text.count("False")) == (3, 0, 0)
 
 
+def test_an_option_that_there_is_not_is_guessed_before_one_is_missed(capsys):
+    parser = cli.ArgumentParser(prog="x")
+    parser.add_argument("--steps", required=True)
+    parser.add_argument("names", nargs="*")
+    for words, guess in (
+        (["--stepps", "3"], "--stepps; did you mean --steps?"),
+        (["--stepps=3"], "--stepps; did you mean --steps?"),
+        (["--quux"], "--quux (see x --help)"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            parser.parse_args(words)
+        assert ended.value.code == 2
+        assert capsys.readouterr().err.startswith(f"x: there is no option {guess}")
+    assert parser.parse_args(["--steps=--a b", "--", "--stepps"]).names == ["--stepps"]
+
+
+def test_help_breaks_no_word(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    words = "see --max-minutes or trainer.experiments.command:add_arguments_of_it"
+    parser = cli.ArgumentParser(prog="x", description=words)
+    parser.add_argument("--out", help=words)
+    text = parser.format_help().split()
+    assert all(text.count(word) == 2 for word in words.split())
+
+
 HOSTILE = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e"
 
 

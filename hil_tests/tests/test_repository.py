@@ -185,6 +185,15 @@ def test_every_command_shows_examples_that_it_takes(folder, only_parse):
             assert not lists or ended.value.args == (0,)
 
 
+@pytest.mark.parametrize("folder", ARROWS)
+def test_every_command_guesses_which_option_is_meant(folder, only_parse):
+    for words in [[], *([name] for name in subcommands_in(help_of(folder, [], only_parse)))]:
+        with pytest.raises(SystemExit) as ended:
+            main_of(folder)([*words, "--hepl"])
+        assert ended.value.code == 2
+        assert "did you mean --help?" in only_parse[-1]
+
+
 HEAVY = ("torch", "highway_env", "matplotlib", "rerun", "scipy", "tensorboard", "pandas", "pygame")
 """Each takes half a second or more to load."""
 SHOW_ALL = """

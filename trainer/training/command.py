@@ -297,7 +297,10 @@ def setting_lines() -> Iterator[str]:
     for name, default in SETTINGS.items():
         typed = str(default).lower() if isinstance(default, bool) else str(default)
         begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
-        yield textwrap.fill(said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent)
+        yield textwrap.fill(
+            said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent,
+            break_on_hyphens=False,
+        )  # fmt: skip
 
 
 def parse_setting(assignment: str) -> tuple[str, Any]:
