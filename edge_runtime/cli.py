@@ -16,7 +16,7 @@ import textwrap
 import time
 from importlib import import_module
 from itertools import takewhile
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple, Union
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
 
 from edge_runtime import __version__
 from edge_runtime.util import UserError, ending_signals, printable, take_signals
@@ -108,18 +108,17 @@ def add_public_key(parser: argparse.ArgumentParser) -> None:
 
 
 class Command(NamedTuple):
-    """A command, in a module that has several. `run` may be a `module:function` that loads long."""
+    """A command, in a module that has several."""
 
     EXAMPLE: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Union[str, Callable[[argparse.Namespace], int]]
+    run: Callable[[argparse.Namespace], int]
 
 
-def command(
-    run: str, *shown: str
-) -> Callable[[Callable[[argparse.ArgumentParser], None]], Command]:
-    """Decorate what declares a command's options; `shown` are examples of the help."""
-    return lambda add_arguments: Command(examples(*shown), add_arguments, run)
+def command(place: str, *shown: str) -> Callable[[Callable[[Any], None]], Command]:
+    """Decorate what declares a command's options; `module:function` at `place` is loaded to run."""
+    text = examples(*shown)
+    return lambda add: Command(text, add, lambda arguments: int(_load(place)(arguments)))
 
 
 def program(
@@ -149,8 +148,7 @@ def program(
                 one.epilog = chosen.EXAMPLE
                 chosen.add_arguments(one)
         arguments = parser.parse_args(argv or ["--help"])
-        run = _load(chosen.run) if isinstance(chosen.run, str) else chosen.run
-        return int(run(arguments))
+        return int(chosen.run(arguments))
 
     return main
 

@@ -215,6 +215,21 @@ def test_no_help_waits_for_what_takes_long_to_load(folder):
     assert done.stderr.split() == []
 
 
+def test_no_test_depends_on_plugins_that_happen_to_be_installed(tmp_path):
+    about = tmp_path / "foreign-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: foreign\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(
+        "[phil.vehicles]\ntank = foreign:Tank\n[pytest11]\nforeign = foreign\n"
+    )
+    (tmp_path / "foreign.py").write_text("raise ImportError('of a plug-in')")
+    inner = ["--basetemp", str(tmp_path / "inner"), "-p", "no:cacheprovider", "-k", "tank"]
+    command = [sys.executable, "-m", "pytest", *inner, "edge_runtime/tests/test_vehicles.py"]
+    env = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
 def test_what_the_repository_keeps_is_found_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     assert kept("results/policies") == "results/policies"  # As reports name it
