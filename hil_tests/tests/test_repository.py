@@ -230,6 +230,14 @@ def test_no_test_depends_on_plugins_that_happen_to_be_installed(tmp_path):
     assert done.returncode == 0, done.stdout
 
 
+def test_make_install_says_first_what_it_takes():
+    command = ["make", "--dry-run", "--always-make", "install"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    said, _, rest = done.stdout.partition(" -m pip install ")
+    assert "GB, about two minutes" in said
+    assert rest
+
+
 def test_what_the_repository_keeps_is_found_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     assert kept("results/policies") == "results/policies"  # As reports name it
