@@ -13,7 +13,7 @@ from edge_runtime.cli import Command, examples
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import infer, load_policy, probes
-from edge_runtime.service import quantiles_ms
+from edge_runtime.service import peak_memory_mb, quantiles_ms
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.util import UserError, parse_json, printable
@@ -47,9 +47,11 @@ def _check(arguments: argparse.Namespace) -> int:
     report = {
         "policy_id": policy.policy_id,
         "trust": policy.trust,
+        "public_key": policy.public_key,
         "manifest": msgspec.to_builtins(policy.manifest),
         "inference_ms": inference_ms,
         "inference_runs": _RUNS,
+        "memory_mb": peak_memory_mb(),
         "onnxruntime": onnxruntime.__version__,
     }
     print(json.dumps(report, indent=2))

@@ -9,6 +9,7 @@ manifest (manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, sec
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import io
 import time
@@ -33,7 +34,8 @@ UNSIGNED = "unsigned"
 
 OPSETS = range(13, 22)
 MAX_IR_VERSION = 10
-MAX_POLICY_MIB = 512
+MAX_POLICY_MIB = 96
+"""Loading takes 90 MB and up to 3.9 times the file: that fits phil-edge.service's MemoryMax."""
 OUTPUT = "action"
 _RANGE_TOLERANCE = 1e-5  # Of an action's whole range: the last bits of a network's tanh
 
@@ -46,6 +48,7 @@ class Policy(NamedTuple):
     layout: Layout
     trust: str
     policy_id: str
+    public_key: Optional[str] = None  # The file of the key that it was verified by
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The action, float32 [n], for the arrays of `layout`. It may hold NaN: check it.
@@ -54,7 +57,8 @@ class Policy(NamedTuple):
         onnxruntime raises.
         """
         inputs = {name: array[np.newaxis] for name, array in observation.items()}
-        answer: np.ndarray = self.session.run([OUTPUT], inputs)[0]
+        with _flushed():
+            answer: np.ndarray = self.session.run([OUTPUT], inputs)[0]
         if answer.dtype != np.float32 or answer.shape != (1, len(self.manifest.action)):
             raise UserError(f"the policy answers with {answer.dtype} {list(answer.shape)}")
         return answer[0]
@@ -71,9 +75,9 @@ def load_policy(
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
     data = read_bytes(path, "policy file", MAX_POLICY_MIB)
-    trust = check_trust(path, data, public_key, allow_unsigned)
+    trust, key_file = check_trust(path, data, public_key, allow_unsigned)
     try:
-        return open_policy(data, trust)
+        return open_policy(data, trust)._replace(public_key=key_file)
     except UserError as error:
         raise UserError(f"policy {Path(path)} may not drive: {error}") from None
 
@@ -129,14 +133,38 @@ def open_network(data: bytes) -> onnxruntime.InferenceSession:
     # One thread: so small a network gains nothing from more, and the board has other work.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
+    # Else numbers near zero, as of a dark picture, make a network ten times slower.
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
     # Read as what was checked: bytes can be an ONNX file and one of onnxruntime's own format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # It prints "EP Error" on stdout for some broken files; stdout belongs to our reports.
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), _flushed():
             return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no narrower base
         raise UserError(f"onnxruntime does not load it: {error}") from None
+
+
+_libc = ctypes.PyDLL(None)
+_flushing = ctypes.create_string_buffer(64)  # An fenv_t: how a thread computes
+_libc.fegetenv(_flushing)
+
+
+@contextlib.contextmanager
+def _flushed() -> Iterator[None]:
+    """Compute as a session asks for; what this thread computes later is none of its business.
+
+    onnxruntime sets the processor so for good, by a process's first session and for the thread
+    that makes it alone. What it has set is kept here, for every thread.
+    """
+    before = ctypes.create_string_buffer(64)
+    _libc.fegetenv(before)
+    _libc.fesetenv(_flushing)
+    try:
+        yield
+    finally:
+        _libc.fegetenv(_flushing)
+        _libc.fesetenv(before)
 
 
 def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
@@ -218,18 +246,19 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
 
 def check_trust(
     path: PathLike, policy_bytes: bytes, public_key: Optional[PathLike], allow_unsigned: bool
-) -> str:
+) -> tuple[str, Optional[str]]:
     """VERIFIED, BESIDE, UNVERIFIED or UNSIGNED for a policy that may drive; UserError for others.
 
-    A signature is always verified where a public key is known; `allow_unsigned` lets through
-    only what cannot be verified, never what fails to. With it, a key beside the policy comes before
-    that of the working directory. Without it, such a key counts for nothing: a person who
-    brings a policy could bring it, too.
+    The second is the file of the public key that verified it, if any. A signature is always
+    verified where a public key is known; `allow_unsigned` lets through only what cannot be
+    verified, never what fails to. With it, a key beside the policy comes before that of the
+    working directory. Without it, such a key counts for nothing: a person who brings a policy
+    could bring it, too.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
         if allow_unsigned:
-            return UNSIGNED
+            return UNSIGNED, None
         help_ = f"{signature_path.name} is missing; sign it, or allow it with --allow-unsigned"
         raise UserError(f"policy {path} is not signed: {help_}")
     signature = read_bytes(signature_path, "signature")
@@ -240,7 +269,7 @@ def check_trust(
         public_key = DEFAULT_PUBLIC_KEY
     if public_key is None:
         if allow_unsigned:
-            return UNVERIFIED
+            return UNVERIFIED, None
         help_ = f"name it with --public-key, or put it at {DEFAULT_PUBLIC_KEY}"
         raise UserError(f"no public key to verify {signature_path.name} with: {help_}")
     key_pem = read_bytes(public_key, "public key")
@@ -251,7 +280,7 @@ def check_trust(
             f"signature {signature_path}, public key {public_key}: {error};"
             " name the key of its signer with --public-key"
         ) from None
-    return trust
+    return trust, str(Path(public_key).absolute())
 
 
 # Field numbers of onnx.proto (ONNX 1.12 and later; they never change), by kind of message: plain
@@ -276,6 +305,31 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
     "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
 
+# What may not be in a network, by reason: operators, with the inputs that decide it (none: whatever
+# goes in). At random answers one that has such an input; the cost is the observation's where such
+# an input follows from that, and not from weights and shapes alone.
+_RANDOM, _COST = "answers at random", "takes as long as the observation makes it"
+_AT_RANDOM = ("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform",
+              "RandomUniformLike")  # fmt: skip
+_BY_FIRST = ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow", "NonZero",
+             "StringNormalizer", "StringSplit", "Unique")  # fmt: skip
+_BY_SECOND = ("AffineGrid", "CenterCropPad", "Compress", "Expand", "OneHot", "Reshape", "RoiAlign",
+              "SequenceAt", "SequenceErase", "Split", "SplitToSequence", "Squeeze", "Tile", "TopK",
+              "Unsqueeze")  # fmt: skip
+_OVER = ("L1", "L2", "LogSum", "LogSumExp", "Max", "Mean", "Min", "Prod", "Sum", "SumSquare")
+_OPERATORS: dict[str, dict[str, Sequence[int]]] = {
+    _RANDOM: {**dict.fromkeys(_AT_RANDOM, ()), "Dropout": (2,)},
+    _COST: {
+        **dict.fromkeys(_BY_FIRST, (0,)),
+        **dict.fromkeys((*_BY_SECOND, *(f"Reduce{what}" for what in _OVER)), (1,)),
+        **dict.fromkeys(("MaxUnpool", "SequenceInsert"), (2,)),
+        **dict.fromkeys(("GRU", "LSTM", "RNN"), (4,)),
+        **dict.fromkeys(("MelWeightMatrix", "NonMaxSuppression", "Range"), range(5)),
+        **dict.fromkeys(("Col2Im", "DFT", "Pad", "Resize", "Slice", "STFT"), range(1, 5)),
+    },
+}
+_OF_SHAPES = ("SequenceLength", "Shape", "Size")  # Each observation has the same.
+
 
 def check_graph(data: bytes) -> dict[str, str]:
     """Check a whole ONNX file, which onnxruntime does not, and return its metadata.
@@ -297,6 +351,7 @@ def check_graph(data: bytes) -> dict[str, str]:
             raise ValueError("it names no operator set")
         entries = [dict(_fields(_bytes(value))) for number, value in model if number == 14]
         metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
+        _check_operators(next(_bytes(value) for number, value in model if number == 7))
     except ValueError as error:
         raise UserError(f"not a whole ONNX file: {error}") from None
     ir_version, opset = versions[-1], max(numbers)
@@ -304,6 +359,25 @@ def check_graph(data: bytes) -> dict[str, str]:
         needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
         raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
     return metadata
+
+
+def _check_operators(graph: memoryview) -> None:
+    """Raise UserError for an operator of `_OPERATORS`, or one that is not ONNX's own."""
+    fields = list(_fields(graph))
+    tensors = (dict(_fields(value)) for number, value in fields if number == 5)
+    fixed = {"", *(_text(tensor.get(8)) for tensor in tensors)}  # "": an input left out
+    for node in (list(_fields(value)) for number, value in fields if number == 1):
+        name, domain = (_text(dict(node).get(number)) for number in (4, 7))
+        inputs, outputs = ([_text(v) for n, v in node if n == number] for number in (1, 2))
+        if domain not in ("", "ai.onnx", "ai.onnx.ml"):
+            raise UserError(f"its operator {name} is of {domain}, and not ONNX's own")
+        for reason, harmless in ((_RANDOM, {""}), (_COST, fixed)):
+            places = _OPERATORS[reason].get(name, (-1,))
+            deciding = {one for place, one in enumerate(inputs) if place in places}
+            if not places or deciding - harmless:
+                raise UserError(f"its operator {name} {reason}")
+        if name in _OF_SHAPES or fixed.issuperset(inputs):
+            fixed.update(outputs)
 
 
 def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:

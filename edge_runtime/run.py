@@ -21,7 +21,7 @@ from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
-from edge_runtime.util import PathLike, ending_signals, ends_within, take_signals
+from edge_runtime.util import PathLike, ending_signals, ends_within, printable, take_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
@@ -210,7 +210,8 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
                 log.event("warning", "policy_not_verified", trust=policy.trust)
             print(
                 f"ready vehicle_id={config.vehicle_id} vehicle={name}"
-                f" connect={config.connect} policy_id={policy.policy_id}",
+                f" connect={config.connect} policy_id={policy.policy_id}"
+                f" verified_by={printable(policy.public_key or 'none')}",
                 flush=True,
             )
             notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")

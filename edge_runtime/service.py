@@ -76,6 +76,13 @@ def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -
     return Board(max(temperatures_c, default=None), os.getloadavg()[0], rss_mb)
 
 
+def peak_memory_mb() -> Optional[float]:
+    """The most memory that this process has held so far; None where the system does not say."""
+    with contextlib.suppress(OSError, LookupError, ValueError):  # getrusage has its parent's, too
+        return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) * 1024e-6
+    return None
+
+
 class BoardWatch:
     """Looks every 2 s in a thread of its own, and keeps the last look."""
 

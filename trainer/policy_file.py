@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 
 from bridge.policy_file import make_policy, write_policy
 from edge_runtime.files import check_writable
-from edge_runtime.policy import policy_id_of
+from edge_runtime.policy import open_network, policy_id_of
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError, read_json
 from trainer.drivers import load_actor
@@ -151,7 +150,7 @@ def real_observations(scenario: str, count: int, seed: int = 0) -> NDArray[Any]:
 
 def parity(network: torch.nn.Module, model: bytes, entries: Mapping[str, NDArray[Any]]) -> float:
     """Largest absolute difference between torch and onnxruntime over observations, by entry."""
-    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    session = open_network(model)
     entries = {name: np.ascontiguousarray(values) for name, values in entries.items()}
     with torch.no_grad():
         wanted = network(*map(torch.from_numpy, entries.values())).numpy()

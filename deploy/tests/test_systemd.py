@@ -8,10 +8,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
 from deploy.installer.systemd import MAIN_UNIT, TRIAL_UNIT, Limits, Systemd
 from deploy.installer.verify import UnhealthyError
+from edge_runtime.policy import MAX_POLICY_MIB
+from edge_runtime.tests.harness import run_command
+from edge_runtime.tests.policies import write_policy
 
 UNITS = Path(__file__).parents[1] / "systemd"
 NAMES = ("phil-edge.service", "phil-can.service")
@@ -83,6 +89,25 @@ def test_the_runtime_has_a_watchdog_limits_no_rights_and_nothing_to_write_to():
     assert bus["CapabilityBoundingSet"] == "CAP_NET_ADMIN CAP_SYS_MODULE"
     assert "phil-can.service" in unit["Wants"]
     assert not {"Requires", "BindsTo", "Requisite"} & set(unit)
+
+
+def test_the_largest_policy_fits_the_services_memory(tmp_path):
+    """Its weights are a table of which one row is looked up: that takes no time."""
+    path, mib = tmp_path / "large.onnx", int(settings(NAMES[0])["MemoryMax"].removesuffix("M"))
+    graph = """large (uint8[batch, 2, 45, 80] frames) => (float[batch, 1] action) {
+        pixels = Cast<to = 1>(frames) mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
+        row = Cast<to = 7>(mean) action = Gather(table, row)
+    }"""
+    write_policy(path, graph=graph)
+    model = onnx.load(str(path))
+    rows = ((MAX_POLICY_MIB << 20) - model.ByteSize() - 100) // 4
+    table = numpy_helper.from_array(np.zeros((rows, 1), np.float32), "table")
+    model.graph.initializer.append(table)
+    path.write_bytes(model.SerializeToString())
+    assert path.stat().st_size > (MAX_POLICY_MIB << 20) - 100
+    done = run_command("check", str(path), "--allow-unsigned")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["memory_mb"] < (mib << 20) / 1e6 - 40  # the rest is `run`'s
 
 
 FAKE = """\

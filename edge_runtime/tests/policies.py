@@ -24,8 +24,6 @@ from edge_runtime.manifest import (
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
 FAULT_BRIGHTNESS = 200.0
-SLOW_LOOPS = 50_000
-_SLOW_SIZE = 512
 
 PEDAL, STEERING = (
     Action(name=name, meaning="m", unit="u", low=-1.0, high=1.0, stop=stop)
@@ -50,17 +48,15 @@ def write_policy(
     manifest_changes: Optional[Dict[str, Any]] = None,
     opset: int = 17,
     ir_version: int = 8,
-    loops: int = SLOW_LOOPS,
     graph: str = "",
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" the mean brightness scaled to [-1, 1]; "nan" is
-    "constant" until the frames are brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then
-    takes about a second at SLOW_LOOPS `loops`, and in proportion at others. `graph` is another
-    network, in ONNX's text form; it may name the constant `ten`.
+    "constant" until the frames are brighter than FAULT_BRIGHTNESS, then NaN. `graph` is another
+    network, in ONNX's text form; it may name the constants.
     """
-    made = _graph(graph, kind, value, len(actions), loops)
+    made = _graph(graph, kind, value, len(actions))
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
@@ -109,30 +105,19 @@ _ANSWERS = {
     # The root of a negative number is NaN, and NaN times zero stays NaN.
     "nan": """room = Sub(fault_brightness, mean) root = Sqrt(room) nothing = Mul(root, zero)
         answer = Add(nothing, value)""",
-    # A recurrent network over `loops` steps for bright frames, and over one for others.
-    "slow": """is_bright = Greater(mean, fault_brightness) bright = Cast<to = 7>(is_bright)
-        more = Mul(bright, loops) steps = Add(more, last_axis)
-        shape = Concat<axis = 0>(steps, last_axis, last_axis)
-        sequence = ConstantOfShape(shape)
-        every, level = RNN<hidden_size = 512>(sequence, inward, recurrent)
-        sum = ReduceSum<keepdims = 0>(level) nothing = Mul(sum, zero)
-        answer = Add(nothing, value)""",
 }
 
 
-def _graph(text: str, kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
-    size = _SLOW_SIZE if kind == "slow" else 1
+def _graph(text: str, kind: str, value: float, n_actions: int) -> onnx.GraphProto:
     weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "ten": np.array(10.0, np.float32),
+        "faint": np.array(1e-20, np.float32),
         "half_range": np.array([127.5], np.float32),
         "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
         "ones": np.ones((1, n_actions), np.float32),
-        "loops": np.array([loops], np.int64),
         "last_axis": np.array([1], np.int64),
-        "inward": np.zeros((1, size, 1), np.float32),
-        "recurrent": np.zeros((1, size, size), np.float32),
     }
     graph = onnx.parser.parse_graph(
         text
@@ -144,9 +129,6 @@ def _graph(text: str, kind: str, value: float, n_actions: int, loops: int) -> on
             action = Mul(column, ones)
         }}"""
     )
-    for node in graph.node:
-        if node.op_type == "RNN":
-            node.output[0] = ""  # one of the two outputs would fill the memory
     graph.initializer.extend(
         numpy_helper.from_array(array, name) for name, array in weights.items()
     )

@@ -53,6 +53,8 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     assert report["policy_id"] == hashlib.sha256(signed.path.read_bytes()).hexdigest()
     assert report["manifest"]["task"] == "left_turn"
     assert 0 < report["inference_ms"]["p50"] <= report["inference_ms"]["max"]
+    assert (report["trust"], report["public_key"]) == ("verified", str(signed.public_key))
+    assert 10 < report["memory_mb"] < 500
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 import random
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -164,11 +166,14 @@ def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
         (plain, "not signed", module.UNSIGNED),
     ):
         refused(path, match)
-        assert load_policy(path, allow_unsigned=True).trust == trust
+        policy = load_policy(path, allow_unsigned=True)
+        assert (policy.trust, policy.public_key) == (trust, None)
     # The one in the working directory is found.
     (tmp_path / "keys").mkdir()
     signed.public_key.rename(tmp_path / "keys" / "policy.pub")
-    assert load_policy(signed.path).trust == module.VERIFIED
+    policy = load_policy(signed.path)
+    verified = module.VERIFIED, str(tmp_path / "keys" / "policy.pub")
+    assert (policy.trust, policy.public_key) == verified
 
 
 def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypatch):
@@ -339,6 +344,89 @@ def test_what_protobuf_would_read_in_another_way_is_refused(written, added, what
     data = written.read_bytes()
     with pytest.raises(UserError, match=what):
         check_graph(data + (data if added is None else added))
+
+
+def network(answer):
+    """A network of its own with the mean of the picture, which `answer` makes an action of."""
+    return f"""own (uint8[batch, 2, 45, 80] frames) => (float[batch, 1] action) {{
+        pixels = Cast<to = 1>(frames)
+        mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
+        whole = Cast<to = 7>(mean)
+        {answer}
+    }}"""
+
+
+LEVEL = "row = Unsqueeze(mean, last_axis)"
+BY_OBSERVATION = {
+    "Range": "end = Squeeze(whole) many = Range(end, end, end) action = Cast<to = 1>(many)",
+    "Expand": "action = Expand(zero, whole)",
+    "ConstantOfShape": "action = ConstantOfShape(whole)",
+    "Tile": "action = Tile(ones, whole)",
+    "Slice": "action = Slice(ones, whole, whole)",
+    "Pad": "action = Pad(ones, whole)",
+    "TopK": f"{LEVEL} action, places = TopK(row, whole)",
+    "NonZero": "places = NonZero(mean) action = Cast<to = 1>(places)",
+    "Compress": "lit = Cast<to = 9>(whole) action = Compress(ones, lit)",
+    "LSTM": "action = LSTM<hidden_size = 1>(pixels, ones, ones, zero, whole)",
+    "ReduceMax": "action = ReduceMax(pixels, whole)",
+    "Shape": "some = NonZero(mean) size = Shape(some) action = Expand(zero, size)",
+}
+AT_RANDOM = {
+    "RandomUniform": "action = RandomUniform<shape = [1, 1]>()",
+    "RandomNormalLike": f"{LEVEL} action = RandomNormalLike(row)",
+    "Bernoulli": f"{LEVEL} action = Bernoulli(row)",
+    "Multinomial": f"{LEVEL} drawn = Multinomial(row) action = Cast<to = 1>(drawn)",
+    "Dropout": f"{LEVEL} yes = Cast<to = 9>(zero) action = Dropout(row, zero, yes)",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "answer", "why"),
+    [
+        *((name, answer, module._COST) for name, answer in BY_OBSERVATION.items()),
+        *((name, answer, module._RANDOM) for name, answer in AT_RANDOM.items()),
+        ("Mine", "action = someones.Mine(mean)", "not ONNX's own"),
+    ],
+)
+def test_neither_cost_nor_answer_may_be_left_to_the_observation_or_to_chance(
+    plain, name, answer, why
+):
+    write_policy(plain, graph=network(answer))
+    refused(plain, f"operator ({name}|NonZero) .*{why}", allow_unsigned=True)
+
+
+def test_sizes_that_follow_from_weights_and_shapes_may_drive(plain):
+    """As exporters write them: the batch's size, a range of it, a tensor made as large."""
+    answer = f"""{LEVEL} size = Shape(row) one = Size(row) none = Sub(one, one)
+        whole_steps = Range(none, one, one) steps = Cast<to = 1>(whole_steps)
+        room = ConstantOfShape(size) wide = Expand(room, size) nothing = Mul(row, zero)
+        left = Dropout(nothing) sum = Add(wide, left) all = Add(sum, steps)
+        action = Reshape(all, size)"""
+    write_policy(plain, graph=network(answer))
+    policy = load_policy(plain, allow_unsigned=True)
+    assert policy.act({"frames": np.full(SHAPE, 9, np.uint8)}).tolist() == [0.0]
+
+
+def test_numbers_near_zero_are_taken_for_zero(plain):
+    """A dark picture makes this network's numbers subnormal, and those take ten times as long.
+
+    In a process of its own: the first session of a process decides.
+    """
+    answer = f"{LEVEL} dim = Mul(row, faint) dimmer = Mul(dim, faint) action = Div(dimmer, faint)"
+    write_policy(plain, graph=network(answer))
+    act = f"""if True:
+        import numpy as np, threading
+        from edge_runtime.policy import load_policy
+        load = lambda: load_policy({str(plain)!r}, allow_unsigned=True)
+        policies = [load(), load()]
+        def act():
+            for policy in policies:
+                print(policy.act({{"frames": np.ones({SHAPE}, np.uint8)}}).tolist())
+        act()
+        threading.Thread(target=act).start()
+        print(np.float32(1e-20) * np.float32(1e-20) > 0.0)  # elsewhere nothing is changed"""
+    done = subprocess.run([sys.executable, "-c", act], capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.split("\n")) == ["", "True", *["[0.0]"] * 4]
 
 
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493  # of Ed25519, RFC 8032

@@ -146,9 +146,11 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     settings.write_text("log_format = 'json'\ncpus = [4095]\n")
     environment = {"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "400000"}
     endpoint = free_endpoint()
-    flags = [*make_policy().flags, "--connect", endpoint, "--config", str(settings)]
+    signed = make_policy()
+    flags = [*signed.flags, "--connect", endpoint, "--config", str(settings)]
     with EdgeProcess(*flags, environment=environment) as edge:
         assert edge.ready_line.startswith("ready ")
+        assert edge.ready_line.rstrip().endswith(f" verified_by={signed.public_key}")
         assert systemd.until("READY") == "READY=1\nSTATUS=standby"
         assert [systemd.next() for _ in range(3)] == ["WATCHDOG=1"] * 3
         edge.process.send_signal(signal.SIGSTOP)

@@ -5,9 +5,9 @@ done to it from outside is put in here, so that the code that drives has no swit
 ``python -m hil_tests.faults.inside router LISTEN CONNECT`` is a Zenoh router to be killed.
 
 The directory PHIL_FAULT_DIR holds the switches, which are files: ``end`` ends the episode,
-``bright`` turns pictures white, ``vehicle`` holds the fault of the mock vehicle; ``task`` holds the
-task that the policy was made for. Every press and release of the simulated brake is written to
-``brakes`` there, with its monotonic time.
+``bright`` turns pictures white, ``slow`` slows inference down, ``vehicle`` holds the fault of the
+mock vehicle; ``task`` holds the task that the policy was made for. Every press and release of the
+simulated brake is written to ``brakes`` there, with its monotonic time.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 from gymnasium import spaces
 
 from edge_runtime.manifest import Entry, Task
+from edge_runtime.policy import Policy
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
@@ -35,6 +36,7 @@ DIRECTORY = "PHIL_FAULT_DIR"
 ENVIRONMENT = "hil_tests.faults.inside:PhilEndless-v0"
 MOCK = "hil_tests.faults.inside:FaultyMockVehicle"
 END, BRIGHT, BRAKES, VEHICLE, TASK = "end", "bright", "brakes", "vehicle", "task"
+SLOW, SLOW_S = "slow", 0.25
 _FULL_MPS2, _MOST_MPS = 4.0, 12.0
 _WHITE, _DARKEST_TO_BRIGHTEST = 255, 120
 _STUCK_AT, _LEAP_MPS = -1.0, 8.0
@@ -166,9 +168,22 @@ def step_clock_on_signals() -> None:
         signal.signal(number, lambda *_, to_s=to_s: step_s.__setitem__(0, to_s))
 
 
+def slow_down_on_switch() -> None:
+    """An inference takes SLOW_S more while the switch is there."""
+    real, switch = Policy.act, Path(os.environ.get(DIRECTORY, "")) / SLOW
+
+    def act(policy: Policy, observation: Any) -> np.ndarray:
+        if switch.exists():
+            time.sleep(SLOW_S)
+        return real(policy, observation)
+
+    Policy.act = act  # type: ignore[method-assign]
+
+
 def launch(package: str) -> None:
-    """Be the command, with a clock that can be stepped."""
+    """Be the command, with a clock that can be stepped and a policy that can be slowed down."""
     step_clock_on_signals()
+    slow_down_on_switch()
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

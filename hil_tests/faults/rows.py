@@ -30,7 +30,7 @@ import numpy as np
 from bridge.recording import Recording, heard_of
 from edge_runtime.tests.policies import T
 from edge_runtime.wire import SAFE_STOP, State, decode_state
-from hil_tests.faults.inside import MOCK, VEHICLE
+from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
     RECOVERY_LIMIT_S,
@@ -154,7 +154,7 @@ LASTS_S = 1.0
 STALLED_S = 0.6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once. A
 T of more than 0.24 s needs a longer one."""
-BRIGHT_S = 0.5
+SLOWED_S = 0.5
 STARVED_S = 2.0
 SETTLED_S = 0.5
 """So long the drive is steady first: a vehicle may lag behind what it was asked before."""
@@ -278,16 +278,16 @@ def _step(process: Process, number: int) -> None:
 @fault(
     "edge sends safe_stop: inference_too_long",
     "last answered state at the probe to safe_stop on the wire",
-    policy="slow", flows=True, alone=True,
+    flows=True, alone=True,
 )  # fmt: skip
 def slow_inference(rig: Rig, number: int) -> Try:
     """Inference of about 2.5 T for 0.5 s."""
     begin_s = time.monotonic()
-    rig.bright(True)
+    rig.switch(SLOW, "")
     stop = rig.stop_command(begin_s)
     last_s = rig.last_answered_s(stop.seen_s)
-    sleep_until(begin_s + BRIGHT_S)
-    rig.bright(False)
+    sleep_until(begin_s + SLOWED_S)
+    rig.switch(SLOW, None)
     ended_s = time.monotonic()
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 

@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edge_runtime.manifest import Task
 from edge_runtime.policy import load_policy
-from edge_runtime.tests.policies import SHAPE, SLOW_LOOPS, TASK, write_policy
+from edge_runtime.tests.policies import TASK, write_policy
 from edge_runtime.util import UserError
 from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
@@ -23,25 +21,12 @@ from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase, do_fault
 from hil_tests.processes import POLICY, in_parallel, trusting
 
-SLOW_S = 2.5 * TASK.control_period_s
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
 
 
-def write_slow(path: Path) -> None:
-    """A policy that takes about SLOW_S on white frames on this machine, and no time on others."""
-    trial = path.with_suffix(".trial.onnx")
-    write_policy(trial, "slow")
-    policy = load_policy(trial, allow_unsigned=True)
-    begun_s = time.perf_counter()
-    policy.act({"frames": np.full(SHAPE, 255, np.uint8)})
-    took_s = time.perf_counter() - begun_s
-    write_policy(path, "slow", loops=max(1, round(SLOW_LOOPS * SLOW_S / took_s)))
-
-
 POLICIES: dict[str, Callable[[Path], object]] = {
-    "slow": write_slow,
     "steady": lambda path: write_policy(path, "constant", 0.6),
     "full": lambda path: write_policy(path, "constant", 1.0),
     # Brightness is its pedal: full throttle on white frames, the brake on all others.
