@@ -50,7 +50,7 @@ from edge_runtime.controller import Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import Policy, infer, load_policy
-from edge_runtime.util import UserError, counted, printable
+from edge_runtime.util import UserError, counted, name_in_file, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
 
 
@@ -119,14 +119,12 @@ class RecordedEpisode:
             )
         return step
 
-    def environment(self, named: str | None = None) -> Environment:
-        """The environment anew. UserError where there is none, or it has become another.
+    def environment(self, named: str | None = None, option: str = "--env") -> Environment:
+        """The environment anew, or the one ``named`` by the option that a person typed.
 
-        A module is imported where a person has ``named`` it, not because a file says so.
+        UserError where there is none, or it has become another.
         """
-        name = named or self.origin.environment
-        if ":" in name and named is None:
-            raise UserError(f"{self.path} was driven in {name}, a module's: name it yourself")
+        name = named or name_in_file(self.origin.environment, f"{self.path} was driven in", option)
         made = make_environment(name, self.origin.condition)
         if (now := describe(made, self.task.control_period_s).text) != self.task.text:
             raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
@@ -470,7 +468,7 @@ def _run_bisect(asked: Namespace) -> int:
     drive, fork = find_fork(asked.recording, asked)
     outcomes: dict[int, str] = {}
     with closing(drive.environment(asked.env)) as environment, tempfile.TemporaryDirectory() as tmp:
-        names, load = _policies(Path(asked.runs), Path(tmp))
+        names, load = _policies(Path(asked.runs), Path(tmp), asked.env)
         with ProgressBar("policies tried", len(names).bit_length() + 3) as bar:
 
             def succeeds(number: int) -> bool:
@@ -522,11 +520,14 @@ def first_change(count: int, succeeds: Callable[[int], bool]) -> tuple[int, bool
     return high, all(succeeds(n) == (first if n < high else last) for n in beside)
 
 
-def _policies(place: Path, folder: Path) -> tuple[list[str], Callable[[int], Policy]]:
+def _policies(
+    place: Path, folder: Path, env: str | None
+) -> tuple[list[str], Callable[[int], Policy]]:
     """The names of the policies there, in their order, and what loads one by its number.
 
-    A snapshot becomes a policy file in ``folder``. In a simulation none need be signed.
+    A snapshot of ``env`` becomes a policy file in ``folder``. In a simulation none need be signed.
     """
+    scenario = ["--scenario", env] if env else []
     paths = sorted((place / SNAPSHOTS).glob("*/"))
     if len(paths) < 2:
         paths = sorted(place.glob("*.onnx"))
@@ -538,7 +539,7 @@ def _policies(place: Path, folder: Path) -> tuple[list[str], Callable[[int], Pol
         path = paths[number]
         if path.is_dir():
             path = folder / f"{path.name}.onnx"
-            words = _trainer_command("export", str(paths[number]), "--out", str(path))
+            words = _trainer_command("export", str(paths[number]), "--out", str(path), *scenario)
             done = subprocess.run(words, capture_output=True, text=True)
             if done.returncode:
                 why = (done.stderr.strip().splitlines() or [""])[-1]

@@ -33,7 +33,7 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.ride import Ride
 from edge_runtime.safety import FRESH_STATES_TO_RECOVER, SILENCE_PERIODS, Event
 from edge_runtime.tls import tls_for
-from edge_runtime.util import UserError, printable
+from edge_runtime.util import UserError, name_in_file, printable
 from edge_runtime.vehicles import find_vehicle, installed_as, vehicle_limits
 from edge_runtime.wire import (
     DRIVE,
@@ -328,7 +328,8 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
         name = config.vehicle  # A module:Class, of which the recording has the class's name
     elif name not in (NONE, *BUILT_IN):
-        name = installed_as(name)
+        option = "--config FILE.toml with [vehicle] driver ="
+        name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
     try:
         limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)
     except UserError as error:

@@ -152,11 +152,7 @@ _libc.fegetenv(_flushing)
 
 @contextlib.contextmanager
 def _flushed() -> Iterator[None]:
-    """Compute as a session asks for; what this thread computes later is none of its business.
-
-    onnxruntime sets the processor so for good, by a process's first session and for the thread
-    that makes it alone. What it has set is kept here, for every thread.
-    """
+    """Keep to this block how a process's first session sets the processor: it does so for good."""
     before = ctypes.create_string_buffer(64)
     _libc.fegetenv(before)
     _libc.fesetenv(_flushing)
@@ -250,10 +246,9 @@ def check_trust(
     """VERIFIED, BESIDE, UNVERIFIED or UNSIGNED for a policy that may drive; UserError for others.
 
     The second is the file of the public key that verified it, if any. A signature is always
-    verified where a public key is known; `allow_unsigned` lets through only what cannot be
-    verified, never what fails to. With it, a key beside the policy comes before that of the
-    working directory. Without it, such a key counts for nothing: a person who brings a policy
-    could bring it, too.
+    verified where a key is known; `allow_unsigned` lets through only what cannot be verified, never
+    what fails to. With it, a key beside the policy comes before that of the working directory.
+    Without it, such a key counts for nothing: who brings a policy could bring it, too.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
@@ -305,30 +300,25 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
     "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
 
-# What may not be in a network, by reason: operators, with the inputs that decide it (none: whatever
-# goes in). At random answers one that has such an input; the cost is the observation's where such
-# an input follows from that, and not from weights and shapes alone.
+# Operators that are refused, why, and where one of which inputs is there (_RANDOM), or follows from
+# the observation, and not from weights and shapes alone (_COST); None: always.
 _RANDOM, _COST = "answers at random", "takes as long as the observation makes it"
-_AT_RANDOM = ("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform",
-              "RandomUniformLike")  # fmt: skip
-_BY_FIRST = ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow", "NonZero",
-             "StringNormalizer", "StringSplit", "Unique")  # fmt: skip
-_BY_SECOND = ("AffineGrid", "CenterCropPad", "Compress", "Expand", "OneHot", "Reshape", "RoiAlign",
-              "SequenceAt", "SequenceErase", "Split", "SplitToSequence", "Squeeze", "Tile", "TopK",
-              "Unsqueeze")  # fmt: skip
-_OVER = ("L1", "L2", "LogSum", "LogSumExp", "Max", "Mean", "Min", "Prod", "Sum", "SumSquare")
-_OPERATORS: dict[str, dict[str, Sequence[int]]] = {
-    _RANDOM: {**dict.fromkeys(_AT_RANDOM, ()), "Dropout": (2,)},
-    _COST: {
-        **dict.fromkeys(_BY_FIRST, (0,)),
-        **dict.fromkeys((*_BY_SECOND, *(f"Reduce{what}" for what in _OVER)), (1,)),
-        **dict.fromkeys(("MaxUnpool", "SequenceInsert"), (2,)),
-        **dict.fromkeys(("GRU", "LSTM", "RNN"), (4,)),
-        **dict.fromkeys(("MelWeightMatrix", "NonMaxSuppression", "Range"), range(5)),
-        **dict.fromkeys(("Col2Im", "DFT", "Pad", "Resize", "Slice", "STFT"), range(1, 5)),
-    },
-}
-_OF_SHAPES = ("SequenceLength", "Shape", "Size")  # Each observation has the same.
+_OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
+    (_RANDOM, None, ("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
+                     "RandomUniform", "RandomUniformLike")),
+    (_RANDOM, slice(2, 3), ("Dropout",)),
+    (_COST, slice(0, 5), ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow",
+                          "MelWeightMatrix", "NonMaxSuppression", "NonZero", "Range",
+                          "StringNormalizer", "StringSplit", "Unique")),
+    (_COST, slice(1, 5), ("AffineGrid", "CenterCropPad", "Col2Im", "Compress", "DFT", "Expand",
+                          "OneHot", "Pad", "Reshape", "Resize", "RoiAlign", "SequenceAt",
+                          "SequenceErase", "Slice", "Split", "SplitToSequence", "Squeeze", "STFT",
+                          "Tile", "TopK", "Unsqueeze", "ReduceL1", "ReduceL2", "ReduceLogSum",
+                          "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceProd",
+                          "ReduceSum", "ReduceSumSquare")),
+    (_COST, slice(2, 3), ("MaxUnpool", "SequenceInsert")),
+    (_COST, slice(4, 5), ("GRU", "LSTM", "RNN")),
+)  # fmt: skip
 
 
 def check_graph(data: bytes) -> dict[str, str]:
@@ -362,21 +352,19 @@ def check_graph(data: bytes) -> dict[str, str]:
 
 
 def _check_operators(graph: memoryview) -> None:
-    """Raise UserError for an operator of `_OPERATORS`, or one that is not ONNX's own."""
+    """Raise UserError for one of `_OPERATORS`, or that is not ONNX's own."""
     fields = list(_fields(graph))
-    tensors = (dict(_fields(value)) for number, value in fields if number == 5)
-    fixed = {"", *(_text(tensor.get(8)) for tensor in tensors)}  # "": an input left out
+    fixed = {"", *(_text(dict(_fields(tensor)).get(8)) for number, tensor in fields if number == 5)}
     for node in (list(_fields(value)) for number, value in fields if number == 1):
         name, domain = (_text(dict(node).get(number)) for number in (4, 7))
         inputs, outputs = ([_text(v) for n, v in node if n == number] for number in (1, 2))
         if domain not in ("", "ai.onnx", "ai.onnx.ml"):
             raise UserError(f"its operator {name} is of {domain}, and not ONNX's own")
-        for reason, harmless in ((_RANDOM, {""}), (_COST, fixed)):
-            places = _OPERATORS[reason].get(name, (-1,))
-            deciding = {one for place, one in enumerate(inputs) if place in places}
-            if not places or deciding - harmless:
+        for reason, part, names in _OPERATORS:
+            harmless = fixed if reason == _COST else {""}
+            if name in names and (part is None or not harmless.issuperset(inputs[part])):
                 raise UserError(f"its operator {name} {reason}")
-        if name in _OF_SHAPES or fixed.issuperset(inputs):
+        if name in ("SequenceLength", "Shape", "Size") or fixed.issuperset(inputs):
             fixed.update(outputs)
 
 

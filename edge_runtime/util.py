@@ -8,6 +8,7 @@ import contextlib
 import errno
 import json
 import os
+import shlex
 import signal
 import stat
 import threading
@@ -35,6 +36,18 @@ class UserError(Exception):
     def __str__(self) -> str:
         """The text on one line, whatever a file name or a library put into it."""
         return printable(" ".join(super().__str__().split()))
+
+
+def name_in_file(name: str, said: str, option: str) -> str:
+    """A name that a file holds, of what is to be loaded: built in, or an installed entry point.
+
+    `said` are the words before it, as in "F was trained in". No file decides what is imported:
+    UserError for `module:thing`, which a person must type after `option`.
+    """
+    if ":" in name:
+        rule = f"no file decides on what is of a module: give {option} {shlex.quote(name)}"
+        raise UserError(f"{said} {name}, a module's: {rule}")
+    return name
 
 
 def counted(count: int, noun: str) -> str:

@@ -53,7 +53,7 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, metavar="F.json", help="what is found")
     add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
     add_public_key(parser)
-    add("--env", default="left_turn", help="scenario, gymnasium id or module:id")
+    add("--env", help="scenario, gymnasium id or module:id (default: the file's, else left_turn)")
     add("--condition", choices=TEST_CONDITIONS, default="nominal", help="of the scene")
     add("--promise", type=inner, default=0.95, help="share of successes")
     add("--confidence", type=inner, default=0.95, help="of each axis's limit")

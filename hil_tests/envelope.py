@@ -44,7 +44,7 @@ from bridge.policy_file import network_of_file
 from bridge.report import GOAL, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError, read_json
+from edge_runtime.util import UserError, name_in_file, read_json
 from hil_tests.trace import failing_drive, shrunk
 from trainer.drivers import load_driver
 from trainer.environments import CONDITIONS, make_environment
@@ -349,8 +349,13 @@ def run(arguments: argparse.Namespace) -> int:
     began_s, jobs = time.monotonic(), arguments.jobs or cores()
     known = read_known(arguments.confirm) if arguments.confirm else None
     told = known or arguments  # A file tells what was driven.
-    env, condition = told.env, told.condition
-    policy = arguments.policy or told.policy or kept(f"results/policies/{env}.onnx")
+    env, policy, condition = arguments.env, arguments.policy, told.condition
+    if known:
+        said = f"{arguments.confirm} is of"
+        env = env or name_in_file(known.env, said, "--env")
+        policy = policy or name_in_file(known.policy, said, "--policy")
+    env = env or "left_turn"
+    policy = policy or kept(f"results/policies/{env}.onnx")
     environment = make_environment(env, condition)
     policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
     if known and known.policy_id != policy_id:

@@ -172,6 +172,7 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
 )
 def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
+    options.add_scenario(parser, "what the run was trained in")
     parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
     parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
     add_envelope(parser)

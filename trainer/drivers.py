@@ -13,7 +13,7 @@ import numpy as np
 
 from bridge.network import parse_spec
 from edge_runtime.controller import limit_action, neutral_action, shared_limits
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, name_in_file
 from trainer.environments import (
     check_trained_in,
     entries_of,
@@ -148,7 +148,8 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
     knows a delay, ``known_latency``, too. ``env`` is by default the one that it names.
 
-    Raises UserError: no run there, or one in another environment than ``env``.
+    Raises UserError: no run there, or one in another environment than ``env``; without ``env``, in
+    one of a module.
     """
     there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
     path = next((path for path in there if path.is_file()), None)
@@ -161,7 +162,9 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
         if "known_latency" in state:
             label["known_latency"] = state["known_latency"]
-        env = env or make_environment(label["scenario"])
+        env = env or make_environment(
+            name_in_file(label["scenario"], f"{run_dir} was trained in", "--scenario")
+        )
         check_trained_in(env, run_dir, label["scenario"])
         aware = _awareness(env, label)
         space = aware.space if aware else env.observation_space

@@ -17,7 +17,7 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
-from edge_runtime.util import UserError, counted, read_json
+from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer.drivers import ActTogether, load_driver
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
@@ -97,12 +97,11 @@ def evaluate(
         raise UserError(f"runs must be at least 1: {runs}")
     if seed < 0:
         raise UserError(f"seed must be at least 0: {seed}")
+    scenario = scenario or getattr(policy, "scenario", None)
     policy, spec = fspath(policy), parse_spec(latency)
     named, period_s = trained_in(policy, public_key)
-    if scenario is None and ":" in named and policy.endswith(".onnx"):
-        # No policy file decides what is imported.
-        raise UserError(f"{policy} was trained in {named}, of a module: give --scenario {named}")
-    scenario = scenario_of(scenario or named)
+    named = scenario or name_in_file(named, f"{policy} was trained in", "--scenario")
+    scenario = scenario_of(named)
     env = make_environment(scenario, condition, period_s=period_s)
     driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     goals = 0
@@ -128,7 +127,7 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
             known = read_json(Path(policy) / name, "config")
-            return str(known.get("scenario")), period_of(known)
+            return scenario_of(str(known.get("scenario"))), period_of(known)
     if not policy.endswith(".onnx"):
         return "left_turn", PERIOD_S
     manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
@@ -136,7 +135,7 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
     named = config.get("scenario") if isinstance(config, dict) else None
     # One of `deploy policy` names its environment itself.
     name = str(named or manifest.training.get("environment") or manifest.task)
-    return name, manifest.control_period_s
+    return scenario_of(name), manifest.control_period_s
 
 
 class Drive:

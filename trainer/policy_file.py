@@ -32,7 +32,8 @@ PARITY_TOLERANCE = 1e-5
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, check, sign; returns the exit status."""
-    made = export(arguments.run_dir, arguments.out, key=arguments.key, envelope=arguments.envelope)
+    names = ("out", "scenario", "key", "envelope")
+    made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
     signed = "signed" if arguments.key else "not signed"
     size = f"{len(made.model) / 1e6:.1f} MB"
     print(f"{arguments.out}: {size}, {signed}, policy_id {made.policy_id}")
@@ -44,13 +45,15 @@ def export(
     run: str | PathLike[str],
     out: str | PathLike[str],
     *,
+    scenario: str | None = None,
     key: str | PathLike[str] | None = None,
     envelope: str | PathLike[str] | None = None,
 ) -> Export:
     """Write a run's actor as a policy file, as ``python -m trainer export`` does.
 
-    ``run`` is what ``train`` gave, or its directory; ``key`` the private key (PEM) that signs;
-    ``envelope`` the JSON of ``hil_tests envelope`` for the same network.
+    ``run`` is what ``train`` gave, or its directory; ``scenario`` what it was trained in, to be
+    named where that is of a module; ``key`` the private key (PEM) that signs; ``envelope`` the JSON
+    of ``hil_tests envelope`` for the same network.
 
     Raises UserError: no run there, a wrong name or key, or a file that would do something else.
     """
@@ -60,7 +63,8 @@ def export(
     check_writable(path)
     if key_file:
         read_signing_key(key_file)
-    actor, label = load_actor(Path(run))
+    scenario = scenario or getattr(run, "scenario", None)
+    actor, label = load_actor(Path(run), scenario and make_environment(scenario))
     if "known_latency" in label:
         raise UserError(f"{run} needs the actions that are under way, which no state carries")
     config = read_json(Path(run) / CONFIG_FILE, "run config")

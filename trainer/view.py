@@ -291,8 +291,10 @@ class Shown:
     def _drive_again(self, episode: list[Step]) -> list[Any]:
         """The scene at each step, by the same seed and the same actions; empty where it differs."""
         first, scenes = episode[0], []
-        if first.step != 0:
-            return []  # Its beginning was in another file, which is gone.
+        module = first.scenario.rpartition(":")[0]
+        # Its beginning was in another file, which is gone; or no file decides what is imported.
+        if first.step != 0 or (module and module not in sys.modules):
+            return []
         try:
             env = self._environment(first.scenario)
         except UserError:  # It is not installed here.

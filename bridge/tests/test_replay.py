@@ -1,6 +1,7 @@
 """``python -m bridge replay``: recordings written by hand, whose right answers are known."""
 
 import json
+import sys
 
 import pytest
 
@@ -284,6 +285,17 @@ def test_a_vehicle_that_is_not_installed_is_named_by_the_settings(hand, refusal)
     words = ("--policy", make_policy(hand.path.parent, "constant"), "--allow-unsigned")
     said = refusal("replay", hand.path, *words)
     assert "--config FILE.toml: the settings it was driven by" in said
+
+
+def test_no_recording_decides_what_is_imported(hand, refusal, tmp_path, monkeypatch):
+    (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="planted:Rover", needs_rearm=False))
+    hand.drive(0, 3)
+    hand.close()
+    words = ("--policy", make_policy(hand.path.parent, "constant"), "--allow-unsigned")
+    assert "driver = planted:Rover" in refusal("replay", hand.path, *words)
+    assert "planted" not in sys.modules
 
 
 def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):

@@ -171,13 +171,7 @@ def step_clock_on_signals() -> None:
 def slow_down_on_switch() -> None:
     """An inference takes SLOW_S more while the switch is there."""
     real, switch = Policy.act, Path(os.environ.get(DIRECTORY, "")) / SLOW
-
-    def act(policy: Policy, observation: Any) -> np.ndarray:
-        if switch.exists():
-            time.sleep(SLOW_S)
-        return real(policy, observation)
-
-    Policy.act = act  # type: ignore[method-assign]
+    Policy.act = lambda *seen: (switch.exists() and time.sleep(SLOW_S), real(*seen))[1]  # type: ignore[method-assign]
 
 
 def launch(package: str) -> None:

@@ -219,10 +219,11 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
             return None
         rows = read_metrics(run_dir)
         validated = [row for row in rows if was_validated(row)]
-        tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
+        env = make_environment(unit.environment)
+        tested = load_actor(run_dir, env)[1]["episode"]  # counted from 1: after so many episodes
         record["training"] = _columns(rows, TRAINING_COLUMNS)
         record["validation"] = _columns(validated, VALIDATION_COLUMNS)
-        record["period_s"] = make_environment(unit.environment).control_period_s
+        record["period_s"] = env.control_period_s
         record["totals"] = totals(rows, record["period_s"])
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))

@@ -80,7 +80,7 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
             _, period_s = trained_in(asked.policy, asked.public_key)
         return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
-    own = recorded.environment(asked.scenario)
+    own = recorded.environment(asked.scenario, "--scenario")
     name = scenario_of(asked.scenario or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)

@@ -344,7 +344,7 @@ def test_a_step_that_has_no_length_of_its_own_takes_the_period_that_is_asked_for
     assert main([*command, *short, *words]) == 0
     said = f"Dark-v0 does not say how long a step is: {period_s} s is taken"
     assert said in capsys.readouterr().err
-    export(tmp_path / "run", tmp_path / "p.onnx")
+    export(tmp_path / "run", tmp_path / "p.onnx", scenario=f"{__name__}:test/Dark-v0")
     assert (
         load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest.control_period_s == period_s
     )

@@ -1,4 +1,5 @@
 import contextlib
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,9 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import drivers
+from trainer.__main__ import main
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import CONDITIONS, Drive, drive_episodes, drive_together, evaluate
@@ -42,6 +45,20 @@ def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name
     save_torch(tmp_path / name, {**label, **more})
     with pytest.raises(UserError, match="trained in planted:Env-v0, not in left_turn"):
         load_driver(str(tmp_path), make_environment("left_turn"))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "export"])
+def test_a_run_in_a_modules_environment_is_taken_where_that_is_typed(tmp_path, capsys, command):
+    """Nothing is imported because a file says so, and the line says what to type."""
+    planted = "trainer.tests.planted:Env-v0"  # Not there: importing it would be another line.
+    label = {"scenario": planted, "algorithm": "phil_td3", "seed": 0, "episode": 3}
+    save_torch(tmp_path / BEST_FILE, {**label, "actor": Actor().state_dict()})
+    (tmp_path / "config.json").write_text(json.dumps({"scenario": planted}))
+    words = [command, str(tmp_path), "--out", str(tmp_path / "out.onnx")]
+    for more, says in (([], f"give --scenario {planted}"), (["--scenario", planted], "no module")):
+        assert run_cli(main, [*words, *more]) == 2
+        assert says.lower() in capsys.readouterr().err.lower()
+        assert not (tmp_path / "out.onnx").exists()
 
 
 def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it():

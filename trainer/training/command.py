@@ -72,6 +72,7 @@ class Run:
 
     directory: Path
     interrupted: bool = False  # Whether it was asked to end before its time; ``resume`` goes on
+    scenario: str | None = None  # As ``train`` was told: so it may be of a module
 
     def __fspath__(self) -> str:
         return str(self.directory)
@@ -217,7 +218,7 @@ def _train(
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
-    return Run(run_dir, interrupted)
+    return Run(run_dir, interrupted, config.scenario)
 
 
 def _quit(training: TrainingRun) -> bool:
