@@ -11,6 +11,7 @@ import json
 import os
 import secrets
 import stat
+import zlib
 from pathlib import Path
 from typing import Any, BinaryIO, Optional
 
@@ -26,19 +27,35 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """
     target = _checked(path)
     make_directory(target.parent)
-    temporary = target.with_name(f".{secrets.token_hex(8)}")
+    temporary = None
     try:
-        with temporary.open("xb") as stream:
+        with _temporary(target) as stream:
+            temporary = stream.name
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, target)
+            os.replace(temporary, target)
     except BaseException as error:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
+        if temporary is not None:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
         if isinstance(error, OSError):
             raise UserError(f"cannot write {target}: {error.strerror}") from None
         raise
+
+
+def _temporary(target: Path) -> BinaryIO:
+    """A file beside the target, held by its writer; those that dead writers have left go."""
+    begin = f".{zlib.crc32(os.fsencode(target.name)):08x}-"
+    for left in target.parent.glob(f"{begin}*"):
+        with contextlib.suppress(OSError), open_regular(left) as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
+    stream = target.with_name(f"{begin}{secrets.token_hex(8)}").open("xb")
+    with contextlib.suppress(OSError):  # No locks here: then nothing is cleared away.
+        fcntl.flock(stream, fcntl.LOCK_EX)
+    # Another writer may have come just before the lock.
+    return stream if os.fstat(stream.fileno()).st_nlink else _temporary(target)
 
 
 def behind_link(path: PathLike) -> Path:

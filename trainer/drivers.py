@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from bridge.network import parse_spec
@@ -27,7 +28,7 @@ from trainer.human.guide import Action, Driver, Observation
 from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
 from trainer.training.delayed import DelayAware
-from trainer.util import load_torch
+from trainer.util import fitting, load_torch
 
 CONSTANT = "constant:"
 """Before an action that is kept throughout: what any policy should be better than."""
@@ -156,12 +157,13 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     if path is None:
         raise UserError(f"{run_dir} holds no training run ({BEST_FILE} or {CHECKPOINT_FILE})")
     state = load_torch(path)
-    try:
+    with fitting(f"{path} is not a checkpoint of this project"):
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]
         weights = networks[state.get("kept_actor", "actor")]
-        label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
-        if "known_latency" in state:
-            label["known_latency"] = state["known_latency"]
+        keys = ("scenario", "algorithm", "seed", "episode", *({"known_latency"} & state.keys()))
+        label: dict[str, Any] = msgspec.convert(
+            {key: state[key] for key in keys}, dict[str, str | int]
+        )
         env = env or make_environment(
             name_in_file(label["scenario"], f"{run_dir} was trained in", "--scenario")
         )
@@ -172,6 +174,4 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
         frames = 2 if first is None else first.shape[1]
         actor = Actor(len(weights["head.output.bias"]), frames, space)
         actor.load_state_dict(weights)
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise UserError(f"{path} is not a checkpoint of this project") from error
     return actor, label

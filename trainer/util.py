@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
@@ -105,6 +106,10 @@ def load_torch(path: Path) -> dict[str, Any]:
 
     try:
         with open_regular(path) as stream:
+            # torch writes a checksum of each part, and looks at none.
+            if damaged := zipfile.ZipFile(stream).testzip():
+                raise ValueError(f"{damaged} is damaged")
+            stream.seek(0)
             state = torch.load(stream, map_location="cpu", weights_only=True)  # noqa: TID251
         if not isinstance(state, dict):
             raise TypeError(type(state))
@@ -114,6 +119,17 @@ def load_torch(path: Path) -> dict[str, Any]:
     except Exception as error:
         # torch raises its own unpickling errors for foreign files; ours hold a table of names.
         raise UserError(f"{path} is not a checkpoint of this project") from error
+
+
+@contextmanager
+def fitting(words: str) -> Iterator[None]:
+    """Make a UserError of these words of whatever a crafted or foreign file leads to."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(words) from error
 
 
 @contextmanager

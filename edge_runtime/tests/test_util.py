@@ -5,6 +5,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -39,6 +41,32 @@ def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path, m
     longest = path.with_name("a" * 250 + ".json")  # as a file system has it
     write_json_out(longest, {"a": 4})
     assert json.loads(longest.read_text()) == {"a": 4}
+
+
+KILLED = """import os, signal, sys
+from edge_runtime.files import write_atomic
+os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)
+write_atomic(sys.argv[1], b"cut off")"""
+
+
+def test_what_killed_writers_left_goes_with_the_next_and_what_a_live_one_holds_stays(
+    tmp_path, monkeypatch
+):
+    path, other = tmp_path / "out.json", tmp_path / "other.json"
+    for _ in range(2):
+        assert subprocess.run([sys.executable, "-c", KILLED, str(path)]).returncode == -9
+        assert len(os.listdir(tmp_path)) == 1
+    real, inner = os.fsync, iter([b"inner"])
+
+    def fsync(descriptor):  # another writer of the same file comes while this one is at it
+        for data in inner:
+            write_atomic(path, data)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_atomic(path, b"outer")
+    write_atomic(other, b"other")
+    assert (path.read_bytes(), sorted(os.listdir(tmp_path))) == (b"outer", [other.name, path.name])
 
 
 def refused(path, match=None):

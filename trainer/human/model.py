@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
-from edge_runtime.util import UserError
+from trainer import util
 from trainer.environments import check_trained_in
 from trainer.human.config import MODEL_FILE, HumanModelConfig
 from trainer.human.guide import Driver
@@ -102,10 +102,8 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
     """The network of a HUMAN_DIR and what is known of it; UserError: no human model of ``env``."""
     path = directory / MODEL_FILE
     state = load_torch(path)
-    try:
+    with util.fitting(f"{path} is not a human model of this project"):
         actor = Actor(state["action_size"], state["frames"], env.observation_space)
         check_trained_in(env, directory, state["scenario"])
         actor.load_state_dict(state.pop("actor"))
-    except (AttributeError, LookupError, TypeError, RuntimeError) as error:
-        raise UserError(f"{path} is not a human model of this project") from error
     return actor, state

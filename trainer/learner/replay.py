@@ -253,7 +253,7 @@ class ReplayBuffer:
             getattr(self, f"_{name}")[: self._used] = state[name]
         # What was here before must not be drawn any more.
         self._weights[:] = 0.0
-        self._weights[self.alive] = self._priorities[self.alive] ** self.alpha
+        self.update_priorities(self.alive, self._priorities[self.alive])
         if self._foreseen is not None:
             own = {n.removeprefix(AHEAD): v for n, v in state.items() if n.startswith(AHEAD)}
             self._foreseen.load_state_dict(own)

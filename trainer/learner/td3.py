@@ -6,6 +6,7 @@ once.
 
 import copy
 from dataclasses import replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -156,6 +157,9 @@ class TD3Learner:
         for name in (*NETWORKS, *OPTIMISERS):
             # A copy, because optimisers keep the very tensors that they are given.
             getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
+        for weights, kept in chain(*(getattr(self, name).state.items() for name in OPTIMISERS)):
+            if not kept["exp_avg"].shape == kept["exp_avg_sq"].shape == weights.shape:
+                raise ValueError("an optimiser's state is of other weights")  # torch does not look
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 

@@ -8,6 +8,7 @@ from unittest.mock import Mock
 import msgspec
 import numpy as np
 import pytest
+import torch
 
 from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
@@ -45,6 +46,25 @@ def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name
     save_torch(tmp_path / name, {**label, **more})
     with pytest.raises(UserError, match="trained in planted:Env-v0, not in left_turn"):
         load_driver(str(tmp_path), make_environment("left_turn"))
+
+
+@pytest.mark.parametrize(
+    "crafted",
+    [
+        {"seed": torch.zeros(2)},
+        {"episode": [1]},
+        {"scenario": 7},
+        {"known_latency": 5},
+        {"kept_actor": []},
+        {"actor": {"head.output.bias": 3}},
+        {"actor": {"head.output.bias": torch.zeros(1), "picture.conv1.weight": torch.zeros(0)}},
+    ],
+)
+def test_a_crafted_field_of_a_checkpoint_is_one_line(tmp_path, crafted):
+    label = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 0, "episode": 3}
+    save_torch(tmp_path / BEST_FILE, {**label, "actor": Actor().state_dict(), **crafted})
+    with pytest.raises(UserError):
+        load_actor(tmp_path)
 
 
 @pytest.mark.parametrize("command", ["evaluate", "export"])

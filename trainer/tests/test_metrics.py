@@ -59,6 +59,15 @@ def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(t
         writer.close()
 
 
+@pytest.mark.parametrize("episodes", [(0, 1, 1), (0, 2), (1, 2), (0, 0, 1), (0,)])
+def test_rows_that_are_double_or_missing_are_noticed_when_a_run_goes_on(tmp_path, episodes):
+    write(tmp_path, [*map(row, episodes), ""])
+    before = (tmp_path / "metrics.csv").read_bytes()
+    with pytest.raises(UserError, match=r"metrics\.csv"):
+        MetricsWriter(tmp_path, 2)
+    assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
 def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
     lines = [",".join(OLDER), row(0, OLDER), row(1, OLDER), ""]
     (tmp_path / "metrics.csv").write_text("\r\n".join(lines), newline="")

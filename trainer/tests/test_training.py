@@ -1,4 +1,5 @@
 import json
+import math
 import os
 import signal
 import subprocess
@@ -166,15 +167,25 @@ def test_a_run_of_so_many_steps_goes_on_as_one(tmp_path):
         check_directory(tmp_path, replace(TINY, episodes=1, evaluate_every_steps=0), resume=True)
 
 
-def test_a_checkpoint_of_other_observations_is_said_to_fit_no_more(tmp_path):
+def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fit_no_more(tmp_path):
     config = replace(TINY, episodes=1, evaluate_every_steps=0)
     train(config, tmp_path)
     state = load_torch(tmp_path / CHECKPOINT_FILE)
-    replay = state["learning"]["replay"]
-    replay["pictures"] = torch.cat([replay["pictures"]] * 2, dim=-1)
-    save_torch(tmp_path / CHECKPOINT_FILE, state)
-    with pytest.raises(UserError, match="does not fit this run"):
-        TrainingRun(config, tmp_path, resume=True)
+    replay, learner = state["learning"]["replay"], state["learning"]["learner"]
+    wide, moments = torch.cat([replay["pictures"]] * 2, dim=-1), {"state": {0: {"exp_avg": 1}}}
+    for place, name, crafted in (
+        (replay, "pictures", wide),
+        (replay, "priorities", torch.full_like(replay["priorities"], math.nan)),
+        (learner, "updates", torch.zeros(2)),
+        (learner, "actor_optimiser", {**learner["actor_optimiser"], **moments}),
+        (state, "episode", 1.5),
+        (state, "best_validation", None),
+    ):
+        kept, place[name] = place[name], crafted
+        save_torch(tmp_path / CHECKPOINT_FILE, state)
+        with pytest.raises(UserError, match="does not fit this run"):
+            TrainingRun(config, tmp_path, resume=True)
+        place[name] = kept
 
 
 def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):

@@ -1,6 +1,8 @@
 import subprocess
 
+import numpy as np
 import pytest
+import torch
 
 from edge_runtime.util import UserError
 from trainer import util
@@ -58,6 +60,26 @@ def test_what_is_out_of_range_is_told_the_range(name, value, said):
     with pytest.raises(UserError, match=rf"{name} = {value} is out of range: {said}"):
         LearnerConfig(**{name: value})
     LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
+
+
+def test_a_flipped_bit_of_a_checkpoint_is_refused_or_in_nothing_that_is_read(tmp_path):
+    path, weights = tmp_path / "c.pt", torch.arange(500.0)
+    state = {"w": weights, "episode": 3}
+    util.save_torch(path, state)
+    whole, refused = path.read_bytes(), 0
+    assert torch.equal(util.load_torch(path)["w"], weights)
+    for bit in np.random.default_rng(0).integers(8 * len(whole), size=200):
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            found = util.load_torch(path)
+        except UserError as error:
+            refused += "\n" not in str(error)
+        else:
+            assert torch.equal(found.pop("w"), weights)
+            assert found == {"episode": 3}
+    assert refused > 100
 
 
 def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):

@@ -6,6 +6,7 @@ Validation drives on seeds of their own, without help; the best actor is kept.
 import copy
 import csv
 import io
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -99,7 +100,10 @@ class MetricsWriter:
 
     def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
         self.path = run_dir / METRICS_FILE
-        kept = [row for row in read_metrics(run_dir) if int(row["episode"]) < from_episode]
+        kept = read_metrics(run_dir)[:from_episode]
+        if len(kept) < from_episode:
+            lost = f"{self.path} holds {len(kept)} episodes, and the checkpoint was after"
+            raise UserError(f"{lost} {from_episode}: put the missing rows back")
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
@@ -130,6 +134,7 @@ class MetricsWriter:
         try:
             self._csv.writerow(row)
             self._file.flush()
+            os.fsync(self._file.fileno())  # No power cut leaves a checkpoint without its rows.
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
         row["success"] = float(metrics.outcome == GOAL)
@@ -175,6 +180,10 @@ def _rows(text: str) -> list[dict[str, str]]:
                     (int if name in WHOLE else float)(value)
         except (ValueError, TypeError):
             raise ValueError(f"row {number} is broken") from None
+        if int(row["episode"]) != number - 1:
+            raise ValueError(
+                f"row {number} is of episode {row['episode']}: one is missing, or double"
+            )
     return [{**dict.fromkeys(NAMES, ""), **row} for row in rows]
 
 

@@ -200,13 +200,14 @@ class TrainingRun:
 
     def _load(self) -> None:
         path = self.run_dir / CHECKPOINT_FILE
-        try:
+        with util.fitting(f"{path} does not fit this run"):
             self._restore(util.load_torch(path))
-        except (LookupError, TypeError, ValueError, RuntimeError) as error:
-            raise UserError(f"{path} does not fit this run") from error
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.episode, self.steps = state["episode"], state["steps"]
+        counts = state["episode"], state["steps"], state["learning"]["learner"]["updates"]
+        if not all(type(count) is int and count >= 0 for count in counts):
+            raise ValueError(f"counts of {counts}")
+        self.episode, self.steps, _ = counts
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guidance.bit_generator.state = state["guidance"]
