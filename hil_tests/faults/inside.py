@@ -176,7 +176,7 @@ def slow_down_on_switch() -> None:
         time.sleep(SLOW_S * switch.exists())
         return real(*seen)
 
-    Policy.act = act  # type: ignore[method-assign]
+    Policy.act = act  # type: ignore[method-assign, assignment]
 
 
 def launch(package: str) -> None:
