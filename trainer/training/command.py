@@ -23,7 +23,7 @@ from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
-from edge_runtime.util import UserError, counted, read_json, read_toml
+from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert
 from trainer.environments import scenario_of
@@ -268,9 +268,8 @@ def _take_own(arguments: argparse.Namespace, path: Path) -> list[str]:
     if "preset" in getattr(arguments, "given", ()):
         kept -= set().union(*map(_preset_names, PRESETS))
     values = {name: v for name, v in _flat(read_json(path, "run config")).items() if name in kept}
-    for name in ("scenario", "algorithm", "human"):
-        if ":" in str(values.get(name)):
-            del values[name]
+    for name in {"scenario", "algorithm", "human"} - set(getattr(arguments, "given", ())):
+        name_in_file(str(values.get(name)), f"{path.parent} was trained with", f"--{name}")
     return _take(arguments, path, values)
 
 
