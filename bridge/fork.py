@@ -380,7 +380,7 @@ def _add_fork_arguments(parser: Any) -> None:
     parser.add_argument("--policy", metavar="POLICY.onnx", help=policy)
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
-    parser.add_argument("--human", metavar="keyboard|gamepad|wheel|web", help=human)
+    parser.add_argument("--human", metavar="web", help=human)
     parser.add_argument("--record", metavar="G.mcap", help=record)
 
 

@@ -51,29 +51,6 @@ if not torch.cuda.is_available():
     sys.exit(f"torch {torch.__version__} sees no CUDA device")
 print(torch.cuda.get_device_name(0))
 """
-_WINDOW = """
-import os, sys, pygame
-try:
-    pygame.display.init()
-    driver = pygame.display.get_driver()
-except pygame.error:
-    driver = "dummy"
-if driver in ("dummy", "offscreen"):
-    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    where = f"display {shown}" if shown else "neither DISPLAY nor WAYLAND_DISPLAY is set"
-    sys.exit(f"SDL opens no window ({where})")
-print(f"SDL's driver {driver}")
-"""
-_CONTROLLERS = """
-import os, sys
-os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-import pygame
-pygame.joystick.init()
-sticks = [pygame.joystick.Joystick(number) for number in range(pygame.joystick.get_count())]
-if not sticks:
-    sys.exit("SDL sees no game controller")
-print(", ".join(f"{stick.get_name()} ({stick.get_numaxes()} axes)" for stick in sticks))
-"""
 EXAMPLE = examples("python -m hil_tests doctor --only basics vehicle")
 
 
@@ -212,6 +189,14 @@ def _loopback() -> str:
     return f"a message went over {endpoint}"
 
 
+def _window() -> str:
+    from bridge.rerun import has_display
+
+    if not has_display():
+        raise UserError("neither DISPLAY nor WAYLAND_DISPLAY is set")
+    return "there is a display"
+
+
 def _ssh_keygen() -> str:
     found = shutil.which("ssh-keygen")
     if found is None:
@@ -294,12 +279,9 @@ CHECKS = (
     Check("training", "GPU", partial(python_says, _GPU),
           "no `--device cuda`",
           "an NVIDIA GPU with its driver, and torch with CUDA"),
-    Check("person", "window", partial(python_says, _WINDOW),
-          "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
-          "a desktop session; without one: --human web, and --serve or --save"),
-    Check("person", "gamepad or wheel", partial(python_says, _CONTROLLERS),
-          "no `--human gamepad`, no `--human wheel`",
-          "plug one in; if it is: the right to read /dev/input/* (group input)"),
+    Check("person", "window", _window,
+          "no cockpit that opens by itself, no rerun window (--spawn)",
+          "a desktop session; without one: open the printed address, and --serve or --save"),
     Check("vehicle", "ssh-keygen", _ssh_keygen, "no bundle for a board, no `make test`",
           "apt install openssh-client"),
     Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",

@@ -28,7 +28,7 @@ DEFAULTS = RunConfig()
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
     "python -m trainer train --resume --out runs/phil_1",
     "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
-    "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
+    "python -m trainer train --human web --rerun mine.rrd --out runs/mine",
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
     "python -m trainer train --set    # lists the settings",
@@ -97,16 +97,15 @@ class _Set(argparse.Action):
 
 @command(
     "trainer.person.session:run",
-    "python -m trainer drive --human keyboard --out runs/drives",
-    "python -m trainer drive --policy runs/phil_1 --human wheel --profile my.toml \\\n"
-    "    --out runs/drives",
-    "python -m trainer drive --from drive.mcap --at 3s --human web --out runs/drives",
+    "python -m trainer drive --out runs/drives",
+    "python -m trainer drive --policy runs/phil_1 --out runs/drives",
+    "python -m trainer drive --from drive.mcap --at 3s --out runs/drives",
 )
 def drive(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser, "what was recorded")
     add = parser.add_argument
-    device = "the device that your hands are on"
-    add("--human", "--device", dest="human", choices=list(HUMANS), default="keyboard", help=device)
+    device = "the browser, which has keyboard, touch, gamepad and wheel (the default, and all)"
+    add("--human", "--device", dest="human", choices=HUMANS, default=HUMANS[0], help=device)
     driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)

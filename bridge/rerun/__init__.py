@@ -95,6 +95,12 @@ def _file(path: str) -> str:
     return path
 
 
+def has_display() -> bool:
+    """Whether a window can be opened here; on Linux the environment says so."""
+    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return bool(named) or not sys.platform.startswith("linux")
+
+
 def check_sink(sink: str | None) -> str:
     """The sink: spawn (None is that, too), serve, or a path that ends in .rrd.
 
@@ -111,9 +117,7 @@ def check_sink(sink: str | None) -> str:
                 raise UserError(f"port {port} is in use; end the other rerun first") from None
     elif sink != SPAWN:
         raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    elif sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    elif not has_display():
         raise UserError("no display for a window here: serve a page, or save a file")
     return sink
 

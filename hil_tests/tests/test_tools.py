@@ -86,12 +86,11 @@ def test_python_buses_and_the_display_are_tried(monkeypatch):
     assert said == "a frame went through UDP multicast on loopback"
     monkeypatch.setattr(doctor, "OLDEST", (99, 0))
     assert not doctor.examine(BY_NAME["Python"]).ok
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "neither DISPLAY" in doctor.examine(BY_NAME["window"]).detail
     monkeypatch.setenv("DISPLAY", ":4711")
-    assert ":4711" in doctor.examine(BY_NAME["window"]).detail
-    assert not doctor.examine(BY_NAME["window"]).ok
+    assert doctor.examine(BY_NAME["window"]).ok
 
 
 def test_packages_are_asked_for(monkeypatch, tmp_path):

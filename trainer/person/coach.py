@@ -1,7 +1,7 @@
 """The coach: what a person's guidance has come to, what is typical, and one line of advice.
 
 It draws nothing and drives nothing: the loop tells it of episodes and of the policy alone, and the
-window and the page show what it says.
+page shows what it says.
 """
 
 import json

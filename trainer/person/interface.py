@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -30,7 +28,7 @@ WISH_HELP = (
     "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
     "    Q: quit, all is kept"
 )
-PERSON = "person"  # ``RunConfig.human`` of every device: a run may go on with another one
+PERSON = "person"  # ``RunConfig.human`` of a run that a person guides
 
 
 def amount(action: Any) -> Amount:
@@ -61,20 +59,7 @@ class Reading:
     wishes: frozenset[Wish] = frozenset()
     """What was asked for since the last reading; each press is reported once."""
     by_moving: bool = False
-    """Whether moving ``action`` away from rest also takes over, as with a steering wheel
-    (``Moving``)."""
-
-
-@dataclass(frozen=True)
-class Moving:
-    """When moving a wheel or a pedal takes over, and when its resting hands control back."""
-
-    threshold: float = 0.15  # How far from rest ``Reading.action`` must be to take over
-    rest: float = 0.05
-    """Below this it rests. Less than ``threshold``, so that a hand that trembles there does not
-    take over time and again."""
-    rest_s: float = 0.6
-    """How long it must rest to hand control back: a wheel passes its middle in every bend."""
+    """Whether moving ``action`` away from rest also takes over, as with a steering wheel."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +99,9 @@ class Person(Protocol):
     than a few milliseconds.
     """
 
-    moving: Moving
-
     @property
     def present(self) -> bool:
-        """Whether a person can act: a browser has the wheel, a gamepad is plugged in.
+        """Whether a person can act: a browser has the wheel.
 
         Before an episode the loop waits for it; within one, an absent person has let go.
         """
@@ -133,22 +116,10 @@ class Person(Protocol):
         """Close device and display; a second call does nothing."""
 
 
-HUMANS = {
-    "keyboard": "trainer.person.devices:open_keyboard",
-    "gamepad": "trainer.person.devices:open_joystick",
-    "wheel": "trainer.person.devices:open_joystick",
-    "web": "trainer.person.web:open_cockpit",
-}
-"""Word of ``--human`` -> what opens it; the libraries behind it are imported only then."""
-DEVICE_OPTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
-    "profile": (None, ("gamepad", "wheel")),
-    "host": ("127.0.0.1", ("web",)),
-    "port": (0, ("web",)),
-    "speed": (1.0, tuple(HUMANS)),
-}
-"""Option -> its default, and the devices that have a use for it."""
-
-
+HUMANS = ("web",)
+"""Words of ``--human`` for a person; the browser has keyboard, touch, gamepad and wheel."""
+PERSON_OPTIONS = {"host": "127.0.0.1", "port": 0, "speed": 1.0}
+"""Options that only a person has a use for, with their defaults."""
 SLOWEST, FASTEST = 0.01, 1000
 """Simulated seconds in one of the person's."""
 
@@ -156,28 +127,26 @@ SLOWEST, FASTEST = 0.01, 1000
 def add_person(parser: argparse.ArgumentParser) -> None:
     """Declare the person's options of ``drive`` and ``train``."""
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
-    shipped = "what the axes and buttons of --human gamepad or wheel mean (default: as shipped)"
-    here = "the address at which --human web listens; by default this machine's alone"
-    port = "the port of --human web; 0: any that is free"
+    here = "the address at which the cockpit listens; by default this machine's alone"
+    port = "the cockpit's port; 0: any that is free"
     said = f"a number from {SLOWEST} to {FASTEST}"
     speed = number(said, lambda value: SLOWEST <= value <= FASTEST)
     slow = "simulated seconds per real second: 0.5 is slow motion"
-    group.add_argument("--profile", metavar="F.toml", help=shipped)
     group.add_argument("--host", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)
     group.add_argument("--speed", type=speed, metavar="X", help=slow)
-    group.set_defaults(**{name: default for name, (default, _) in DEVICE_OPTIONS.items()})
+    group.set_defaults(**PERSON_OPTIONS)
 
 
 def check_person_options(arguments: argparse.Namespace) -> None:
-    """Refuse an option that ``--human``, a device or not, has no use for; raises UserError."""
-    for name, (default, devices) in DEVICE_OPTIONS.items():
-        if getattr(arguments, name) != default and arguments.human not in devices:
+    """Refuse a person's option where no person drives; raises UserError."""
+    for name, default in PERSON_OPTIONS.items():
+        if getattr(arguments, name) != default and arguments.human not in HUMANS:
             raise UserError(f"--{name} means nothing with --human {arguments.human}")
 
 
 def open_person(arguments: argparse.Namespace) -> Person:
-    """Open the device and the display of ``--human``; raises UserError where there is none."""
-    check_person_options(arguments)
-    opener: Callable[[argparse.Namespace], Person] = resolve_name(HUMANS[arguments.human])
-    return opener(arguments)
+    """Open the browser cockpit; raises UserError where it cannot be served."""
+    from trainer.person.web import open_cockpit  # aiohttp takes a third of a second to load
+
+    return open_cockpit(arguments)

@@ -240,7 +240,7 @@ class PersonRun(TrainingRun):
         return self.sitting.stop or super()._must_stop(deadline_s)
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
-        """Behind the scenes, and once more at a sitting's end, behind its closed window: a person
+        """Behind the scenes, and once more at a sitting's end, when the page is closed: a person
         is not to wait.
         """
         if not at_end:

@@ -20,6 +20,7 @@ from msgspec import structs
 from bridge.fork import ForkedEnvironment, find_fork
 from bridge.report import DISCARDED, RESTARTED, STOPPED, failed
 from edge_runtime.cli import quit_on_signals
+from edge_runtime.files import check_writable
 from edge_runtime.util import UserError, counted
 from trainer.drivers import load_driver
 from trainer.environments import Adapted, make_environment, scenario_of
@@ -53,12 +54,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits; returns the exit status."""
     set_threads(arguments.threads)
     env, seed_of = _environment(arguments)
-    arguments.scenario = env.scenario  # By it the devices know their keys.
+    arguments.scenario = env.scenario  # By it the cockpit knows its keys.
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
+    out = Path(arguments.out)
+    check_writable(out / "sitting")  # Before a browser opens.
     with closing(open_person(arguments)) as person:
-        recorder = Recorder(Path(arguments.out))
+        recorder = Recorder(out)
         made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         with closing(made) as sitting, quit_on_signals(sitting.quit):
             outcomes = drive(sitting, policy, seed_of, arguments.episodes)
@@ -127,7 +130,7 @@ class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
 
 
 class Sitting:
-    """A scenario's environment with a person at the wheel, from the window's opening to its end.
+    """A scenario's environment with a person at the wheel, from the cockpit's opening to its end.
 
     The loop calls ``reset``, then ``decide`` before and ``step`` for each control period, and
     ``rest`` after an episode. All else is the environment's own. ``alone``: nobody but the person
@@ -318,7 +321,7 @@ class Sitting:
         return not self.closed
 
     def close(self) -> None:
-        """Close the person's devices and the recording; a second call does nothing."""
+        """Close the cockpit and the recording; a second call does nothing."""
         self.closed = True
         self._write_last_step()
         self.recorder.close()
@@ -339,7 +342,7 @@ class Sitting:
     def _forget(self, seed: int) -> None:
         """Nothing of an episode has happened yet."""
         self._seed, self._number = seed, 0
-        self._take_over, self._intent = TakeOver(), Intent(self.person.moving, self._rest)
+        self._take_over, self._intent = TakeOver(), Intent(self._rest)
         self._reading, self._read_ns = Reading(self._rest), 0
         self._applied = Applied(self._rest, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None

@@ -15,7 +15,6 @@ from trainer.person.interface import (
     WISHES,
     Amount,
     Control,
-    Moving,
     Reading,
     Wish,
     amount,
@@ -26,6 +25,13 @@ SILENCE_S = 0.5  # A driver who is not heard for this long has let go
 MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
+MOVED = 0.15
+"""How far from rest a wheel or a pedal must be to take over."""
+RESTING = 0.05
+"""Below this it rests. Less than ``MOVED``, so that a hand that trembles there does not take over
+time and again."""
+REST_S = 0.6
+"""How long it must rest to hand control back: a wheel passes its middle in every bend."""
 State = Literal["policy", "taking", "human", "returning"]
 NEXT: dict[tuple[State, bool], tuple[State, State]] = {
     ("policy", True): ("taking", "human"),
@@ -80,8 +86,8 @@ class TakeOver:
 class Intent:
     """Whether the person wants control: holds something, or has moved the wheel."""
 
-    def __init__(self, moving: Moving, rest: Amount = 0.0) -> None:
-        self.moving, self._rest = moving, rest
+    def __init__(self, rest: Amount = 0.0) -> None:
+        self._rest = rest
         self._moved = False
         self._resting_since_s: float | None = None
 
@@ -90,12 +96,12 @@ class Intent:
         away = distance(reading.action, self._rest)
         if not reading.by_moving:
             self._moved, self._resting_since_s = False, None
-        elif away > self.moving.rest:
-            self._moved |= away > self.moving.threshold
+        elif away > RESTING:
+            self._moved |= away > MOVED
             self._resting_since_s = None
         elif self._resting_since_s is None:
             self._resting_since_s = now_s
-        elif now_s - self._resting_since_s >= self.moving.rest_s:
+        elif now_s - self._resting_since_s >= REST_S:
             self._moved = False
         return reading.engaged or self._moved
 
@@ -169,7 +175,7 @@ class Seat:
             self._wishes |= set(said.wishes)
             # Nothing is held, and a wheel that takes over by moving is at rest.
             action = self._rest if said.action is None else said.action
-            resting = not said.by_moving or distance(action, self._rest) <= Moving.rest
+            resting = not said.by_moving or distance(action, self._rest) <= RESTING
             self._hands_were_off |= resting and not said.engaged
             if not self._hands_were_off:
                 return False

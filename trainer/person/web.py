@@ -17,6 +17,7 @@ import socket
 import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,10 +32,10 @@ from aiohttp.http_exceptions import HttpProcessingError
 from PIL import Image
 
 from bridge.messages import plain
-from bridge.rerun import BY_NAME
+from bridge.rerun import BY_NAME, has_display
 from edge_runtime.util import UserError
-from trainer.person.controls import controls_of, keyboard_of
-from trainer.person.interface import WISH_HELP, Moving, Reading, View
+from trainer.person.controls import controls_of
+from trainer.person.interface import WISH_HELP, Reading, View
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
@@ -77,7 +78,7 @@ LOGGER.addFilter(_is_ours)
 
 
 def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
-    """Serve the cockpit and print its address."""
+    """Serve the cockpit, print its address, and open it where there is a display."""
     host = arguments.host
     cockpit = Cockpit(host, arguments.port, arguments.scenario)
     if host not in LOOPBACK:
@@ -88,6 +89,10 @@ def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
             file=sys.stderr,
         )
     print(f"cockpit: open {cockpit.url}", flush=True)
+    if has_display():
+        # In a thread, for it waits for some browsers.
+        args = (cockpit.one_time_url(),)
+        threading.Thread(target=webbrowser.open, args=args, daemon=True).start()
     if cockpit.phone_url:
         print(f"on a phone in this network: {cockpit.phone_url}", flush=True)
         if sys.stdout.isatty():
@@ -113,16 +118,15 @@ class Cockpit:
     runs in the server's thread. Raises UserError where the address cannot be listened on.
     """
 
-    moving = Moving()
-
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
         hint = "or slide on the pad, or use a gamepad or wheel"
-        self.controls = keyboard_of(scenario)
+        self.controls = controls_of(scenario)
         self.help: tuple[str, ...] = (self.controls.help, hint, WISH_HELP)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
+        self._one_time_token = ""
         # By this name a browser elsewhere finds the cockpit.
         name = socket.gethostname() if host in EVERYWHERE else host
         self._names = {*LOOPBACK, host.lower(), name.lower()}
@@ -137,6 +141,13 @@ class Cockpit:
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._serve, name="cockpit", daemon=True)
         self._thread.start()
+
+    def one_time_url(self) -> str:
+        """The address to start a browser with. It leads on to the cockpit for one request only:
+        every user of this machine can read the command line of a browser.
+        """
+        self._one_time_token = secrets.token_urlsafe(TOKEN_BYTES)
+        return self.url.replace(self._token, self._one_time_token)
 
     @property
     def present(self) -> bool:
@@ -195,6 +206,11 @@ class Cockpit:
         status, text = 404, "no such page\n"
         if not self._is_asked_by_name(request):
             status, text = 421, NO_NAME
+        elif self._one_time_token and hmac.compare_digest(
+            given.encode(), self._one_time_token.encode()
+        ):
+            self._one_time_token = ""
+            raise web.HTTPFound(f"/{self._token}/", headers=HEADERS)
         elif not hmac.compare_digest(given.encode(), self._token.encode()):
             status, text = 403, NO_TOKEN
         else:

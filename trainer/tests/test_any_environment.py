@@ -41,7 +41,7 @@ from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import Layout, ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 from trainer.person import session
-from trainer.person.controls import controls_of, keyboard_of
+from trainer.person.controls import controls_of
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
@@ -293,7 +293,7 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
         ("learner = 3", "", "learner"),
         ("tau = 0.1", "--preset printed", "sets tau, and so does --preset"),
         ("algorithm = 'phil_td3'\nalpha = 0.5", "--algorithm rlpd_td3", "sets alpha, and so does"),
-        ("human = 'person'", "", "a person guides that run: name --human keyboard"),
+        ("human = 'person'", "", "a person guides that run: name --human web"),
         ("late_to_s = 0.1\nlate_from_s = 0.3", "", "late_to_s 0.1 is below late_from_s 0.3"),
     ):
         (tmp_path / "config.toml").write_text(f"{text}\n")
@@ -378,7 +378,6 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     assert controls.rest == pytest.approx((-0.5, -1.0))
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)
     assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
-    assert controls.period_s == env.control_period_s
     for keys, says in (
         ({"KeyQ": (0.0, 0.0)}, r"is driven with q, which pause, .*: name others"),
         ({}, "it has several actions, and no keys"),
@@ -386,7 +385,7 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
         monkeypatch.setattr(Rover, "keys", keys)
         controls_of.cache_clear()
         with pytest.raises(UserError, match=says):
-            keyboard_of(ROVER)
+            controls_of(ROVER)
     controls_of.cache_clear()
 
 

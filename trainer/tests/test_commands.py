@@ -124,7 +124,7 @@ def test_a_shipped_policy_is_verified_with_the_key_beside_it(capsys, tmp_path, m
     Path("keys/policy.pub").write_bytes(public_pem(Ed25519PrivateKey.generate()))
     status, _, err = call(capsys, "evaluate", POLICY, "--runs", "1")
     assert status == 0, err
-    drive = ["drive", "--human", "keyboard", "--policy", POLICY, "--public-key", "none.pub"]
+    drive = ["drive", "--human", "web", "--policy", POLICY, "--public-key", "none.pub"]
     assert "public key none.pub does not exist" in refusal(capsys, *drive)
     for end in ("", ".sig"):
         shutil.copy(POLICY + end, f"p.onnx{end}")
@@ -200,20 +200,19 @@ def config(tmp_path, capsys):
 
 
 OTHERS = "--seed 0 --human expert --set evaluate_every_steps=500 --set batch_size=128"
-GIVEN = "--seed 3 --episodes 4 --human keyboard --set batch_size=8 --set evaluate_every_steps=7"
+GIVEN = "--seed 3 --episodes 4 --human web --set batch_size=8 --set evaluate_every_steps=7"
 
 
 def test_changed_settings_are_named_as_they_are_given(config):
     values, refused = config
     assert (
-        "was trained with --seed 3 (now 0), --human keyboard|gamepad|wheel|web (now expert), "
+        "was trained with --seed 3 (now 0), --human web (now expert), "
         "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
     ) in refused(values, *OTHERS.split())
-    assert "name --human keyboard" in refused(values)  # Which of them, no file says.
     assert "averaged_actor=True (now False)" in refused(
         values, "--preset", "printed", "--human", "web"
     )
-    given = GIVEN.replace("keyboard", "expert").split()
+    given = GIVEN.replace("web", "expert").split()
     assert "is not a checkpoint of this project" in refused({**values, "human": "expert"}, *given)
     # What came later had its default.
     del values["learner"]["gamma"], values["averaged_actor"], values["period_s"]

@@ -100,7 +100,6 @@ def train(
     max_minutes: float | None = None,
     resume: bool = False,
     rerun: str | None = None,
-    profile: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
     speed: float = 1.0,
@@ -150,9 +149,8 @@ def train(
     config = replace(config, **ours, learner=replace(learner, **changed))
     run_dir = _new_directory(config) if out is None else Path(out)
     person = argparse.Namespace(
-        human=human, scenario=config.scenario, profile=profile, host=host,
-        port=port, speed=speed,
-    )  # fmt: skip
+        human=human, scenario=config.scenario, host=host, port=port, speed=speed
+    )
     with claimed(run_dir), options.limited_threads(threads):
         person.resume = check_directory(run_dir, config, resume)
         return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
@@ -371,5 +369,4 @@ def _flat(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _typed(name: str, values: dict[str, Any]) -> str:
-    # A run may go on with another device of the person's.
     return "|".join(HUMANS) if (name, values[name]) == ("human", PERSON) else str(values[name])

@@ -2,11 +2,12 @@
 
 import asyncio
 import inspect
+import os
 from contextlib import closing
 
 import pytest
 
-from trainer.person import devices
+from trainer.person import web
 from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
 from trainer.tests.conftest import one_thread
@@ -23,6 +24,12 @@ globalThis.plug = (id, mapping, axes, buttons) => {
 };
 """
 """Headless Chromium has no gamepad: the page is given one that says what the test wants."""
+
+
+# No test opens a browser by itself, nor does a process that it starts.
+for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+    os.environ.pop(name, None)
+os.environ["BROWSER"] = "true"  # On macOS: the command that does nothing
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -54,11 +61,11 @@ def browser(runner):
 
 @pytest.fixture
 def sit_down(monkeypatch, tmp_path, capsys, one_thread):
-    """Run a command with somebody else at the keyboard; its status, stdout and stderr."""
+    """Run a command with somebody else at the wheel; its status, stdout and stderr."""
 
     def sit_down(person, *command):
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
+        monkeypatch.setattr(web, "open_cockpit", lambda arguments: person)
         return call(capsys, *command, "--speed", "1000")
 
     return sit_down

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import structs
 
 from trainer.environments import make_environment
-from trainer.person.interface import Moving, Reading, View, Wish
+from trainer.person.interface import Reading, View, Wish
 from trainer.person.recording import Recorder, Step, packed
 from trainer.person.session import Sitting
 
@@ -20,8 +20,6 @@ QUICK = 1000.0
 class Puppet:
     """A person who does what a list says, and then ``then`` for good; ``presence``: whether the
     device is there, each time it is asked for, and then for good."""
-
-    moving = Moving()
 
     def __init__(self, readings: Iterable[Reading] = (), then=LET_GO, presence=()) -> None:
         self._readings, self._then, self._presence = iter(readings), then, iter(presence)

@@ -22,7 +22,7 @@ from trainer.tests.test_commands import call
 from trainer.util import load_torch, save_torch
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]
-FORK = ["drive", "--human", "keyboard", "--from", "drive.mcap", "--at", "0.95s"]
+FORK = ["drive", "--human", "web", "--from", "drive.mcap", "--at", "0.95s"]
 
 
 @pytest.fixture

@@ -1,19 +1,19 @@
-"""Real key events, through an X server, take over in a real training process."""
+"""A page takes over in a real training process, and nothing that it did is lost."""
 
 from __future__ import annotations
 
-import os
-import shutil
+import asyncio
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
-import pytest
 
 from edge_runtime.util import UserError
 from trainer.drivers import CHECKPOINT_FILE
@@ -25,10 +25,11 @@ from trainer.person.tests.browser import (
     POLICY_DRIVES,
     address,
     open_browser,
+    page,
     quit_sitting,
+    say,
     until,
 )
-from trainer.person.tests.virtual_wheel import load_sdl
 from trainer.util import load_torch
 
 SOON_S = 60.0
@@ -37,28 +38,19 @@ SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_ste
 
 
 class Training:
-    """A ``trainer train`` with a person in it, by a module that has the trainer's command line."""
+    """A ``trainer train`` with a person in it."""
 
-    def __init__(self, run_dir: Path, *more: str, module: str = "trainer", **environment: str):
+    def __init__(self, run_dir: Path, *more: str):
         self.run_dir = run_dir
-        command = [sys.executable, "-m", module, "train", "--out", str(run_dir), *SMALL, *more]
-        pipes: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        words = ["train", "--human", "web", "--out", str(run_dir), *SMALL, *more]
+        pipes: Any = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
         self.process = subprocess.Popen(
-            command, **pipes, text=True, env={**os.environ, **environment}
+            [sys.executable, "-m", "trainer", *words], **pipes, text=True
         )
 
     def close(self) -> None:
         self.process.kill()
         self.process.communicate()
-
-    def tell(self, line: str) -> int:
-        """Have the virtual wheel do something; when it was done, ns since 1970."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        print(line, file=self.process.stdin, flush=True)
-        answer = self.process.stdout.readline()
-        assert answer.startswith(f"did {line} "), answer
-        return int(answer.split()[-1])
 
     def wait_for_step(self, wanted: Callable[[Step], bool]) -> Step:
         end_s = time.monotonic() + SOON_S
@@ -106,94 +98,45 @@ def first_of_the_persons(steps: Sequence[Step]) -> int:
     return index
 
 
-def assert_taken_over_at_once(steps: Sequence[Step], began_ns: int, done_ns: int) -> None:
-    """The first control period that asked the hands after ``done_ns`` is already the person's; an
-    earlier one may be: a key is down before the press is confirmed."""
-    taken = first_of_the_persons(steps)
-    assert steps[taken].time_ns >= began_ns
-    assert steps[taken - 1].time_ns < done_ns
+@asynccontextmanager
+async def at_the_wheel(training):
+    """A page whose wheel is where the list says, and which speaks as often as a page does."""
+    url, places = address(training.process), [0.0]
+
+    async def speak(link):
+        while True:
+            await say(link, action=places[-1], by_moving=True)
+            await asyncio.sleep(0.05)
+
+    async with page(SimpleNamespace(url=url, port=urlsplit(url).port)) as link:
+        speaking = asyncio.create_task(speak(link))
+        yield places
+        speaking.cancel()
 
 
-@pytest.fixture
-def display():
-    for program in ("Xvfb", "xdotool"):
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is not installed (Debian packages xvfb and xdotool)")
-    read, write = os.pipe()
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
-        pass_fds=[write],
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(write)
-    with os.fdopen(read) as pipe:
-        number = pipe.readline().strip()
-    yield {"DISPLAY": f":{number}", "SDL_VIDEODRIVER": "x11"}
-    server.terminate()
-    server.wait()
-
-
-def xdotool(display, *words) -> int:
-    """Do something as a person would; when it was done, ns since 1970."""
-    subprocess.run(["xdotool", *words], env={**os.environ, **display}, check=True, timeout=30)
-    return time.time_ns()
-
-
-def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
-    with closing(Training(tmp_path / "run", "--human", "keyboard", **display)) as training:
-        training.wait_for_step(lambda step: step.step >= 2)
-        began_ns = time.time_ns()
-        done_ns = xdotool(display, "keydown", "Down")
-        training.wait_for_step(lambda step: step.human and vector(step.action)[0] < -0.99)
-        let_go_ns = xdotool(display, "keyup", "Down")
-        back = training.wait_for_step(lambda step: step.time_ns > let_go_ns and not step.human)
-        steps = newest_sitting(training.run_dir)
-        assert_taken_over_at_once(steps, began_ns, done_ns)
-        after = next(step for step in steps if step.time_ns > let_go_ns)
-        assert after.control != "human"
-        assert back.action == back.policy_action
-        xdotool(display, "key", "q")
-        status, errors = training.end()
-    assert status == 0, errors
-    all_in_replay(training.run_dir)
-
-
-def test_the_window_loads_no_llvm_beside_that_of_triton(display):
-    code = """
-from pathlib import Path
-from trainer.person.devices import KeyboardHands, Window
-window = Window(KeyboardHands("left_turn"))
-window.poll(0.0)
-print("LLVM" in Path("/proc/self/maps").read_text())
-"""
-    command, environment = [sys.executable, "-c", code], {**os.environ, **display}
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
-    assert told.stdout == "False\n", told.stderr
-
-
-def train(run_dir, *more):
-    module = "trainer.person.tests.virtual_wheel"
-    return Training(run_dir, "--human", "wheel", *more, module=module, SDL_VIDEODRIVER="dummy")
-
-
-def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
-    if load_sdl() is None:
-        pytest.skip("this pygame has no SDL of its own with virtual joysticks")
+async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     run_dir = tmp_path / "run"
-    with closing(train(run_dir)) as training:
-        training.wait_for_step(lambda step: step.step >= 2)
-        began_ns = time.time_ns()
-        done_ns = training.tell("axis 3 -1")
-        training.wait_for_step(lambda step: step.human and vector(step.action)[0] < -0.99)
-        training.process.kill()
-        training.process.wait()
+    with closing(Training(run_dir)) as training:
+        async with at_the_wheel(training) as places:
+            await asyncio.to_thread(training.wait_for_step, lambda step: step.step >= 2)
+            began_ns = time.time_ns()
+            places.append(-1.0)
+            await asyncio.to_thread(
+                training.wait_for_step,
+                lambda step: step.human and vector(step.action)[0] < -0.99,
+            )
+            training.process.kill()
+            training.process.wait()
     killed = newest_sitting(run_dir)
-    assert_taken_over_at_once(killed, began_ns, done_ns)
+    assert killed[first_of_the_persons(killed)].time_ns >= began_ns
 
-    with closing(train(run_dir, "--resume")) as training:
-        training.wait_for_step(lambda step: step.sitting == 2 and step.step >= 1)
-        training.process.terminate()  # Which is quitting, too.
-        status, errors = training.end()
+    with closing(Training(run_dir, "--resume")) as training:
+        async with at_the_wheel(training):
+            await asyncio.to_thread(
+                training.wait_for_step, lambda step: step.sitting == 2 and step.step >= 1
+            )
+            training.process.terminate()  # Which is quitting, too.
+            status, errors = training.end()
     assert status == 0, errors
     human = sum(step.human for step in killed)
     assert f"{len(killed)} recorded steps after the checkpoint, {human} of them yours" in errors
@@ -205,17 +148,16 @@ APPLIED = "document.querySelector('.bar.applied output').textContent"
 
 def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path, runner):
     async def sit(url):
-        async with open_browser() as page:
-            await page.goto(url)
-            await until(page, POLICY_DRIVES)
-            await page.keyboard.down("ArrowDown")
-            await until(page, f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
-            await page.keyboard.up("ArrowDown")
-            await until(page, POLICY_DRIVES)
-            await quit_sitting(page)
+        async with open_browser() as shown:
+            await shown.goto(url)
+            await until(shown, POLICY_DRIVES)
+            await shown.keyboard.down("ArrowDown")
+            await until(shown, f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
+            await shown.keyboard.up("ArrowDown")
+            await until(shown, POLICY_DRIVES)
+            await quit_sitting(shown)
 
-    web = Training(tmp_path / "run", "--human", "web", "--set", "warmup_steps=8")
-    with closing(web) as training:
+    with closing(Training(tmp_path / "run", "--set", "warmup_steps=8")) as training:
         runner.run(sit(address(training.process)))
         status, errors = training.end()
     assert status == 0, errors

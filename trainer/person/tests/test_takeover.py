@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.person.interface import WISHES, Moving, Reading, distance
+from trainer.person.interface import WISHES, Reading, distance
 from trainer.person.takeover import MAX_SLEW, NEXT, SILENCE_S, Input, Intent, Seat, TakeOver
 from trainer.person.tests.people import LET_GO
 
@@ -68,14 +68,14 @@ HELD = [(Reading(action=1.0), 0.0, False), (Reading(action=0.0, engaged=True), 0
 
 @pytest.mark.parametrize("readings", [MOVED, HELD])
 def test_moving_or_holding_takes_over_and_resting_or_letting_go_hands_back(readings):
-    intent = Intent(Moving(threshold=0.15, rest=0.05, rest_s=0.6))
+    intent = Intent()
     for reading, now_s, wants_control in readings:
         assert intent.update(reading, now_s) == wants_control, now_s
 
 
 @given(st.lists(st.tuples(st.floats(-0.15, 0.15), st.floats(0.0, 1.0)), max_size=30))
 def test_below_the_threshold_nothing_is_taken_over(moves):
-    intent, now_s = Intent(Moving()), 0.0
+    intent, now_s = Intent(), 0.0
     for action, waited_s in moves:
         now_s += waited_s
         assert not intent.update(wheel(action), now_s)

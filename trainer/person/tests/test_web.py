@@ -4,10 +4,12 @@ import base64
 import itertools
 import json
 import os
+import queue
 import resource
 import socket
 import struct
 import time
+import webbrowser
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from unittest.mock import Mock
@@ -160,6 +162,7 @@ async def status_of(url, **more):
 async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
     status, text, headers = await status_of(cockpit.url)
     assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
+    assert 'rel="icon" href="data:' in text, "else browsers ask for one outside of the token"
     assert headers["Referrer-Policy"] == "no-referrer"
     assert "default-src 'self'" in headers["Content-Security-Policy"]
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
@@ -237,7 +240,7 @@ async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
 
 
 def open_web(**options):
-    given = {"human": "web", "scenario": "left_turn", "profile": None, "speed": 1.0}
+    given = {"human": "web", "scenario": "left_turn", "speed": 1.0}
     return open_person(argparse.Namespace(**given, **{"host": "127.0.0.1", "port": 0, **options}))
 
 
@@ -256,6 +259,23 @@ def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys
         assert ("warning: --host" in err) == warned
         assert (f"phone in this network: {cockpit.phone_url}\n" in out) == warned
     assert cockpit.phone_url == cockpit.url
+
+
+async def test_where_there_is_a_display_the_browser_opens_by_an_address_for_one_request(
+    monkeypatch,
+):
+    opened: queue.Queue[str] = queue.Queue()
+    monkeypatch.setattr(webbrowser, "open", opened.put)
+    open_web().close()
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    with closing(open_web()) as cockpit:
+        url = opened.get(timeout=WAIT_S)
+        assert opened.empty(), "no browser without a display"
+        assert cockpit.url not in url, "every user of this machine can read a command line"
+        status, text, _ = await status_of(url)
+        assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
+        assert (await status_of(url))[0] == 403
+        assert (await status_of(cockpit.url))[0] == 200
 
 
 async def test_a_phone_gets_in_by_the_address_in_the_code_and_loopback_shows_none(
