@@ -427,7 +427,7 @@ class TrainingLog:
 
 def _status(metrics: EpisodeMetrics) -> rr.TextDocument:
     lines = [
-        f"# episode {metrics.episode}: {metrics.outcome}",
+        f"# episode {metrics.episode + 1}: {metrics.outcome}",
         f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
         f"{counted(metrics.interventions, 'intervention')}, "
         f"{counted(metrics.human_steps, 'step')} the human's",

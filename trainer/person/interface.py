@@ -79,7 +79,7 @@ class View:
     speed_mps: float  # nan where the environment does not tell, as ``goal_m``
     distance_m: float
     goal_m: float
-    episode: int
+    episode: int  # From 0; the page shows it from 1
     step: int
     time_s: float  # Simulated time since the episode's start
     late_ticks: int = 0  # Control periods of this sitting that began too late

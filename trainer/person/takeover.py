@@ -83,6 +83,11 @@ class TakeOver:
         return Applied(self._applied, control, human, first=human and before == "policy")
 
 
+def moved(reading: Reading, rest: Amount) -> bool:
+    """Whether a wheel or a pedal is so far from rest that it takes over."""
+    return reading.by_moving and distance(reading.action, rest) > MOVED
+
+
 class Intent:
     """Whether the person wants control: holds something, or has moved the wheel."""
 
@@ -93,11 +98,10 @@ class Intent:
 
     def update(self, reading: Reading, now_s: float) -> bool:
         """Whether the person wants control, from the newest reading."""
-        away = distance(reading.action, self._rest)
         if not reading.by_moving:
             self._moved, self._resting_since_s = False, None
-        elif away > RESTING:
-            self._moved |= away > MOVED
+        elif distance(reading.action, self._rest) > RESTING:
+            self._moved |= moved(reading, self._rest)
             self._resting_since_s = None
         elif self._resting_since_s is None:
             self._resting_since_s = now_s
@@ -138,7 +142,8 @@ class Seat:
         self._wishes: set[Wish] = set()
         self._said = self._off
         self._tap: Reading | None = None
-        """Pressed since the last poll: a tap shorter than a control period counts for one."""
+        """The farthest of what took over since the last poll, by a button, a wheel or a pedal: a
+        tap shorter than a control period counts for one."""
         self._hands_were_off = False
         self._heard_s = float("-inf")
 
@@ -179,21 +184,26 @@ class Seat:
             self._hands_were_off |= resting and not said.engaged
             if not self._hands_were_off:
                 return False
-            pressed = said.engaged and not self._said.engaged
-            self._said = Reading(action, said.engaged, by_moving=said.by_moving)
-            if pressed:
-                self._tap = self._said
+            before, now = self._said, Reading(action, said.engaged, by_moving=said.by_moving)
+            if self._wants(now) and (self._tap is not None or not self._wants(before)):
+                taps = (now, self._tap or now)
+                self._tap = max(taps, key=lambda tap: distance(tap.action, self._rest))
+            self._said = now
             return True
 
     def poll(self, now_s: float) -> Reading:
         """What the driver does at ``now_s``; each wish once."""
         with self._lock:
             said = self._said if now_s - self._heard_s <= SILENCE_S else self._off
-            if said is not self._off and not said.engaged and self._tap is not None:
+            if said is not self._off and not self._wants(said) and self._tap is not None:
                 said = self._tap
             self._tap = None
             wishes, self._wishes = frozenset(self._wishes), set()
             return Reading(said.action, said.engaged, wishes, said.by_moving)
+
+    def _wants(self, said: Reading) -> bool:
+        """Whether something is held, or a wheel or a pedal is moved."""
+        return said.engaged or moved(said, self._rest)
 
     def _let_go(self) -> None:
         self._said, self._tap = self._off, None

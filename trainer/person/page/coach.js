@@ -22,7 +22,7 @@ export function showCoach(coach) {
   if (!byId("coach").hidden) drawCurves(byId("curve"), coach);
   const head = row(["episode", "outcome", "you, s", "take-overs"], "th");
   const rows = [...coach.episodes].reverse().map(({ number, outcome, human_s, takeovers }) =>
-    row([number, outcome, human_s.toFixed(1), takeovers], "td", outcome));
+    row([number + 1, outcome, human_s.toFixed(1), takeovers], "td", outcome));
   byId("episodes").replaceChildren(head, ...rows);
 }
 

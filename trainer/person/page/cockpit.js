@@ -8,7 +8,6 @@ import { drawFrames, drawPicture, drawScene, History } from "./scene.js";
 
 const byId = (id) => document.getElementById(id);
 const STEP_MS = 1000 / 60;
-const SURE_MS = 3000; // within which Quit is pressed again
 const STALE_MS = 1000; // without a new view the trainer is busy, and says so
 const WHO = {
   waiting: ["Nobody drives yet", "the trainer is starting"],
@@ -25,10 +24,11 @@ let viewMs = 0;
 let driving = true; // and not watching
 let refused = false; // held since before the connection, or the wheel, was this page's
 const changed = () => link?.changed();
-const keyboard = new Keyboard(changed, (word) => wish(word));
+const wish = (word) => link?.wish(word);
+const keyboard = new Keyboard(changed, wish);
 const touch = new Pad(byId("pad"), byId("knob"), changed);
 const choices = Object.keys(FIELDS).map((id) => [id, byId(id)]);
-const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed);
+const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed, wish);
 // A finger goes before a key, a key before a device that may only lie there. To a hidden page the
 // browser tells nothing new of any of them.
 const hands = {
@@ -102,7 +102,7 @@ function draw() {
   showCoach(view.coach);
   bar("policy", view.policy_action);
   bar("applied", view.applied_action);
-  byId("place").textContent = `episode ${view.episode}, ${view.time_s.toFixed(1)} s`;
+  byId("place").textContent = `episode ${view.episode + 1}, ${view.time_s.toFixed(1)} s`;
   byId("speed-value").textContent = view.speed_mps?.toFixed(1) ?? "–";
   const way = view.goal_m === null ? "" : `${view.distance_m.toFixed(1)} of ${view.goal_m.toFixed(0)} m`;
   byId("distance").textContent = way;
@@ -160,19 +160,6 @@ function showState(state) {
     byId("trip").textContent = "";
   }
   showWho();
-}
-
-let sureMs = -SURE_MS;
-function wish(word) {
-  const button = document.querySelector("[data-wish=quit]");
-  const now = performance.now();
-  if (word === "quit" && now - sureMs > SURE_MS) {
-    sureMs = now;
-    button.textContent = "Really quit?";
-    setTimeout(() => (button.textContent = "Quit"), SURE_MS);
-    return;
-  }
-  link.wish(word);
 }
 
 for (const button of document.querySelectorAll("[data-wish]")) {

@@ -7,6 +7,7 @@ import { list, mix, OFF, shares, ways } from "./hands.js";
 
 const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
 const WHEEL = /wheel|racing|driving force|\b[gt]\d{2,3}\b/i; // in the device's name
+const WISHES = { 8: "restart", 9: "pause" }; // back or share, start or options: of most gamepads, and of a G29
 const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
 
 // What is chosen, and the property of its control that holds it.
@@ -54,9 +55,11 @@ function value(pad, source) {
 
 export class Gamepads {
   // form: the selects and inputs by name.
-  constructor(form, changed) {
+  constructor(form, changed, wish) {
     this.form = form;
     this.changed = changed;
+    this.wish = wish;
+    this.down = {}; // number of a button -> whether it was pressed; empty for a device that is new
     this.scenario = this.controls = null;
     this.pad = null;
     this.said = OFF;
@@ -75,6 +78,11 @@ export class Gamepads {
     const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
     if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
     this.pad = pad;
+    for (const [index, word] of Object.entries(WISHES)) {
+      const down = pad?.buttons[index]?.pressed ?? false;
+      if (down && this.down[index] === false && this.choice.hold !== `button ${index}`) this.wish(word);
+      this.down[index] = down;
+    }
     const said = pad ? this.said_by(pad) : OFF;
     const before = this.said;
     this.said = said;
@@ -102,6 +110,7 @@ export class Gamepads {
 
   take(pad) {
     this.chosenFor = this.scenario;
+    this.down = {};
     this.form.name.textContent = pad ? pad.id : "none: press one of its buttons";
     if (!pad) return;
     this.key = `${pad.id} ${this.scenario}`;

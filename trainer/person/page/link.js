@@ -76,11 +76,12 @@ export class Link {
     this.changed();
   }
 
-  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once.
+  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once,
+  // and each place of a wheel, which is read no more often.
   changed() {
     this.dirty = true;
-    const edge = this.hands.now().engaged !== this.saidEngaged;
-    if (edge || performance.now() - this.saidMs >= LEAST_MS) this.say();
+    const { engaged, by_moving } = this.hands.now();
+    if (by_moving || engaged !== this.saidEngaged || performance.now() - this.saidMs >= LEAST_MS) this.say();
   }
 
   beat() {

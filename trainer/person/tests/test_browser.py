@@ -250,7 +250,34 @@ async def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(browser, co
     assert (await reads(cockpit, lambda r: r.by_moving)).action == pytest.approx(turned)
 
 
-async def test_buttons_and_keys_wish_once_and_quitting_asks_again(browser, cockpit):
+async def test_a_tap_of_a_gamepads_button_and_of_a_pedal_is_heard_however_short(browser, cockpit):
+    """Both come and go between two polls of the loop."""
+    wait = "await new Promise((done) => setTimeout(done, 40));"
+    press = "plug('{0}', '{1}', [0, 0, {2}, 1], {3}); " + wait
+    for name, mapping, before, after in (
+        ("Pad", "standard", (0, [0.0] * 17), (0, [*[0.0] * 5, 1.0, *[0.0] * 11])),
+        ("G29", "", (1, [0.0] * 24), (-1, [0.0] * 24)),
+    ):
+        taps = "".join(press.format(name, mapping, *it) for it in (before, after, before))
+        await browser.evaluate(f"(async () => {{ {taps} }})()")
+        reading = poll(cockpit)
+        assert (reading.engaged, reading.by_moving) == (name == "Pad", name == "G29")
+        assert reading.action == float(name == "G29")
+        assert not poll(cockpit).engaged
+        await browser.evaluate("delete pads[0]")
+        await reads(cockpit, lambda r: r == LET_GO)
+
+
+async def test_a_gamepads_own_buttons_pause_and_restart(browser, cockpit):
+    buttons = [0.0] * 17
+    for pressed, wished in ((9, set()), (None, set()), (9, {"pause"}), (8, {"restart"})):
+        shown = [float(number == pressed) for number in range(len(buttons))]
+        await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {shown})")
+        await browser.evaluate(TWO_HEARTBEATS)
+        assert poll(cockpit).wishes == wished, "the first press only shows the page the device"
+
+
+async def test_buttons_and_keys_wish_once(browser, cockpit):
     await browser.evaluate("document.querySelector('[data-wish=pause]').click()")
     await reads(cockpit, lambda r: r.wishes == {"pause"})
     await browser.keyboard.press("KeyR")
@@ -259,11 +286,9 @@ async def test_buttons_and_keys_wish_once_and_quitting_asks_again(browser, cockp
     await reads(cockpit, lambda r: r.wishes == {"discard"})
     await browser.evaluate("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
     await reads(cockpit, lambda r: r.wishes == {"discard"})
-    await browser.keyboard.press("KeyQ")
-    await until(browser, "document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
-    assert not poll(cockpit).wishes
-    await browser.keyboard.press("KeyQ")
-    await reads(cockpit, lambda r: r.wishes == {"quit"})
+    for quit in (browser.keyboard.press("KeyQ"), browser.click("[data-wish=quit]")):
+        await quit
+        await reads(cockpit, lambda r: r.wishes == {"quit"})
 
 
 async def test_what_is_shown_is_drawn(browser, cockpit):
@@ -273,7 +298,7 @@ async def test_what_is_shown_is_drawn(browser, cockpit):
     assert await browser.text_content("#who") == "You drive"
     assert await browser.text_content("#speed-value") == "4.3"
     assert await browser.text_content("#message") == "saving"
-    assert (await browser.text_content("#place")).startswith("episode 7")
+    assert (await browser.text_content("#place")).startswith("episode 8")
     assert await browser.text_content(".bar.policy output") == "0.25"
     # The newer frame's pixels are the policy's own, and the road is drawn in more than one
     # colour.
@@ -295,8 +320,8 @@ async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpi
     await until(browser, "document.getElementById('advice').textContent === 'Watch only.'")
     assert await browser.text_content("#alone") == "94%"
     newest, older = (await browser.inner_text("#episodes")).splitlines()[1:]
-    assert newest.split() == ["7", "goal", "2.3", "1"]
-    assert older.split() == ["6", "collision", "0.0", "0"]
+    assert newest.split() == ["8", "goal", "2.3", "1"]
+    assert older.split() == ["7", "collision", "0.0", "0"]
     assert await browser.evaluate(COLOURS_IN.format("curve")) > 5
     cockpit.show(first_view())
     await until(browser, "document.getElementById('coach').hidden")
