@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.virtual_link import Decision
+from bridge.virtual_link import BRAKE_PERIODS, NO_COMMAND, Decision
 from edge_runtime.util import counted, printable
 from edge_runtime.wire import Command, Feedback
 
@@ -115,16 +115,28 @@ class SafeStopEvent:
 
 
 class SafeStopLog:
-    """Collects the events of a whole run."""
+    """Collects the events of a whole run.
+
+    Where one of an episode's first states is answered, the wait for that answer was a round trip:
+    the car brakes after 2 T of it, and that is no stop.
+    """
 
     def __init__(self, period_s: float) -> None:
         self.events: list[SafeStopEvent] = []
         self._period_s = period_s
         self._open: SafeStopEvent | None = None
+        self._waits = False  # In all of the open event the first command may have been under way
 
     def observe(self, episode: int, step: int, decision: Decision, speed_mps: float) -> None:
         """Note one tick: what was decided at ``step``, and the speed at the tick's end (m/s)."""
-        event = self._open
+        event, command = self._open, decision.command
+        if command is None:
+            self._waits &= decision.waits
+        elif self._waits and event is not None and event.episode == episode:
+            self._waits = False
+            if command.step <= BRAKE_PERIODS:
+                self.events.remove(event)
+                self._open = event = None
         if event is not None and not (decision.brake_reason and event.episode == episode):
             if event.episode == episode:
                 event.resumed_after_s = self._since(event, step)
@@ -135,6 +147,7 @@ class SafeStopLog:
             event = SafeStopEvent(episode, step, decision.brake_reason, decision.undriven_s)
             self.events.append(event)
             self._open = event
+            self._waits = decision.waits and event.reason == NO_COMMAND
         if event.stopped_after_s is None and abs(speed_mps) < STANDSTILL_MPS:
             event.stopped_after_s = self._since(event, step + 1)
 

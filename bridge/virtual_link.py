@@ -62,6 +62,8 @@ class Decision:
     """What the vehicle in the loop says of the tick; None without one, or where it is silent."""
     feedback_age_s: float | None = None
     """From its arrival here, before any injected delay."""
+    waits: bool = False
+    """The episode's first command may still be under way."""
 
 
 class CommandHold:
@@ -125,6 +127,7 @@ class CommandHold:
             undriven_s=now_s - self._driven_s if edge_silence_s is None else edge_silence_s,
             command_age_s=now_s - self._sent_s if obeys else None,
             ridden=ridden,
+            waits=command is None and edge_silence_s is None,
         )
         self._fresh = False
         return decision

@@ -11,6 +11,7 @@ import pytest
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
+from bridge.report import SafeStopLog
 from bridge.tests.harness import (
     SLOW_TOY,
     decoded,
@@ -57,6 +58,10 @@ def test_a_line_runs_what_is_due_in_order_of_time_then_of_arrival_and_forgets_th
 
 def obedient(step):
     return make_command(step, action=[step / 1000])
+
+
+def stopping(step):
+    return make_command(step, mode="safe_stop", reason="vehicle_fault")
 
 
 class Rig:
@@ -175,6 +180,41 @@ def test_a_machine_that_stalls_is_counted_apart_from_the_network():
     assert reasons(rig.exchange(3)) == ["no_fresh_state"]
     late.drive(20)
     assert (rig.clock.wall_clock_stalls, late.clock.wall_clock_stalls) == (1, 0)
+
+
+@pytest.mark.parametrize("kind", [LockStepClock, RealTimeClock])
+@pytest.mark.parametrize(
+    ("spec", "answer", "first_step", "stops"),
+    [
+        ("150ms", obedient, 0, []),
+        ("150ms", stopping, 0, ["vehicle_fault"]),
+        ("down.loss=100%", obedient, None, [NO_COMMAND]),
+        ("up.outage=0.45s@0s", obedient, 5, [NO_COMMAND]),
+    ],
+)
+def test_the_wait_for_the_first_answer_brakes_and_is_no_stop(kind, spec, answer, first_step, stops):
+    rig = Rig(spec, answer, kind)
+    with contextlib.closing(rig.clock):
+        found = rig.drive(8)
+    assert NO_COMMAND in reasons(found), "it does not drive on without a command"
+    assert next((step for step in used(found) if step is not None), None) == first_step
+    assert stops_of(found) == stops
+
+
+def test_an_edge_runtime_that_does_not_answer_at_once_in_lock_step_is_a_stop():
+    rig = Rig(answer=None)
+    silent = rig.drive(1)
+    rig.answer = obedient
+    found = [*silent, *rig.exchange(1)]
+    assert used(found) == [None, 1]
+    assert stops_of(found) == [NO_COMMAND]
+
+
+def stops_of(decisions):
+    log = SafeStopLog(T)
+    for step, decision in enumerate(decisions):
+        log.observe(0, step, decision, speed_mps=1.0)
+    return [event.reason for event in log.events]
 
 
 @pytest.mark.parametrize("spec", ["up.loss=100%", "down.loss=100%"])
