@@ -107,10 +107,11 @@ DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 def run(arguments: argparse.Namespace) -> int:
     """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
     paths = find_recordings([Path(place) for place in arguments.recordings])
-    sink = check_sink(arguments.sink)
+    sink = check_sink(arguments.sink, arguments.port)
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)
-    with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
+    blueprint = make_blueprint(None, SITTINGS)
+    with open_sink(sink, SITTING_APPLICATION, blueprint, arguments.port) as recording:
         log, shown = TrainingLog(recording, SITTINGS), Shown()
         for entry in shown.entries(paths):
             log.draw(entry)
@@ -345,6 +346,8 @@ class TrainingLog:
         self._driver = ""
         self._ground: Any = False
         """What is drawn: a road's lines, a picture (True) or nothing; recordings hold several."""
+        self._actions: dict[str, int] = {}
+        """How many actions the lines at a path are styled for, where it is not one."""
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
         draw.style_lines(recording, LINES)
@@ -359,10 +362,13 @@ class TrainingLog:
             return
         steps, policy, applied, speeds, reasons = zip(*entry.entries, strict=True)
         for name, actions in (("policy", policy), ("applied", applied)):
-            several = np.array(actions).reshape(len(steps), -1).T
-            for number, values in enumerate(several):
-                place = f"action/{name}" + f"/{number}" * (len(several) > 1)
-                self._columns(place, steps, values)
+            path = f"action/{name}"
+            values = np.array(actions).reshape(len(steps), -1)
+            if values.shape[1] != self._actions.setdefault(path, 1):
+                self._actions[path] = values.shape[1]
+                numbers = [str(number) for number in range(1, values.shape[1] + 1)]
+                draw.style_actions(self._recording, path, LINES[path], numbers)
+            self._columns(path, steps, values)
         self._columns("speed/ego", steps, speeds)
         for step, reason in zip(steps, reasons, strict=True):
             driver = reason or "policy"
@@ -385,9 +391,11 @@ class TrainingLog:
             self._ground = ground
             self._recording.log("road", rr.Clear(recursive=True))
             if road:
+                self._bounds = draw.view_bounds(road)
                 self._recording.send_blueprint(make_blueprint(road, self._episodes))
                 draw.draw_ground(self._recording, road)
         if road:
+            draw.follow(self._recording, road, self._bounds)
             draw.draw_cars(self._recording, road, DRIVERS.get(self._driver, HUMAN))
         elif scene is not None:
             self._recording.log("road", rr.Image(scene, color_model="RGB"))
@@ -412,11 +420,15 @@ class TrainingLog:
         flush(self._recording)  # Only a flush notices that a viewer has gone.
 
     def _columns(self, path: str, steps: Sequence[int], values: Any) -> None:
-        """Log many numbers in one call: a call for each would cost as much as this one."""
+        """Log the numbers of many steps, one or more a step, in one call: a call for each step
+        would cost as much as this one.
+        """
+        numbers = np.array(values).reshape(len(steps), -1)
+        rows = rr.Scalars.columns(scalars=numbers.ravel())
         rr.send_columns(
             path,
             indexes=[rr.TimeColumn(TIMELINE, sequence=np.array(steps))],
-            columns=rr.Scalars.columns(scalars=np.array(values)),
+            columns=rows.partition([numbers.shape[1]] * len(steps)),
             recording=self._recording,
         )
 

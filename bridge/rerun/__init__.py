@@ -7,6 +7,7 @@ its own, on loopback: by itself it would bind all interfaces.
 from __future__ import annotations
 
 import argparse
+import colorsys
 import contextlib
 import os
 import shutil
@@ -22,7 +23,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from edge_runtime.cli import sigterm_as_interrupt
+from edge_runtime.cli import sigterm_as_interrupt, whole_number
 from edge_runtime.files import behind_link, check_writable, make_directory
 from edge_runtime.reach import check_port_is_free, free_endpoint
 from edge_runtime.util import UserError
@@ -44,6 +45,18 @@ APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 )
+
+SPREAD = 150 / 360
+"""Of the hue: what is asked and what is reached stay apart, however many actions there are."""
+
+
+def shades(colour: Colour, count: int) -> list[Colour]:
+    """Colours for so many actions, in hues that go on from ``colour``, which is the first."""
+    hue, light, saturation = colorsys.rgb_to_hls(*(part / 255 for part in colour))
+    hues = (hue + SPREAD * number / count for number in range(count))
+    turned = [colorsys.hls_to_rgb(each % 1.0, light, saturation) for each in hues]
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in turned]
+
 
 GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
 PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
@@ -79,13 +92,19 @@ def flush(recording: rr.RecordingStream) -> None:
 
 
 def add_sink(parser: argparse.ArgumentParser) -> Any:
-    """The group of ``--spawn``, ``--serve``, ``--save F.rrd``: kept as ``sink``, None without."""
+    """The group of ``--spawn``, ``--serve``, ``--save F.rrd``: kept as ``sink``, None without.
+
+    ``--port`` of the page stands beside it.
+    """
     where = parser.add_mutually_exclusive_group()
     page, window = "serve a web page on this machine's loopback only", "open a rerun window"
     for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
         where.add_argument(f"--{kind}", dest="sink", action="store_const", const=kind, help=text)
     text = "write a recording instead of showing it"
     where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
+    text = "of --serve: the page's port, and N + 1 for its data"
+    text += f" (default: {WEB_PORT} and {GRPC_PORT}, or two that are free)"
+    parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
     return where
 
 
@@ -101,20 +120,18 @@ def has_display() -> bool:
     return bool(named) or not sys.platform.startswith("linux")
 
 
-def check_sink(sink: str | None) -> str:
+def check_sink(sink: str | None, port: int | None = None) -> str:
     """The sink: spawn (None is that, too), serve, or a path that ends in .rrd.
 
-    UserError for any other, and at once where nothing could be shown there.
+    UserError for any other, and at once where nothing could be shown there. ``port``: of the page.
     """
     sink = SPAWN if sink is None else sink
+    if port is not None and sink != SERVE:
+        raise UserError(f"--port is that of a page: --{SERVE}")
     if sink.endswith(SUFFIX):
         check_writable(sink)
     elif sink == SERVE:
-        for port in (GRPC_PORT, WEB_PORT):  # a view of somebody else may be there
-            try:
-                check_port_is_free(f"tcp/{LOOPBACK}:{port}")
-            except UserError:
-                raise UserError(f"port {port} is in use; end the other rerun first") from None
+        _page_ports(port)
     elif sink != SPAWN:
         raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
     elif not has_display():
@@ -124,20 +141,20 @@ def check_sink(sink: str | None) -> str:
 
 @contextlib.contextmanager
 def open_sink(
-    sink: str, application: str, blueprint: rrb.Blueprint
+    sink: str, application: str, blueprint: rrb.Blueprint, port: int | None = None
 ) -> Iterator[rr.RecordingStream]:
     """A recording that goes to ``spawn`` (a window), ``serve`` (a page on loopback) or a file.
 
     ``application`` keeps layouts of different kinds apart. A window stays open afterwards; a page
     is served until then. SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another
-    use for it: a file is to be finished, and a server not to be left behind. ViewerGone: there is
-    no viewer any more, or none has come.
+    use for it: a file is to be finished, and a server not to be left behind. ``port``: of the page,
+    as in ``check_sink``. ViewerGone: there is no viewer any more, or none has come.
     """
     import rerun as rr
 
     recording = rr.RecordingStream(application)
     opened = _saved(recording, sink, blueprint) if sink.endswith(SUFFIX) else None
-    with sigterm_as_interrupt(), opened or _shown(recording, sink, blueprint):
+    with sigterm_as_interrupt(), opened or _shown(recording, sink, blueprint, port):
         yield recording
 
 
@@ -167,19 +184,22 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
 
 
 @contextlib.contextmanager
-def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -> Iterator[None]:
+def _shown(
+    recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint, page_port: int | None
+) -> Iterator[None]:
     """Draw for a window or a page; ViewerGone where it does not last."""
-    port = GRPC_PORT if kind == SERVE else free_port()
     if kind == SERVE:
-        page = ["--serve-web", "--port", str(port), "--web-viewer-port", str(WEB_PORT)]
-        viewer = Viewer(page, [port, WEB_PORT])
+        page_port, port = _page_ports(page_port)
+        page = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page_port)]
+        viewer = Viewer(page, [port, page_port])
     else:
+        port = free_port()
         viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
     try:
         url = f"rerun+http://{LOOPBACK}:{port}/proxy"
         recording.connect_grpc(url, default_blueprint=blueprint)
         if kind == SERVE:
-            print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
+            print(f"open http://{LOOPBACK}:{page_port}/?url={quote(url, safe='')}", flush=True)
         try:
             yield
         finally:
@@ -248,6 +268,19 @@ class Viewer:
         lines = self._said.read().decode(errors="replace").split("\n")
         words = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
         return words[-1] if words else "it was closed"
+
+
+def _page_ports(port: int | None) -> tuple[int, int]:
+    """The ports of a page and of its data; UserError where those that were asked for are taken."""
+    ports = (WEB_PORT, GRPC_PORT) if port is None else (port, port + 1)
+    for each in ports:
+        try:
+            check_port_is_free(f"tcp/{LOOPBACK}:{each}")
+        except UserError:
+            if port is not None:
+                raise UserError(f"port {each} is in use; name another --port") from None
+            return free_port(), free_port()  # Another view has the usual ones.
+    return ports
 
 
 def free_port() -> int:

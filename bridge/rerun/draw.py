@@ -14,12 +14,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bridge.messages import SeenCar, SeenScene
-from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colour
+from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colour, shades
 
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
 MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
+CAMERA = "camera"  # From here the road is seen
 NEAR_M = 20.0  # Cars farther from the path than this do not widen the view
+Bounds = tuple[tuple[float, float], tuple[float, float]]  # Ranges of x and y, m
 ALL_OF_IT = rrb.TimeRange(
     start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
 )
@@ -81,7 +83,7 @@ def windscreen(car: SeenCar) -> list[tuple[float, float]]:
     return [_place(car, ahead, -aside), _place(car, ahead, aside)]
 
 
-def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, float]]:
+def view_bounds(scene: SeenScene) -> Bounds:
     """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
     path = [(point[0], point[1]) for point in scene.path]
     cars = [(car.x, car.y) for car in scene.vehicles]
@@ -94,6 +96,17 @@ def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, flo
     return ranges[0], ranges[1]
 
 
+def follow(recording: rr.RecordingStream, scene: SeenScene, bounds: Bounds) -> None:
+    """Hold the view above the ego car where that has left the ground shown (``view_bounds``)."""
+    ego = next((car for car in scene.vehicles if car.ego), None)
+    away_m = [0.0, 0.0]
+    if ego is not None:
+        place = list(zip((ego.x, ego.y), bounds, strict=True))
+        if any(not low <= at <= high for at, (low, high) in place):
+            away_m = [at - (low + high) / 2 for at, (low, high) in place]
+    recording.log(CAMERA, rr.Transform3D(translation=[*away_m, 0.0]))
+
+
 def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
@@ -101,13 +114,12 @@ def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
 
 def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
     """The road from above; the ground shown is fixed by ``scene`` (None: as rerun sees fit)."""
-    bounds = None
-    if scene is not None:
-        x_range, y_range = view_bounds(scene)
-        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(
-        origin="road", name=name, background=list(GROUND), visual_bounds=bounds
-    )
+    look: dict[str, Any] = {"name": name, "background": list(GROUND)}
+    if scene is None:
+        return rrb.Spatial2DView(origin="road", **look)
+    x_range, y_range = view_bounds(scene)
+    bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    return rrb.Spatial2DView(origin=CAMERA, contents="/road/**", visual_bounds=bounds, **look)
 
 
 def frames_view() -> rrb.Horizontal:
@@ -158,6 +170,17 @@ def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesVie
         axis_x=rrb.TimeAxis(view_range=shown),
         plot_legend=rrb.Corner2D.LeftTop,
     )
+
+
+def style_actions(
+    recording: rr.RecordingStream, path: str, colour: Colour, names: Sequence[str]
+) -> None:
+    """Give each of several actions at one path its name and its colour."""
+    what = path.rpartition("/")[2]
+    shown = [f"{what} {name}" for name in names] if len(names) > 1 else [what]
+    colours, widths = shades(colour, len(names)), [2.0] * len(names)
+    style = rr.SeriesLines(colors=colours, names=shown, widths=widths)
+    recording.log(path, style, static=True)
 
 
 def style_lines(recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:

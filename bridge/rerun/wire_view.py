@@ -37,7 +37,7 @@ from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.commands import link_words
-from edge_runtime.manifest import Layout
+from edge_runtime.manifest import Layout, Task
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
@@ -47,6 +47,8 @@ APPLICATION = "phil_hil"
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    if arguments.foxglove and arguments.port:
+        raise UserError("--foxglove has its port beside it: --foxglove PORT")
     if arguments.foxglove and arguments.recording is not None:
         raise UserError(f"Foxglove opens {arguments.recording} by itself")
     if arguments.foxglove:
@@ -55,11 +57,11 @@ def run(arguments: Any) -> int:
         except ImportError:
             raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
         return _watch(arguments, _served(foxglove, arguments.foxglove))
-    sink = check_sink(arguments.sink)
+    sink, port = check_sink(arguments.sink, arguments.port), arguments.port
     if arguments.recording is not None:
         _show_recording(arguments, sink)
     else:
-        _watch(arguments, _drawn(sink))
+        _watch(arguments, _drawn(sink, port))
     if sink.endswith(SUFFIX):
         print(f"wrote {sink}")
     return 0
@@ -69,7 +71,7 @@ def _show_recording(arguments: Any, sink: str) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
     file = Recording(Path(arguments.recording))
     heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
-    with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
+    with open_sink(sink, APPLICATION, make_blueprint(None), arguments.port) as recording:
         log = WireLog(recording)
         for each in heard:
             log.write(each)
@@ -83,8 +85,8 @@ def _show_recording(arguments: Any, sink: str) -> None:
 
 
 @contextlib.contextmanager
-def _drawn(sink: str) -> Iterator[Callable[[Heard], None]]:
-    with open_sink(sink, APPLICATION, make_blueprint(None)) as recording:
+def _drawn(sink: str, port: int | None) -> Iterator[Callable[[Heard], None]]:
+    with open_sink(sink, APPLICATION, make_blueprint(None), port) as recording:
         log = WireLog(recording, 0.0 if sink.endswith(SUFFIX) else draw.PICTURE_INTERVAL_S)
         yield log.write
         log.say_left_out()
@@ -207,6 +209,7 @@ class WireLog:
         self._recording = recording
         self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
         self._timeline = Timeline()
+        self._task: Task | None = None
         self._layout: Layout | None = None
         self._session = ""  # Of the newest state
         self._told, self._reason = "", ""
@@ -268,7 +271,8 @@ class WireLog:
         silent = arrived_ns - self._heard_command_ns > periods * self._timeline.period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
-            self._scalar("action/asked", math.nan)  # A gap in the line: nothing is asked.
+            nothing = [math.nan] * (len(self._task.action) if self._task else 1)
+            self._recording.log("action/asked", rr.Scalars(nothing))  # A gap in each line
             self._tell(SILENT, "the simulator brakes by itself", rr.TextLogLevel.WARN)
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
@@ -314,10 +318,11 @@ class WireLog:
         The first scene also decides which ground is shown.
         """
         if scene.task is not None:
-            self._layout, self._timeline.period_s = Layout(scene.task), scene.task.control_period_s
+            self._take_task(scene.task)
         session = scene.origin.session if scene.origin else self._session
         self._stand_at((session, scene.episode, scene.step))
         if self._drawn_episode is None:
+            self._bounds = draw.view_bounds(scene)
             self._recording.send_blueprint(make_blueprint(scene))
         if self._drawn_episode != (session, scene.episode):
             self._drawn_episode = session, scene.episode
@@ -333,7 +338,16 @@ class WireLog:
                 "road/picture", rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
             )
         else:
+            draw.follow(self._recording, scene, self._bounds)
             draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
+
+    def _take_task(self, task: Task) -> None:
+        self._timeline.period_s = task.control_period_s
+        if self._task != task:
+            self._task, self._layout = task, Layout(task)
+            for path in ("action/asked", "action/achieved"):
+                names = [action.name for action in task.action]
+                draw.style_actions(self._recording, path, SERIES[path], names)
 
     def _draw_observation(self, state: State) -> None:
         """Its images, the newest last, and few numbers as lines."""

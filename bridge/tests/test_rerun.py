@@ -21,7 +21,17 @@ import bridge.rerun
 from bridge import messages
 from bridge.__main__ import main
 from bridge.recording import Recording, heard_of
-from bridge.rerun import _saved, check_sink, flush, free_port, open_sink
+from bridge.rerun import (
+    APPLIED,
+    POLICY,
+    _saved,
+    check_sink,
+    draw,
+    flush,
+    free_port,
+    open_sink,
+    shades,
+)
 from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.wire_view import Timeline, WireLog
 from bridge.tests import harness
@@ -49,6 +59,41 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
 
     assert bounds(-60.0) == bounds(5.0)  # One far from the path does not shrink the picture.
     assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
+
+
+def test_the_view_stands_until_the_ego_car_leaves_it_and_then_follows():
+    def places(*ego_at):
+        recording, scenes = MagicMock(), [far_scene(x) for x in ego_at]
+        for scene in scenes:
+            draw.follow(recording, scene, view_bounds(scenes[0]))
+        return [call.args[1].translation.as_arrow_array().to_pylist()[0][0]
+                for call in recording.log.call_args_list]  # fmt: skip
+
+    assert places(0.0, 30.0, 59.0, 61.0, 200.0) == [0.0, 0.0, 0.0, 36.0, 175.0]
+
+
+def far_scene(x):
+    car = messages.SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0, ego=True)
+    return messages.SeenScene(path=[[0.0, 0.0], [50.0, 0.0]], vehicles=[car])
+
+
+def test_each_of_several_actions_has_a_name_and_a_colour_of_its_own():
+    recording, one = MagicMock(), TASK.action[0]
+    two = [one, msgspec.structs.replace(one, name="steering")]
+    log = WireLog(recording)
+    for actions in ([one], two):
+        log.write_scene(make_scene(task=msgspec.structs.replace(TASK, action=actions)), 10**18)
+    names, colours = [], []
+    for path in ("action/asked", "action/achieved"):
+        logged = [call.args[1] for call in recording.log.call_args_list if call.args[0] == path]
+        assert logged[-2].names.as_arrow_array().to_pylist() == [path.rpartition("/")[2]]
+        names += logged[-1].names.as_arrow_array().to_pylist()
+        colours += logged[-1].colors.as_arrow_array().to_pylist()
+    assert names == [f"{what} {name}" for what in ("asked", "achieved")
+                     for name in (one.name, "steering")]  # fmt: skip
+    assert len(set(colours)) == 4
+    assert shades(POLICY, 16)[0] == POLICY
+    assert len({*shades(POLICY, 16), *shades(APPLIED, 16)}) == 32
 
 
 def test_episodes_stand_end_to_end():
@@ -136,6 +181,24 @@ def test_a_page_is_told_of_when_it_answers(kind, tmp_path, monkeypatch, capsys):
     end_s = time.monotonic() + 5.0
     while listens(*address):
         assert time.monotonic() < end_s, "it ends with the command"
+
+
+def test_two_pages_on_one_machine_have_ports_of_their_own(tmp_path, monkeypatch, capsys):
+    asked = free_port()
+    with (
+        in_place("works", tmp_path, monkeypatch),
+        opened("serve"),
+        opened("serve"),
+        open_sink("serve", "test", rrb.Blueprint(), asked),
+    ):
+        pages = re.findall(r"http://127.0.0.1:(\d+)/", capsys.readouterr().out)
+        assert len(set(pages)) == 3
+        assert (pages[0], pages[2]) == (str(bridge.rerun.WEB_PORT), str(asked))
+        assert listens("127.0.0.1", asked + 1)
+        with pytest.raises(UserError, match=f"port {asked} is in use"):
+            check_sink("serve", asked)
+    with pytest.raises(UserError, match="--serve"):
+        check_sink("drive.rrd", asked)
 
 
 def test_a_window_listens_on_loopback_only_and_stays_open(tmp_path, monkeypatch):

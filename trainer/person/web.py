@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 from PIL import Image
 
 from bridge.messages import plain
-from bridge.rerun import BY_NAME, has_display
+from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
 from trainer.person.controls import controls_of
 from trainer.person.interface import WISH_HELP, Reading, View
@@ -134,7 +134,7 @@ class Cockpit:
         self.phone_url = None if host in LOOPBACK else self._url_of(lan_address(host))
         """For another machine in this network; None where the cockpit listens on loopback."""
         self._pages: list[Page] = []
-        self._files = _page_files(self.phone_url)
+        self._files = _page_files(self.phone_url, np.size(self.controls.rest))
         self._shown = 0
         self._newest = (0, "")  # The newest view's number and message; pages get it when they can
         self._loop = asyncio.new_event_loop()
@@ -322,7 +322,7 @@ def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
     ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show; ``picture`` is
     base64 of a JPEG.
     """
-    left_m, top_m = (view.scene or {}).get("view", VIEW)
+    left_m, top_m = _corner(view.scene or {})
     frames = None if view.frames is None else view.frames.tobytes()
     fields = vars(view) | {"frames": frames, "controls": controls_of(view.scenario)}
     if view.picture is not None:
@@ -331,6 +331,20 @@ def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
         fields["picture"] = jpeg.getvalue()
     ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
     return _encode("view", number=number, help=hints, ground=ground, **fields)
+
+
+def _corner(scene: Mapping[str, Any]) -> tuple[float, float]:
+    """Where the ground shown begins, m: as the scene says, or so that a car that has left it is
+    in the middle.
+    """
+    left_m, top_m = scene.get("view", VIEW)
+    ego = next((car for car in scene.get("vehicles", ()) if car.get("ego")), None)
+    if "view" in scene or ego is None:
+        return left_m, top_m
+    x, y = ego["x"], ego["y"]
+    if 0.0 <= x - left_m <= WIDTH_M and 0.0 <= y - top_m <= HEIGHT_M:
+        return left_m, top_m
+    return x - WIDTH_M / 2, y - HEIGHT_M / 2
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:
@@ -352,9 +366,13 @@ def lan_address(host: str) -> str:
     return socket.gethostname()  # There is no such way.
 
 
-def _page_files(phone_url: str | None) -> dict[str, bytes]:
+def _page_files(phone_url: str | None, actions: int) -> dict[str, bytes]:
     found = {path.name: path.read_bytes() for path in (Path(__file__).parent / "page").glob("*.*")}
-    colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
+    colours = "".join(
+        f"--{name}: rgb{colour}; "
+        + "".join(f"--{name}-{n}: rgb{one}; " for n, one in enumerate(shades(colour, actions)))
+        for name, colour in BY_NAME.items()
+    )
     if phone_url:
         picture = segno.make(phone_url).svg_data_uri(scale=4)
         found["index.html"] = found["index.html"].replace(

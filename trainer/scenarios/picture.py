@@ -156,12 +156,10 @@ def draw_scene(
     scene: dict[str, Any],
     frames: NDArray[np.uint8] | None = None,
     caption: str = "",
-    ego: Colour = POLICY,
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
-    The picture is uint8 [height, width, 3]; ``ego`` is the ego car's colour, which tells what
-    drives it.
+    The picture is uint8 [height, width, 3].
     """
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
     image = Image.new("RGB", size, shown.GROUND)
@@ -195,7 +193,7 @@ def draw_scene(
         glass = Rectangle(
             body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
         )
-        colour = ego if vehicle.get("ego") else shown.APPLIED
+        colour = POLICY if vehicle.get("ego") else shown.APPLIED
         pen.polygon(pixels(corners(body)), fill=colour, outline=shown.GLASS, width=2)
         pen.polygon(pixels(corners(glass)), fill=shown.GLASS)
     if frames is not None:

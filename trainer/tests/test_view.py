@@ -16,7 +16,7 @@ import torch
 from rerun.chunk import RrdReader
 
 from bridge.messages import SeenScene
-from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun import APPLIED, HUMAN, POLICY, open_sink
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer import view
@@ -52,7 +52,7 @@ def values_in(rrd):
         for name in columns.keys() - {"step", "rerun.controls.RowId"}:
             rows = found.setdefault(chunk.entity_path, [])
             if name in ("Scalars:scalars", "StateChange:state"):
-                values = (value[0] for value in columns[name])
+                values = (one[0] if len(one) == 1 else tuple(one) for one in columns[name])
                 rows += zip(steps, values, strict=True)
     return {path: sorted(rows, key=lambda row: row[0] or 0) for path, rows in found.items()}
 
@@ -244,6 +244,20 @@ def test_a_sitting_is_shown_whole(tmp_path, capsys):
     assert [step for step, _ in found["/return/episode"]] == [14, 29]
     assert {"/road/ego/body", "/road/roads", "/frames/now"} <= set(found)
     assert "/loss/critic" not in {path for path, rows in found.items() if rows}
+
+
+def test_each_of_several_actions_is_drawn(tmp_path):
+    out = tmp_path / "two.rrd"
+    with open_sink(str(out), "test", view.make_blueprint(None, ())) as recording:
+        log = view.TrainingLog(recording, ())
+        steps = [view.StepEntry(n, (0.5, -0.5), (0.25, n / 10), 3.0, None) for n in range(3)]
+        log.draw(Steps(steps))
+    found = values_in(out)
+    for path, expected in (
+        ("/action/policy", 3 * [(0.5, -0.5)]),
+        ("/action/applied", [(0.25, 0.0), (0.25, 0.1), (0.25, 0.2)]),
+    ):
+        assert [value for _, value in found[path]] == [pytest.approx(row) for row in expected]
 
 
 def test_each_scenario_is_shown_on_its_own_ground(tmp_path):

@@ -130,8 +130,10 @@ function bar(name, action) {
   const values = list(action);
   const track = element.querySelector("i");
   while (track.children.length < values.length) track.append(document.createElement("u"));
+  const tell = name === "raw" ? "human" : name; // the colours of several actions
   [...track.children].forEach((fill, i) => {
     const value = values[i] ?? 0;
+    if (values.length > 1) fill.style.background = `var(--${tell}-${i})`;
     fill.style.left = `${50 + Math.min(value, 0) * 50}%`;
     fill.style.width = `${Math.abs(value) * 50}%`;
     fill.style.top = `${(100 * i) / values.length}%`;

@@ -137,13 +137,15 @@ export class History {
       pen.globalAlpha = 1;
     });
     line(pen, [[0, height / 2], [width, height / 2]], "#3a424d", 1);
-    const trace = (index, colour, wide) => {
-      const first = (action) => (Array.isArray(action) ? action[0] : action);
-      const known = this.steps.map((step, i) => [left + (i + 0.5) * dx, first(step[index])]);
+    const trace = (index, name, wide) => {
+      const known = this.steps.map((step, i) => [left + (i + 0.5) * dx, step[index]]);
       const points = known.filter(([, action]) => action !== null);
-      line(pen, points.map(([x, action]) => [x, y(action)]), colour, wide);
+      [].concat(points[0]?.[1] ?? []).forEach((_, n) => {
+        const places = points.map(([x, action]) => [x, y([].concat(action)[n])]);
+        line(pen, places, colour(`${name}-${n}`), wide);
+      });
     };
-    trace(0, colour("policy"), 1.2);
-    trace(1, colour("applied"), 2);
+    trace(0, "policy", 1.2);
+    trace(1, "applied", 2);
   }
 }

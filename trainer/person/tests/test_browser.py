@@ -1,12 +1,13 @@
 """The page in a real headless Chromium: hands become readings, and losing it is letting go."""
 
 import asyncio
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from bridge.rerun import BY_NAME
+from bridge.rerun import BY_NAME, shades
 from trainer.person.coach import Coaching, Episode, advise
 from trainer.person.tests.browser import (
     LIVE,
@@ -23,7 +24,8 @@ from trainer.person.tests.browser import (
     view_of_step,
 )
 from trainer.person.tests.people import LET_GO
-from trainer.person.web import VIEWS_UNDERWAY
+from trainer.person.web import VIEWS_UNDERWAY, Cockpit
+from trainer.tests.test_any_environment import ROVER
 
 pytestmark = pytest.mark.usefixtures("opened")
 
@@ -308,6 +310,33 @@ async def test_what_is_shown_is_drawn(browser, cockpit):
     )
     assert await browser.evaluate(pixel) == view.frames[1].ravel().tolist()
     assert await browser.evaluate(COLOURS_IN.format("scene")) > 10
+
+
+async def test_several_actions_are_drawn_in_colours_of_their_own(browser):
+    view = replace(first_view(), scenario=ROVER, scene=None, frames=None)
+    with closing(Cockpit(scenario=ROVER)) as cockpit:
+        await browser.goto(cockpit.url)
+        await until(browser, LIVE)
+        for step in range(40):
+            cockpit.show(replace(
+                view, step=step, policy_action=(0.9, 0.4), human_action=(0.0, 0.0),
+                applied_action=(-0.4, -0.9),
+            ))  # fmt: skip
+            await asyncio.sleep(0.05)
+        bars = await browser.evaluate(
+            "[...document.querySelectorAll('.bar.policy u, .bar.applied u')]"
+            ".map((bar) => getComputedStyle(bar).backgroundColor)"
+        )
+        wanted = [*shades(BY_NAME["policy"], 2), *shades(BY_NAME["applied"], 2)]
+        assert bars == [f"rgb{colour}" for colour in wanted]
+        drawn = await browser.evaluate(
+            "[...new Set(new Uint32Array(document.getElementById('history').getContext('2d')"
+            ".getImageData(0, 0, 2000, 200).data.buffer))].map((pixel) => pixel >>> 0)"
+        )
+        seen = [tuple(pixel >> shift & 255 for shift in (0, 8, 16)) for pixel in drawn]
+        for colour in wanted:
+            apart = [max(abs(a - b) for a, b in zip(one, colour, strict=True)) for one in seen]
+            assert min(apart) < 10, colour
 
 
 async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpit):

@@ -11,6 +11,7 @@ import struct
 import time
 import webbrowser
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 from urllib.parse import urlsplit
@@ -35,7 +36,7 @@ from trainer.person.tests.browser import (
     view_of_step,
 )
 from trainer.person.tests.people import LET_GO
-from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit
+from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit, encode_view
 
 RESET = struct.pack("ii", 1, 0)
 """SO_LINGER that closes without a good-bye."""
@@ -94,6 +95,16 @@ async def test_a_view_arrives_whole_and_a_page_that_comes_later_sees_the_newest(
         cockpit.show(view_of_step(step))
     async with page(cockpit) as link:
         assert (await hear(link, "view"))["step"] == 2
+
+
+def test_the_ground_that_is_shown_goes_with_a_car_that_has_left_it():
+    def left_m(x, **more):
+        car = {"x": x, "y": 0.0, "ego": True}
+        view = replace(first_view(), scene={"vehicles": [car], **more})
+        return json.loads(encode_view(view, 1, ()))["ground"]["left_m"]
+
+    assert [left_m(x) for x in (0.0, 15.0, 17.0, 500.0)] == [-30.0, -30.0, -6.0, 477.0]
+    assert left_m(500.0, view=(3.0, -7.0)) == 3.0, "a scene may say it by itself"
 
 
 async def test_a_slow_page_gets_fewer_views_and_never_old_ones(cockpit):
