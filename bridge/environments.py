@@ -13,6 +13,7 @@ import importlib.metadata
 import io
 import json
 import math
+import os
 import re
 import sys
 import traceback
@@ -30,6 +31,11 @@ from PIL import Image
 from edge_runtime.manifest import DTYPES, Action, Car, Entry, Task, check_task
 from edge_runtime.policy import OUTPUT
 from edge_runtime.util import UserError
+
+# Environments draw into memory. Left to itself SDL looks for a screen, with an "error:" that looks
+# like ours, and takes SIGTERM for itself. Its "dummy" screen makes highway-env draw nothing.
+os.environ.setdefault("SDL_VIDEODRIVER", "offscreen")
+os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
 
 Environment = gymnasium.Env[Any, Any]
 SCENARIO_GROUP = "phil.scenarios"

@@ -182,6 +182,25 @@ def test_somebodys_robot_of_another_kind_is_served_recorded_replayed_and_shown(t
     assert "road/picture" in rerun("rrd", "stats", str(shown))
 
 
+def test_an_environment_that_draws_by_sdl_says_nothing_and_leaves_sigterm_alone():
+    code = """
+import os, signal, time
+from bridge.environments import make_environment
+environment = make_environment("racetrack-v0")
+environment.reset(seed=0)
+print(environment.render().std() > 1.0, flush=True)
+os.kill(os.getpid(), signal.SIGTERM)
+time.sleep(9)
+"""
+    told = {"XDG_RUNTIME_DIR", "DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"}
+    told |= {"SDL_NO_SIGNAL_HANDLERS"}
+    clean = {name: value for name, value in os.environ.items() if name not in told}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "True\n", "")
+
+
 class ScriptedClock:
     """Drives for a while with one steering, brakes, and drives again."""
 
