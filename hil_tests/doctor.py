@@ -247,11 +247,10 @@ def _realtime_priority() -> str:
 
 def python_says(script: str) -> str:
     """The first line of a script in its own process; ModuleNotFoundError, UserError if it fails."""
-    quiet = {**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
     command = [sys.executable, "-c", script]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, env=quiet
+            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise UserError(str(error)) from None
