@@ -104,7 +104,7 @@ class _Set(argparse.Action):
 def drive(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser, "what was recorded")
     add = parser.add_argument
-    device = "the browser, which has keyboard, touch, gamepad and wheel (the default, and all)"
+    device = "what your hands are on: the browser takes keyboard, touch, gamepad and wheel"
     add("--human", "--device", dest="human", choices=HUMANS, default=HUMANS[0], help=device)
     driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
     add("--policy", metavar="POLICY", help=driver)
