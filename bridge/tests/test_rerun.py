@@ -74,7 +74,7 @@ def test_the_view_stands_until_the_ego_car_leaves_it_and_then_follows():
 
 def far_scene(x):
     car = messages.SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0, ego=True)
-    return messages.SeenScene(path=[[0.0, 0.0], [50.0, 0.0]], vehicles=[car])
+    return messages.SeenScene(path=[(0.0, 0.0), (50.0, 0.0)], vehicles=[car])
 
 
 def test_each_of_several_actions_has_a_name_and_a_colour_of_its_own():
