@@ -297,6 +297,7 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
+_FOLDER = {"metavar": "DIR", "type": "path"}
 _VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
 _TLS, _WAIT = "ca.pem, cert.pem, key.pem of this party", "how long to wait for"
 _SIMULATOR = "where the simulator or the router listens"
@@ -305,7 +306,7 @@ _NETWORK = "injected network: " + GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "where the edge runtime and viewers connect to"},
     "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": _SIMULATOR},
-    "--tls": {"metavar": "DIR", "help": f"{_TLS} (python -m deploy certs); endpoint tls/..."},
+    "--tls": {**_FOLDER, "help": f"{_TLS} (python -m deploy certs); endpoint tls/..."},
     "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
     "--wait-s": {**_SECONDS, "default": 10.0, "help": f"{_WAIT} a simulator, in seconds"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},

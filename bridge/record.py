@@ -59,11 +59,11 @@ NEVER_OVER = "choose another name: no recording is lost"
 
 
 def new_recording(path: str) -> str:
-    """The path itself; UserError where a recording could not be begun there later."""
+    """The path, absolute; UserError where a recording could not be begun there later."""
     check_writable(path)
     if Path(path).exists():
         raise UserError(f"{path} exists; {NEVER_OVER}")
-    return path
+    return str(Path(path).absolute())
 
 
 def _add_record_arguments(parser: Any) -> None:

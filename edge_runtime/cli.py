@@ -62,6 +62,8 @@ class ArgumentParser(argparse.ArgumentParser):
         # A guessed abbreviation would change its meaning when an option is added.
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(*args, **kwargs)
+        # Absolute, as soon as it is read: a simulator may change the working directory.
+        self.register("type", "path", os.path.abspath)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse, but an empty value is an error: no option here means anything by it.
@@ -102,6 +104,7 @@ def add_public_key(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--public-key",
         metavar="FILE",
+        type="path",
         help="Ed25519 public key of the policy's signer, PEM (default: keys/policy.pub where it"
         " exists; where an unsigned policy may drive, first policy.pub beside the policy)",
     )

@@ -73,9 +73,10 @@ def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
     """The flags of these settings, or of all. One that is not given is None: the file has it."""
     for name in names or _FLAGS:
         metavar, text = _FLAGS[name]
+        kind = "path" if name in ("policy", "tls") else str
         default = getattr(Config(), name, None)
         shown = f"{text} (default: {default})" if default else text
-        parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, help=shown)
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, type=kind, help=shown)
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:

@@ -64,7 +64,7 @@ def behind_link(path: PathLike) -> Path:
 
 
 def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
-    """The path; UserError now if `write_json_out(path)` would fail later, after the long work.
+    """Its absolute path; UserError now if `write_json_out(path)` would fail after the long work.
 
     It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
     """
@@ -76,7 +76,7 @@ def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
         raise UserError(f"cannot write {target}: {directory} is no directory")
     if not os.access(str(directory), os.W_OK | os.X_OK):
         raise UserError(f"cannot write {target}: the directory {directory} is read-only")
-    return path
+    return os.path.abspath(path)
 
 
 def make_directory(path: PathLike) -> None:

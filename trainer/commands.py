@@ -184,7 +184,7 @@ def export(parser: argparse.ArgumentParser) -> None:
 )
 def view(parser: argparse.ArgumentParser) -> None:
     what = "sitting-NNNN.mcap, a directory of such, or a run that a person guided"
-    parser.add_argument("recordings", metavar="RECORDING", nargs="+", help=what)
+    parser.add_argument("recordings", metavar="RECORDING", type="path", nargs="+", help=what)
     add_sink(parser)
 
 

@@ -111,7 +111,7 @@ def add_sink(parser: argparse.ArgumentParser) -> Any:
 def _file(path: str) -> str:
     if not path.endswith(SUFFIX):
         raise UserError(f"{path}: rerun opens only what is called F{SUFFIX}")
-    return path
+    return os.path.abspath(path)
 
 
 def has_display() -> bool:
@@ -129,6 +129,7 @@ def check_sink(sink: str | None, port: int | None = None) -> str:
     if port is not None and sink != SERVE:
         raise UserError(f"--port is that of a page: --{SERVE}")
     if sink.endswith(SUFFIX):
+        sink = os.path.abspath(sink)
         check_writable(sink)
     elif sink == SERVE:
         _page_ports(port)
