@@ -17,7 +17,8 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +81,13 @@ def make_environment(name: str, condition: str = NOMINAL) -> Environment:
         _load_plugin(environment_id)
         options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
         modes = _metadata(environment_id).get("render_modes") or ()
-        if RENDERED in modes:
-            options["render_mode"] = RENDERED
-        return _OneLine(_make_quietly(environment_id, **options))
+        drawn = {"render_mode": RENDERED} if RENDERED in modes else {}
+        try:
+            return _OneLine(_make_quietly(environment_id, **options, **drawn))
+        except TypeError as error:
+            if "render_mode" not in str(error):  # Not every constructor takes it.
+                raise
+            return _OneLine(_make_quietly(environment_id, **options))
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
         first_line = (str(error).splitlines() or [""])[0]
         what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
@@ -97,8 +102,8 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._do(self.env.reset, **options)
 
     def step(self, action: Any) -> Any:
-        """One control period."""
-        return self._do(self.env.step, action)
+        """One control period; the environment may write into its copy of the action."""
+        return self._do(self.env.step, np.array(action))
 
     def render(self) -> Any:
         """What it draws."""
@@ -181,36 +186,53 @@ def _load_plugin(environment_id: str) -> None:
         raise UserError(f"nobody registers it; these scenarios fail: {', '.join(failures)}")
 
 
-def describe(environment: Environment, period_s: float | None = None) -> Task:
+def describe(
+    environment: Environment, period_s: float | None = None, unknown_s: float | None = None
+) -> Task:
     """What the environment asks of a policy: its observation, actions, and control period.
 
-    The period is the environment's ``control_period_s``, else that of its ``render_fps``, else
-    ``period_s``.
+    The period is ``period_s`` where that is given, else the environment's ``control_period_s``,
+    that of ``config["policy_frequency"]`` (highway-env's), ``dt``, a guess from ``render_fps``, or
+    ``unknown_s``. A line says of the last two that they were taken.
 
     Raises UserError where the wire cannot carry it, or where nothing says how long a step is.
     """
-    own = environment.unwrapped
     spec = environment.spec
-    name = getattr(own, "scenario", None) or (spec.id if spec else type(own).__name__)
+    own = spec.id if spec else type(environment.unwrapped).__name__
+    name = offered(environment, "scenario") or own
     try:
-        car = msgspec.convert(getattr(own, "car", None), Car | None)
+        car = msgspec.convert(offered(environment, "car"), Car | None)
     except msgspec.ValidationError as error:
         raise UserError(f"environment {name!r}: its car is not valid: {error}") from None
     task = Task(
         task=name,
         observation=_entries(environment, name),
         action=_actions(environment, name),
-        control_period_s=_period_s(own, name, period_s),
+        control_period_s=period_s or _period_s(environment, name, unknown_s),
         car=car,
     )
     check_task(task)
     return task
 
 
+def offered(environment: Environment, name: str, default: Any = None) -> Any:
+    """What the outermost of an environment's wrappers that has this name, or it itself, has."""
+    try:
+        return environment.get_wrapper_attr(name)
+    except AttributeError:
+        return default
+
+
+@cache
+def say_once(text: str) -> None:
+    """Say it on stderr; many environments may be made of one kind."""
+    print(text, file=sys.stderr)
+
+
 def _entries(environment: Environment, name: str) -> dict[str, Entry]:
-    own, space = environment.unwrapped, environment.observation_space
-    meanings = getattr(own, "observation_meanings", {})
-    boxes = dict(space.spaces) if isinstance(space, Dict) else {entry_name(own): space}
+    space = environment.observation_space
+    meanings = offered(environment, "observation_meanings", {})
+    boxes = dict(space.spaces) if isinstance(space, Dict) else {entry_name(environment): space}
     entries = {}
     for entry, box in boxes.items():
         if not entry or entry.isdigit() or entry == OUTPUT:  # An ONNX graph would rename it
@@ -225,20 +247,20 @@ def _entries(environment: Environment, name: str) -> dict[str, Entry]:
     return entries
 
 
-def entry_name(own: Any) -> str:
+def entry_name(environment: Environment) -> str:
     """How an environment calls its one observation."""
-    return str(getattr(own, "observation_name", PLAIN))
+    return str(offered(environment, "observation_name", PLAIN))
 
 
 def _actions(environment: Environment, name: str) -> list[Action]:
-    own, space = environment.unwrapped, environment.action_space
+    space = environment.action_space
     if not isinstance(space, Box) or not np.all(np.isfinite([space.low, space.high])):
         raise UserError(f"environment {name!r} acts in {space}; the wire carries a Box with bounds")
     low, high = space.low.ravel().tolist(), space.high.ravel().tolist()
     count = len(low)
     names, empty = [f"action_{number}" for number in range(count)], [""] * count
     defaults = {"action_names": names, "action_meanings": empty, "action_units": empty}
-    said: dict[str, Any] = {key: getattr(own, key, None) or kept for key, kept in defaults.items()}
+    said: dict[str, Any] = {k: offered(environment, k) or kept for k, kept in defaults.items()}
     said["brake_action"] = known_stops(environment) or [None] * count
     for key, values in said.items():
         if len(values) != count:
@@ -253,32 +275,56 @@ def known_stops(environment: Environment) -> list[float | None] | None:
 
     One that has a brake of its own (``press_brake``) holds the last action and presses it.
     """
-    own = environment.unwrapped
     size = math.prod(environment.action_space.shape or (1,))
-    if callable(getattr(own, "press_brake", None)):
+    if callable(offered(environment, "press_brake")):
         return [None] * size
-    brake = getattr(own, "brake_action", None)
+    brake = offered(environment, "brake_action")
     return None if brake is None else [float(value) for value in np.ravel(brake)]
 
 
-def _period_s(own: Any, name: str, period_s: float | None) -> float:
-    found, frames_per_s = getattr(own, "control_period_s", None), own.metadata.get("render_fps")
-    if found is None:
-        found = 1.0 / frames_per_s if frames_per_s else period_s
-    if found is None:
-        raise UserError(f"environment {name!r} does not say how long a step is; give it --period")
-    return float(found)
+def _period_s(environment: Environment, name: str, unknown_s: float | None) -> float:
+    own, config = (offered(environment, key) for key in ("control_period_s", "config"))
+    if own is not None:
+        return finite("control_period_s", own)
+    # These names others have, too: what is no number means something else.
+    rate = _number(config.get("policy_frequency")) if isinstance(config, Mapping) else None
+    if found := (rate and 1.0 / rate) or _number(offered(environment, "dt")):
+        return found
+    says = f"{name} does not say how long a step is"
+    if frames_per_s := _number(environment.metadata.get("render_fps")):
+        say_once(f"{says}: {1.0 / frames_per_s:g} s is guessed from its render_fps")
+        return 1.0 / frames_per_s
+    if unknown_s is None:
+        raise UserError(f"environment {says}; give it --period")
+    say_once(f"{says}: {unknown_s} s is taken")
+    return unknown_s
+
+
+def finite(name: str, value: Any) -> float:
+    """The number; UserError for one that is not finite, or none: no wire or report carries it."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise UserError(f"the environment's {name} is {value!r}, no number") from None
+    if not math.isfinite(number):
+        raise UserError(f"the environment's {name} is {number}, not a finite number")
+    return number
+
+
+def _number(value: Any) -> float | None:
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    return float(value) if is_number and value > 0 else None
 
 
 def scene_of(environment: Environment) -> dict[str, Any] | None:
     """Return the picture seen from above, for viewers only; None if there is none."""
-    scene = getattr(environment.unwrapped, "scene", None)
+    scene = offered(environment, "scene")
     return scene() if callable(scene) else None
 
 
 def picture_of(environment: Environment) -> bytes:
     """A JPEG of what ``render()`` shows; empty for an environment that does not draw itself."""
-    if environment.unwrapped.render_mode != RENDERED:
+    if environment.render_mode != RENDERED:
         return b""
     shown = io.BytesIO()
     Image.fromarray(np.asarray(environment.render())).save(shown, "JPEG")

@@ -6,7 +6,6 @@ stepped with is the policy's command, or what a vehicle made of it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +14,9 @@ import msgspec
 import numpy as np
 
 from bridge.clocks import Clock
-from bridge.environments import Environment, entry_name
+from bridge.environments import Environment, entry_name, finite, offered
 from bridge.messages import Origin, Scene
-from bridge.report import FAILED, GOAL, UNKNOWN, EpisodeResult, SafeStopLog
+from bridge.report import ACCELERATIONS, EpisodeResult, SafeStopLog, of_known, outcome_of
 from bridge.virtual_link import Decision
 from edge_runtime.manifest import Action, Layout, Task
 from edge_runtime.safety import Event
@@ -34,7 +33,7 @@ class Actuators:
     """
 
     def __init__(self, environment: Environment, actions: Sequence[Action]) -> None:
-        self._own, self._actions = environment.unwrapped, actions
+        self._environment, self._actions = environment, actions
         space: Any = environment.action_space
         self._space, self._shape = space, space.shape
         self.hands_off: np.ndarray = np.clip(0.0, space.low, space.high).astype(space.dtype)
@@ -43,13 +42,13 @@ class Actuators:
 
     def brake(self, pressed: bool) -> None:
         """Press or release the brake of an environment that has one: its action only steers."""
-        press = getattr(self._own, "press_brake", None)
+        press = offered(self._environment, "press_brake")
         if callable(press):
             press(pressed)
 
     def stop(self) -> np.ndarray:
         """The action of a safe stop, in the environment's shape."""
-        own = getattr(self._own, "brake_action", None)
+        own = offered(self._environment, "brake_action")
         if own is not None:
             return self.within(own)
         pairs = zip(self._actions, self.last.ravel().tolist(), strict=True)
@@ -62,7 +61,7 @@ class Actuators:
         to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
         for what the last step missed, while errors of pedals would add up.
         """
-        pedal_for_speed = getattr(self._own, "pedal_for_speed", None)
+        pedal_for_speed = offered(self._environment, "pedal_for_speed")
         speed_mps, action = feedback.scenario_speed_mps, list(feedback.action)
         for place, row in enumerate(self._actions):
             if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
@@ -158,10 +157,8 @@ class EpisodeRunner:
         self._ridden = 0
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         self._applied = (None, False)
-        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
-        lateral_mps2: list[float] = []
-        longitudinal_mps2: list[float] = []
-        ended = False
+        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
+        felt, ended = [], False
         while not ended:
             state = self._state(episode, result.steps, observation, info)
             self._show(state)
@@ -179,9 +176,7 @@ class EpisodeRunner:
             result.actions.append(applied)
             self._applied = (applied, bool(decision.brake_reason))
             result.reward += finite("reward", reward)
-            # An environment need not report accelerations; then they count as zero.
-            lateral_mps2.append(abs(_number(info, "lateral_acceleration_mps2")))
-            longitudinal_mps2.append(abs(_number(info, "longitudinal_acceleration_mps2")))
+            felt.append(accelerations(info))
             self.deadline_misses += not decision.fresh
             self._ridden = decision.ridden
             self.ridden_steps += decision.ridden > 0
@@ -194,11 +189,12 @@ class EpisodeRunner:
         self._show(final)
         self.clock.finish(final)
         self._under_way = None
-        result.outcome = outcome_of(info)
+        result.outcome = outcome_of(info, only_truncated=not terminated)
         result.distance_m = _number(info, "distance_m")
         result.time_s = round(result.steps * self._period_s, 6)
-        result.lateral_acceleration_mps2 = float(np.mean(lateral_mps2))
-        result.longitudinal_acceleration_mps2 = float(np.mean(longitudinal_mps2))
+        result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
+            of_known, zip(*felt, strict=True)
+        )
         return result
 
     def _state(
@@ -234,7 +230,7 @@ class EpisodeRunner:
 def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str, bytes]:
     """An environment's observation as a state carries it. Raises UserError for another shape."""
     if not isinstance(observation, Mapping):
-        observation = {entry_name(environment.unwrapped): observation}
+        observation = {entry_name(environment): observation}
     packed = {}
     for name, dtype, shape, _ in layout.parts:
         packed[name] = array_of(observation, name, dtype, shape).tobytes()
@@ -246,20 +242,24 @@ def array_of(
 ) -> np.ndarray:
     """An entry of an observation as its task has it. Raises UserError where it does not fit."""
     try:
-        array = np.asarray(observation[name], dtype)
+        given = np.asarray(observation[name])
+        array = np.asarray(given, dtype)
     except (LookupError, TypeError, ValueError) as error:
         raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
     if array.shape != shape:
         raise UserError(f"the observation {name} is {array.shape}, not {shape}")
+    # A float may come as any number; of whole numbers none may change.
+    if dtype.kind != "f" and not (given.dtype.kind in "iub" and np.array_equal(array, given)):
+        value = given.ravel()[np.argmax(array != given)]
+        raise UserError(
+            f"the observation {name} holds {value} ({given.dtype}); it is to be {dtype}"
+        )
     return array
 
 
-def outcome_of(info: Mapping[str, Any]) -> str:
-    """How an episode has ended; UNKNOWN where the environment's last ``info`` does not say."""
-    if info.get("outcome"):
-        return str(info["outcome"])
-    success = info.get("is_success")
-    return UNKNOWN if success is None else GOAL if success else FAILED
+def accelerations(info: Mapping[str, Any]) -> list[float | None]:
+    """|a| of a step in the order of ACCELERATIONS; None where the environment does not say."""
+    return [None if info.get(n) is None else abs(finite(n, info[n])) for n in ACCELERATIONS]
 
 
 def _speed_mps(info: dict[str, Any]) -> float | None:
@@ -269,14 +269,3 @@ def _speed_mps(info: dict[str, Any]) -> float | None:
 def _number(info: dict[str, Any], name: str) -> float:
     value = info.get(name)
     return 0.0 if value is None else finite(name, value)
-
-
-def finite(name: str, value: Any) -> float:
-    """The number; UserError for one that is not finite, or none: no wire or report carries it."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise UserError(f"the environment's {name} is {value!r}, no number") from None
-    if not math.isfinite(number):
-        raise UserError(f"the environment's {name} is {number}, not a finite number")
-    return number

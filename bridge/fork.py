@@ -42,7 +42,7 @@ from bridge.progress import ProgressBar
 from bridge.record import RecordingWriter, new_recording
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.replay import controller_of
-from bridge.report import GOAL, SNAPSHOTS, UNKNOWN, EpisodeResult
+from bridge.report import GOAL, SNAPSHOTS, UNTOLD, EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
 from edge_runtime.config import add_trust
@@ -365,7 +365,8 @@ def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
 
 def _add_common(parser: Any) -> None:
     """Declare what `fork` and `bisect` have in common."""
-    parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
+    drive = "what bridge record has written"
+    parser.add_argument("recording", metavar="F.mcap", type="path", help=drive)
     add_place(parser)
     module = "the environment, where it is of a module: no file decides what is imported"
     parser.add_argument("--env", metavar="ENV", help=module)
@@ -377,11 +378,11 @@ def _add_fork_arguments(parser: Any) -> None:
     policy = "who drives on (default: the recorded commands, while all is as recorded)"
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     record = "record the fork, as `bridge record` does; of a person's, the directory"
-    parser.add_argument("--policy", metavar="POLICY.onnx", help=policy)
+    parser.add_argument("--policy", metavar="POLICY.onnx", type="path", help=policy)
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
     parser.add_argument("--human", metavar="web", help=human)
-    parser.add_argument("--record", metavar="G.mcap", help=record)
+    parser.add_argument("--record", metavar="G.mcap", type="path", help=record)
 
 
 def _run_fork(asked: Namespace) -> int:
@@ -460,7 +461,7 @@ def _add_bisect_arguments(parser: Any) -> None:
     _add_common(parser)
     runs = "a training run with snapshots (--set snapshots=true), or a directory of policy files,"
     runs += " in the order of their names"
-    parser.add_argument("--runs", metavar="RUN_DIR", required=True, help=runs)
+    parser.add_argument("--runs", metavar="RUN_DIR", type="path", required=True, help=runs)
 
 
 def _run_bisect(asked: Namespace) -> int:
@@ -476,11 +477,11 @@ def _run_bisect(asked: Namespace) -> int:
                     forked = ForkedDrive(drive, environment, fork, load(number))
                     outcomes[number] = forked.run().outcome
                     bar.advance({names[number]: outcomes[number]})
-                if outcomes[number] == UNKNOWN:
-                    raise UserError(f"{drive.origin.environment} does not say what a success is")
                 return outcomes[number] == GOAL
 
             change, alone = first_change(len(names), succeeds)
+    if UNTOLD.issuperset(outcomes.values()):
+        raise UserError(f"{drive.origin.environment} does not say what a success is")
     report = {
         "recording": asked.recording, "episode": drive.number,
         "at_s": round(fork * drive.task.control_period_s, 6), "policies": len(names),

@@ -47,12 +47,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
     change = "what the environment does not say: action.N.stop (a number, or null to hold the last"
     change += " action), slew_per_s, unit, meaning; may be repeated"
-    add("model", metavar="MODEL.onnx", help="the model, in one file")
+    add("model", metavar="MODEL.onnx", type="path", help="the model, in one file")
     add("--env", metavar="ENV", required=True, help=env)
-    add("--out", metavar="POLICY.onnx", required=True, help="the policy file")
-    add("--key", metavar="KEY", help="the private key (PEM) to sign it with (deploy keys)")
+    add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
+    add("--key", metavar="KEY", type="path", help="the private key that signs it (deploy keys)")
     add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
-    period = "seconds of a step, for an environment that does not say"
+    period = "seconds of a step (default: what the environment says, else its render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     algorithm = "what trained it, for the manifest"
     add_envelope(parser)
@@ -104,7 +104,7 @@ def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> 
 def add_envelope(parser: argparse.ArgumentParser) -> None:
     """Declare the option of the networks that the policy bears."""
     text = "the networks in which it may drive (hil_tests envelope), for the manifest"
-    parser.add_argument("--envelope", metavar="F.json", help=text)
+    parser.add_argument("--envelope", metavar="F.json", type="path", help=text)
 
 
 def network_of(model: onnx.ModelProto) -> str:

@@ -22,16 +22,43 @@ from edge_runtime.wire import Command, Feedback
 GOAL, FAILED = "goal", "failed"
 UNKNOWN = "ended"
 """An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
+TRUNCATED, TIMEOUT = "truncated", "timeout"
+"""Gymnasium's limit of steps has ended an episode of which the environment says nothing: a timeout
+as soon as it says of any other how that ended (`settled`)."""
 COLLISION = "collision"
 STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
 DISCARDED = "discarded"
 """The person threw it away: it is shown, and nothing learns from it."""
+UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
 SNAPSHOTS = "snapshots"  # In a training run: directories that are such runs themselves
 
 
 def failed(outcome: str) -> bool:
     """Whether an episode missed its goal; not where none is known, or where a person ended it."""
-    return outcome not in (GOAL, UNKNOWN, STOPPED, RESTARTED, DISCARDED)
+    return outcome != GOAL and outcome not in UNTOLD
+
+
+def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
+    """How an episode has ended, by the environment's last ``info``.
+
+    Where that does not say: TRUNCATED for one that only a limit of steps has ended, else UNKNOWN.
+    """
+    if info.get("outcome"):
+        return str(info["outcome"])
+    success = info.get("is_success")
+    if success is None:
+        return TRUNCATED if only_truncated else UNKNOWN
+    return GOAL if success else FAILED
+
+
+def settled(outcomes: Iterable[str]) -> list[str]:
+    """The same, with TIMEOUT for TRUNCATED as soon as any tells how its episode ended."""
+    outcomes = list(outcomes)
+    is_told = not UNTOLD.issuperset(outcomes)
+    return [TIMEOUT if is_told and one == TRUNCATED else one for one in outcomes]
+
+
+ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
 
 
 @dataclass
@@ -39,8 +66,9 @@ class EpisodeResult:
     """One driven episode.
 
     `outcome` is as in the contract for this repository's environments; another environment may
-    report its own word, FAILED or UNKNOWN. Accelerations are the mean of |a| over the episode's
-    steps. `actions` holds for each step the action that the environment was given, as floats.
+    report its own word, FAILED, TRUNCATED or UNKNOWN. Accelerations are the mean of |a| over the
+    episode's steps, None where they are unknown. `actions` holds for each step the action that the
+    environment was given, as floats.
     """
 
     seed: int
@@ -48,8 +76,8 @@ class EpisodeResult:
     distance_m: float
     reward: float
     time_s: float
-    lateral_acceleration_mps2: float
-    longitudinal_acceleration_mps2: float
+    lateral_acceleration_mps2: float | None
+    longitudinal_acceleration_mps2: float | None
     steps: int
     actions: list[list[float]] = field(default_factory=list)
 
@@ -59,27 +87,30 @@ def summarise(
 ) -> dict[str, Any]:
     """The contract's summary of `results`. `std` is over the episodes (population, ddof 0).
 
+    It settles their outcomes. None are mean and deviation of what no episode tells.
+
     Raises ValueError for no episode at all: a mean of nothing is no number.
     """
     if not results:
         raise ValueError("no episode to summarise")
+    for result, outcome in zip(results, settled(one.outcome for one in results), strict=True):
+        result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
     fields = {
         "surviving_distance_m": "distance_m",
         "episode_reward": "reward",
         "episode_time_s": "time_s",
-        "lateral_acceleration_mps2": "lateral_acceleration_mps2",
-        "longitudinal_acceleration_mps2": "longitudinal_acceleration_mps2",
+        **{name: name for name in ACCELERATIONS},
     }
     columns = {key: [getattr(result, name) for result in results] for key, name in fields.items()}
     return {
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": success_rate(outcomes),
+        "success_rate": outcomes[GOAL] / len(results) if outcomes.keys() - UNTOLD else None,
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
-            key: {"mean": float(np.mean(values)), "std": float(np.std(values))}
+            key: {"mean": of_known(values), "std": of_known(values, np.std)}
             for key, values in columns.items()
         },
         "policy_id": policy_id,
@@ -87,10 +118,10 @@ def summarise(
     }
 
 
-def success_rate(outcomes: Counter[str]) -> float | None:
-    """The share of goals; None where the environment says of no episode how it has ended."""
-    known = outcomes.total() - outcomes[UNKNOWN]
-    return outcomes[GOAL] / outcomes.total() if known else None
+def of_known(values: Iterable[float | None], figure: Any = np.mean) -> float | None:
+    """The figure of those values that are known; None where none is."""
+    known = [value for value in values if value is not None]
+    return float(figure(known)) if known else None
 
 
 STANDSTILL_MPS = 0.05

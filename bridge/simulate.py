@@ -60,7 +60,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
-    period = "seconds of a step, for an environment that does not say"
+    period = "seconds of a step (default: what the environment says, else its render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)

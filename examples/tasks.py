@@ -16,9 +16,7 @@ class Racetrack(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(self, **options: Any) -> None:
         import highway_env  # noqa: F401 (registers it)
 
-        env: Any = gymnasium.make("racetrack-v0", **options)
-        super().__init__(env)
-        env.unwrapped.control_period_s = 1.0 / env.unwrapped.config["policy_frequency"]
+        super().__init__(gymnasium.make("racetrack-v0", **options))
 
     def step(self, action: Any) -> Any:
         """One control period, with the word on success."""

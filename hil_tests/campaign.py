@@ -90,7 +90,7 @@ def _task(arguments: argparse.Namespace, policy: Path) -> sweep.Task:
     loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
     return sweep.Task(
         policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
-        arguments.runs, arguments.public_key,
+        arguments.runs, arguments.public_key, loaded.manifest.control_period_s,
     )  # fmt: skip
 
 

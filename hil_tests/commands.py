@@ -50,7 +50,7 @@ def campaign(parser: argparse.ArgumentParser) -> None:
 def envelope(parser: argparse.ArgumentParser) -> None:
     inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
     add, count = parser.add_argument, cli.not_negative
-    add("--out", required=True, metavar="F.json", help="what is found")
+    add("--out", required=True, metavar="F.json", type="path", help="what is found")
     add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
     add_public_key(parser)
     add("--env", help="scenario, gymnasium id or module:id (default: the file's, else left_turn)")
@@ -61,7 +61,7 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--jobs", type=count, default=0, help="processes that drive; 0: one a core")
     confirms = "drive just inside and outside of this file's edges, with fresh seeds; scene and "
     confirms += "promise are the file's"
-    add("--confirm", metavar="F.json", help=confirms)
+    add("--confirm", metavar="F.json", type="path", help=confirms)
     add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
 
 

@@ -41,14 +41,14 @@ import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
 from bridge.policy_file import network_of_file
-from bridge.report import GOAL, UNKNOWN
+from bridge.report import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json
 from hil_tests.trace import failing_drive, shrunk
-from trainer.drivers import load_driver
+from trainer.drivers import load_driver, located
 from trainer.environments import CONDITIONS, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluation import drive_episodes, trained_in
 from trainer.experiments.data import success_estimate
 from trainer.options import set_threads
 from trainer.util import cores, die_with_parent, kept
@@ -246,6 +246,7 @@ class Drivers(ProcessPoolExecutor):
         begin: Any = _begin
         super().__init__(jobs, get_context("spawn"), begin, task)
         self.driven: list[int] = []  # How many drives each `drive` was
+        self._ended = {TRUNCATED}  # How any drive has ended
 
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
@@ -253,7 +254,12 @@ class Drivers(ProcessPoolExecutor):
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
         """Drive each seed behind a network; whether it succeeded."""
         self.driven.append(len(seeds))
-        return list(self.map(partial(_work, _succeeds, spec), seeds, chunksize=CHUNK))
+        outcomes = list(self.map(partial(_work, _outcome, spec), seeds, chunksize=CHUNK))
+        self._ended.update(outcomes)
+        # A limit of steps alone is a timeout as soon as any other drive's end was told.
+        if UNKNOWN in outcomes or len(self._ended) == 1:
+            raise UserError("the environment does not say of each drive whether it succeeded")
+        return [outcome == GOAL for outcome in outcomes]
 
 
 _mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
@@ -263,7 +269,8 @@ def _begin(policy: str, env: str, condition: str, public_key: str | None) -> Non
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=die_with_parent, daemon=True).start()
     set_threads(1)
-    environment = make_environment(env, condition)
+    period_s = trained_in(policy, public_key)[1]
+    environment = make_environment(env, condition, period_s=period_s)
     _mine[:] = environment, load_driver(policy, environment, public_key, True)[0], condition
 
 
@@ -272,11 +279,9 @@ def _work(work: Callable[..., Any], *arguments: Any) -> Any:
     return work(*_mine, *arguments)
 
 
-def _succeeds(env: Any, driver: Any, condition: str, spec: LatencySpec, seed: int) -> bool:
+def _outcome(env: Any, driver: Any, condition: str, spec: LatencySpec, seed: int) -> str:
     (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
-    if result.outcome == UNKNOWN:
-        raise UserError("the environment does not say of each drive whether it succeeded")
-    return result.outcome == GOAL
+    return result.outcome
 
 
 def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
@@ -349,19 +354,20 @@ def run(arguments: argparse.Namespace) -> int:
     began_s, jobs = time.monotonic(), arguments.jobs or cores()
     known = read_known(arguments.confirm) if arguments.confirm else None
     told = known or arguments  # A file tells what was driven.
-    env, policy, condition = arguments.env, arguments.policy, told.condition
+    env, name, condition = arguments.env, arguments.policy, told.condition
     if known:
         said = f"{arguments.confirm} is of"
         env = env or name_in_file(known.env, said, "--env")
-        policy = policy or name_in_file(known.policy, said, "--policy")
+        name = name or name_in_file(known.policy, said, "--policy")
     env = env or "left_turn"
-    policy = policy or kept(f"results/policies/{env}.onnx")
-    environment = make_environment(env, condition)
+    policy = located(name or kept(f"results/policies/{env}.onnx"))
+    period_s = trained_in(policy, arguments.public_key)[1]
+    environment = make_environment(env, condition, period_s=period_s)
     policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
     if known and known.policy_id != policy_id:
         raise UserError(f"{arguments.confirm} is of another policy than {policy}")
     found: dict[str, Any] = {
-        "schema": 1, "policy_id": policy_id, "policy": policy, "env": env, "condition": condition,
+        "schema": 1, "policy_id": policy_id, "policy": name, "env": env, "condition": condition,
         "promised_success": known.promised_success if known else arguments.promise,
         "confidence": told.confidence, "seed": arguments.seed,
         "control_period_s": environment.control_period_s,

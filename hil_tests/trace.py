@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 from bridge.network import DIRECTIONS, Direction, LatencySpec, Link, make_link
-from bridge.report import GOAL, EpisodeResult
+from bridge.report import GOAL, TIMEOUT, TRUNCATED, EpisodeResult
 from trainer.evaluation import drive_episodes
 
 Item = TypeVar("Item")
@@ -99,5 +99,6 @@ def shrunk(
     disturbed = [(name, period) for name in DIRECTIONS for period in whole[name]]
     items = shrink(disturbed, lambda some: behind(part(some)).outcome != GOAL)
     result = behind(part(items))
-    told = {"seed": seed, "network": network, "outcome": result.outcome, "steps": result.steps}
+    outcome = result.outcome.replace(TRUNCATED, TIMEOUT)  # Without a network it reached the goal.
+    told = {"seed": seed, "network": network, "outcome": outcome, "steps": result.steps}
     return {**told, "disturbed": len(items), "disturbed_before": len(disturbed), **part(items)}

@@ -53,7 +53,8 @@ def train(parser: argparse.ArgumentParser) -> None:
     add(
         "--period", action=_Set, dest="set", default=[], metavar="SECONDS",
         type=lambda text: f"period_s={cli.positive_number(text)}",
-        help=f"seconds of a step, for an environment that does not say (default: {PERIOD_S})",
+        help="seconds of a step (default: what the environment says, else its render_fps, else"
+        f" {PERIOD_S})",
     )  # fmt: skip
     options.add_latency(what, "the network between policy and vehicle, also in validation")
     guide = parser.add_argument_group("the human")
@@ -110,10 +111,10 @@ def drive(parser: argparse.ArgumentParser) -> None:
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
     forked = "each episode repeats this recorded drive until --at, and goes on from there"
-    add("--from", dest="recording", metavar="F.mcap", help=forked)
+    add("--from", dest="recording", metavar="F.mcap", type="path", help=forked)
     add_place(parser)
     out = "the directory of the recordings; sittings add up there"
-    add("--out", metavar="REC_DIR", default="runs/drives", help=out)
+    add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
     add("--episodes", type=cli.positive, metavar="N", help="stop after so many (default: no end)")
     options.add_seed(parser, "the episodes, which are others in every sitting")
     add_person(parser)
@@ -129,12 +130,12 @@ def drive(parser: argparse.ArgumentParser) -> None:
 def human(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser)
     add = parser.add_argument
-    add("--out", required=True, metavar="HUMAN_DIR", help="the directory of the model")
+    add("--out", required=True, metavar="HUMAN_DIR", type="path", help="the directory of the model")
     options.add_seed(parser, "everything that is drawn at random")
     options.add_fields(parser, HumanModelConfig(), *FIELDS)
     person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
     person += "their directories, or such a training run (default: the scripted expert)"
-    add("--from", dest="recordings", nargs="+", metavar="RECORDING", help=person)
+    add("--from", dest="recordings", nargs="+", metavar="RECORDING", type="path", help=person)
     last = "begin no episode after this time; the refining steps shrink in proportion to the "
     options.add_time_limit(parser, f"{last}episodes")
     options.add_threads(parser)
@@ -162,7 +163,7 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     add("--runs", type=cli.positive, default=50, metavar="N", help=count)
     options.add_seed(parser, "the first episode; each next one has one more")
     out = "write the report, with each episode, to this file instead of printing it"
-    add("--out", metavar="R.json", help=out)
+    add("--out", metavar="R.json", type="path", help=out)
 
 
 @command(

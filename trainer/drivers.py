@@ -4,6 +4,7 @@ A name is the word expert, ``module:Class`` of one, ``constant:ACTION``, an expo
 training run or a human model.
 """
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -92,6 +93,11 @@ def is_expert(word: str) -> bool:
     """Whether this is the word expert, or ``module:Class`` of one."""
     a_class = re.fullmatch(r"[\w.]+:\w+", word) and not word.startswith(CONSTANT)
     return word == "expert" or bool(a_class)
+
+
+def located(driver: str) -> str:
+    """What drives, by its name; a path is absolute: a simulator may change the directory."""
+    return driver if is_expert(driver) or not Path(driver).exists() else os.path.abspath(driver)
 
 
 def load_driver(

@@ -7,9 +7,7 @@ environment; its ``outer`` and ``inner`` are the one place where actions are sca
 """
 
 import copy
-import sys
 from collections.abc import Mapping
-from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +18,8 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
-from bridge.episode import array_of, finite, outcome_of
+from bridge.episode import array_of, finite
+from bridge.report import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason
@@ -31,6 +30,7 @@ from trainer.util import PERIOD_S
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 MOST_STEPS = 1000  # Of an episode whose environment has no end of its own
+BEARABLE = 1e4  # Of an observation's numbers; the layers of a network take some units
 
 
 class Condition(NamedTuple):
@@ -61,9 +61,9 @@ def make_environment(
     """The environment of a scenario's word, a gymnasium id or ``module:id``.
 
     The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
-    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. In an
-    environment that does not say how long a step is it takes ``period_s``, and a line says so;
-    None where it does not matter.
+    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. A step
+    counts as ``period_s`` where that is given, else as what the environment says, else as 0.1 s,
+    and a line says so.
 
     Raises UserError: no such environment, or one that nothing here could drive.
     """
@@ -75,6 +75,7 @@ def make_environment(
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
         scenario.config = scenario.config.with_printed_reward()
+    scenario.control_period_s = bridge.describe(scenario, period_s).control_period_s
     return scenario
 
 
@@ -177,7 +178,7 @@ class Adapted:
         self.env, self.scenario = env, name
         self.unwrapped: Any = env.unwrapped
         self.observation_space = env.observation_space
-        task = bridge.describe(env, PERIOD_S if period_s is None else period_s)
+        task = bridge.describe(env, period_s, PERIOD_S)
         self.layout = _layout(task, isinstance(env.observation_space, Dict))
         self.control_period_s = task.control_period_s
         self.action_names = tuple(row.name for row in task.action)
@@ -185,23 +186,19 @@ class Adapted:
         assert isinstance(own, Box)  # described
         self.action_range = own.low.reshape(-1), own.high.reshape(-1)
         self.action_space = Box(-1.0, 1.0, (len(task.action),), np.float32)
-        self.key_rate_per_s = float(getattr(self.unwrapped, "key_rate_per_s", 5.0))
-        self.expert = self._expert if hasattr(self.unwrapped, "expert") else None
+        self.key_rate_per_s = float(bridge.offered(env, "key_rate_per_s", 5.0))
+        self.expert = self._expert if bridge.offered(env, "expert") else None
         if env.spec is None or env.spec.max_episode_steps is None:
             most = f"an episode ends after {MOST_STEPS} steps at the latest"
-            _say_once(f"{name} has no limit of its own: {most}")
+            bridge.say_once(f"{name} has no limit of its own: {most}")
             self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)
-        try:
-            bridge.describe(env)
-        except UserError:
-            if period_s is not None:
-                _say_once(f"{name} does not say how long a step is: {period_s} s is taken")
-        self._last = np.zeros(len(task.action), np.float32)
+        self._last = self.rest_action
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Begin an episode."""
+        self._last = self.rest_action
         observation, info = self.env.reset(seed=seed, options=options)
         return self._seen(observation), _said(info)
 
@@ -211,19 +208,19 @@ class Adapted:
         observation, reward, terminated, truncated, info = self.env.step(self._own(action))
         info = _said(info)
         if terminated or truncated:
-            info["outcome"] = outcome_of(info)
+            info["outcome"] = outcome_of(info, only_truncated=not terminated)
         reward = finite("reward", reward)
         return self._seen(observation), reward, bool(terminated), bool(truncated), info
 
     @property
     def brake_action(self) -> Action:
         """The environment's own stop, or the last action where it has none."""
-        own = getattr(self.unwrapped, "brake_action", None)
+        own = bridge.offered(self.env, "brake_action")
         return self._last if own is None else inner(self.action_range, own)
 
     def press_brake(self, pressed: bool) -> None:
         """Press or release the brake, where it has one."""
-        getattr(self.unwrapped, "press_brake", lambda pressed: None)(pressed)
+        bridge.offered(self.env, "press_brake", lambda pressed: None)(pressed)
 
     def scene(self) -> dict[str, Any] | None:
         """The scene from above in metres; None where it has none."""
@@ -232,7 +229,11 @@ class Adapted:
     @property
     def can_be_seen(self) -> bool:
         """Whether there is something to show a person."""
-        return callable(getattr(self.unwrapped, "scene", None)) or self._draws
+        return callable(bridge.offered(self.env, "scene")) or self._draws
+
+    def close(self) -> None:
+        """Close it: of some simulators only one may live in a process."""
+        self.env.close()
 
     def render(self) -> NDArray[np.uint8]:
         """The environment's own picture, uint8 [height, width, 3]; UserError without one."""
@@ -248,7 +249,7 @@ class Adapted:
     @property
     def keys(self) -> dict[str, Action]:
         """Key -> the action while it is held, in [-1, 1]; of a single action the arrows."""
-        own: Mapping[str, Any] = getattr(self.unwrapped, "keys", {})
+        own: Mapping[str, Any] = bridge.offered(self.env, "keys", {})
         if not own and len(self.action_names) == 1:
             one = np.ones(1, np.float32)
             return {"up": one, "right": one, "down": -one, "left": -one}
@@ -264,7 +265,7 @@ class Adapted:
         return outer(self.action_range, action).reshape(space.shape).astype(space.dtype)
 
     def _expert(self) -> Expert:
-        return _ScaledExpert(self, self.unwrapped.expert())
+        return _ScaledExpert(self, self.env.get_wrapper_attr("expert")())
 
     def _seen(self, observation: Any) -> NDArray[Any]:
         """As one array; UserError for one that no network could learn from."""
@@ -272,9 +273,13 @@ class Adapted:
         given = observation if seen.dtype.names else {bridge.PLAIN: observation}
         for name, entry in entries_of(seen, bridge.PLAIN).items():
             entry[...] = array_of(given, name, entry.dtype, entry.shape)
-            if entry.dtype.kind == "f" and not np.isfinite(entry).all():
+            largest = np.abs(entry).max() if entry.dtype.kind == "f" else 0.0
+            if not np.isfinite(largest):
                 what = "holds a number that is not finite"
                 raise UserError(f"an observation of {self.scenario} {what}")
+            if largest > BEARABLE:
+                what = f"numbers beyond {BEARABLE:g}, of which no network learns: scale them"
+                bridge.say_once(f"{self.scenario} observes in {name} {what}")
         return seen
 
 
@@ -304,17 +309,10 @@ class _ScaledExpert(Expert):
 def _said(info: Mapping[str, Any]) -> dict[str, Any]:
     """The info with all that the trainer looks at; what is not known is nan, or no distance."""
     unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
-    still = {"lateral_acceleration_mps2": 0.0, "longitudinal_acceleration_mps2": 0.0}
-    return {**unknown, **still, **{key: value for key, value in info.items() if value is not None}}
+    return unknown | {key: value for key, value in info.items() if value is not None}
 
 
 def _layout(task: Task, several: bool) -> Layout:
     entries = [(name, np.dtype(e.dtype), tuple(e.shape)) for name, e in task.observation.items()]
     (_, dtype, shape), *_ = entries
     return Layout((), np.dtype(entries)) if several else Layout(shape, dtype)
-
-
-@cache
-def _say_once(text: str) -> None:
-    """A training makes many environments."""
-    print(text, file=sys.stderr)

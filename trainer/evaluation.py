@@ -4,6 +4,7 @@ import argparse
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from os import PathLike, fspath
 from pathlib import Path
@@ -11,20 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from bridge.episode import finite
+from bridge.episode import accelerations, finite
 from bridge.network import LatencySpec, Link, parse_spec
 from bridge.progress import ProgressBar
-from bridge.report import GOAL, EpisodeResult, summarise
+from bridge.report import GOAL, EpisodeResult, of_known, summarise
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, counted, name_in_file, read_json
-from trainer.drivers import ActTogether, load_driver
+from trainer.drivers import ActTogether, load_driver, located
 from trainer.environments import CONDITIONS, make_environment, scenario_of
 from trainer.human.guide import Action, Driver
 from trainer.options import limited_threads
 from trainer.training.config import period_of
 from trainer.training.delayed import VehicleEnd
-from trainer.util import PERIOD_S
 
 NO_NETWORK = LatencySpec()
 
@@ -98,15 +98,16 @@ def evaluate(
     if seed < 0:
         raise UserError(f"seed must be at least 0: {seed}")
     scenario = scenario or getattr(policy, "scenario", None)
-    policy, spec = fspath(policy), parse_spec(latency)
+    policy, spec = located(fspath(policy)), parse_spec(latency)
     named, period_s = trained_in(policy, public_key)
     named = scenario or name_in_file(named, f"{policy} was trained in", "--scenario")
     scenario = scenario_of(named)
-    env = make_environment(scenario, condition, period_s=period_s)
-    driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
     goals = 0
-    # The last bits must not depend on the machine's cores.
-    with limited_threads(1), ProgressBar("evaluating", runs) as bar:
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(make_environment(scenario, condition, period_s=period_s)))
+        driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
+        stack.enter_context(limited_threads(1))  # The last bits must not depend on the cores.
+        bar = stack.enter_context(ProgressBar("evaluating", runs))
 
         def on_episode(result: EpisodeResult) -> None:
             nonlocal goals
@@ -119,17 +120,17 @@ def evaluate(
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
 
-def trained_in(policy: str, public_key: str | None) -> tuple[str, float]:
+def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
     """The scenario of a run, a human model or a policy file, and how long a step was there.
 
-    Of anything else the left turn.
+    That is None where the environment said it. Of anything else the left turn.
     """
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
             known = read_json(Path(policy) / name, "config")
             return scenario_of(str(known.get("scenario"))), period_of(known)
     if not policy.endswith(".onnx"):
-        return "left_turn", PERIOD_S
+        return "left_turn", None
     manifest = load_policy(policy, public_key, allow_unsigned=True).manifest
     config = manifest.training.get("config")
     named = config.get("scenario") if isinstance(config, dict) else None
@@ -147,11 +148,11 @@ class Drive:
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
         self.env, self.noise_std = env, noise_std
         self.over = False
-        self.result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        self.result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
         """What it comes to; whole once it is over."""
         self.observation, _ = env.reset(seed=seed)
         self._noise = np.random.default_rng([seed, 1])
-        self._lateral, self._longitudinal = list[float](), list[float]()
+        self._felt: list[list[float | None]] = []
 
     def step(self, action: Action) -> None:
         """One control period."""
@@ -162,16 +163,15 @@ class Drive:
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
         result.reward += finite("reward", reward)
-        for way, seen in (("lateral", self._lateral), ("longitudinal", self._longitudinal)):
-            name = f"{way}_acceleration_mps2"
-            seen.append(abs(finite(name, info[name])))
+        self._felt.append(accelerations(info))
         if self.over:
             result.outcome = info["outcome"]
             result.distance_m = finite("distance_m", info["distance_m"])
             result.steps = len(result.actions)
             result.time_s = result.steps * self.env.control_period_s
-            result.lateral_acceleration_mps2 = float(np.mean(self._lateral))
-            result.longitudinal_acceleration_mps2 = float(np.mean(self._longitudinal))
+            result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
+                of_known, zip(*self._felt, strict=True)
+            )
 
 
 def drive_together(

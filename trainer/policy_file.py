@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
 from os import PathLike
@@ -19,7 +20,7 @@ from bridge.policy_file import make_policy, write_policy
 from edge_runtime.files import check_writable
 from edge_runtime.policy import open_network, policy_id_of
 from edge_runtime.tls import read_signing_key
-from edge_runtime.util import UserError, read_json
+from edge_runtime.util import UserError, name_in_file, read_json
 from trainer.drivers import load_actor
 from trainer.environments import entries_of, make_environment, task_of
 from trainer.learner.networks import Actor
@@ -57,19 +58,25 @@ def export(
 
     Raises UserError: no run there, a wrong name or key, or a file that would do something else.
     """
-    path, key_file = Path(out), None if key is None else Path(key)
-    if path.suffix != ".onnx":
-        raise UserError(f"--out {path}: a policy file's name ends in .onnx")
-    check_writable(path)
+    scenario = scenario or getattr(run, "scenario", None)
+    # Absolute: a simulator may change the working directory.
+    file, run = Path(out).absolute(), Path(run).absolute()
+    key_file = None if key is None else Path(key).absolute()
+    if file.suffix != ".onnx":
+        raise UserError(f"--out {file}: a policy file's name ends in .onnx")
+    check_writable(file)
     if key_file:
         read_signing_key(key_file)
-    scenario = scenario or getattr(run, "scenario", None)
-    actor, label = load_actor(Path(run), scenario and make_environment(scenario))
-    if "known_latency" in label:
-        raise UserError(f"{run} needs the actions that are under way, which no state carries")
-    config = read_json(Path(run) / CONFIG_FILE, "run config")
-    made = export_policy(actor, label, config, envelope and read_json(Path(envelope), "envelope"))
-    write_policy(made.model, path, key_file)
+    measured = envelope and read_json(Path(envelope), "envelope")
+    config = read_json(run / CONFIG_FILE, "run config")
+    named = str(config.get("scenario"))
+    scenario = scenario or name_in_file(named, f"{run} was trained in", "--scenario")
+    with closing(make_environment(scenario, period_s=period_of(config))) as env:
+        actor, label = load_actor(run, env)
+        if "known_latency" in label:
+            raise UserError(f"{run} needs the actions that are under way, which no state carries")
+        made = export_policy(actor, label, config, measured, env)
+    write_policy(made.model, file, key_file)
     return made
 
 
@@ -87,17 +94,19 @@ def export_policy(
     label: dict[str, Any],
     training: dict[str, Any],
     envelope: Any = None,
+    env: Any = None,
 ) -> Export:
     """Convert, describe, check and compare.
 
     ``label`` has ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run; the manifest
     gets its whole config (``training``) and the networks in which it may drive (``envelope``).
+    ``env`` is that scenario, by default a new one.
 
     Raises UserError: the file would not do what the network does.
     """
-    env = make_environment(label["scenario"], period_s=period_of(training))
+    env = env or make_environment(label["scenario"], period_s=period_of(training))
     network = _InOwnUnits(actor, env.action_range).eval()
-    observations = real_observations(label["scenario"], PARITY_OBSERVATIONS)
+    observations = real_observations(env, PARITY_OBSERVATIONS)
     task = task_of(env)
     entries = entries_of(observations, next(iter(task.observation)))
     about = {
@@ -135,9 +144,10 @@ class _InOwnUnits(torch.nn.Module):
         return self.low + (action + 1.0) * self.reach if self.scaled else action
 
 
-def real_observations(scenario: str, count: int, seed: int = 0) -> NDArray[Any]:
-    """Observations [count, ...] from driving the scenario at random."""
-    env, random = make_environment(scenario), np.random.default_rng(seed)
+def real_observations(driven: Any, count: int, seed: int = 0) -> NDArray[Any]:
+    """Observations [count, ...] from driving an environment, or a scenario, at random."""
+    env = make_environment(driven) if isinstance(driven, str) else driven
+    random = np.random.default_rng(seed)
     size = env.action_space.shape
     observation, _ = env.reset(seed=seed)
     seen: list[NDArray[Any]] = []

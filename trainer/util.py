@@ -68,7 +68,7 @@ def random_stream(run_seed: int, purpose: Purpose) -> np.random.Generator:
 def check_ranges(config: Any, ranges: Mapping[Range, Sequence[str]]) -> None:
     """Raise UserError unless every number of a dataclass is finite and within its range.
 
-    That is at least 0, but for the fields that ``ranges`` names.
+    That is at least 0, but for the fields that ``ranges`` names. A default may be outside.
     """
     named = {name: limits for limits, names in ranges.items() for name in names}
     for field in fields(config):
@@ -76,7 +76,7 @@ def check_ranges(config: Any, ranges: Mapping[Range, Sequence[str]]) -> None:
             continue
         name, value = field.name, getattr(config, field.name)
         low, high = named.get(name, FROM_ZERO)
-        if not (math.isfinite(value) and low <= value <= high):
+        if value != field.default and not (math.isfinite(value) and low <= value <= high):
             raise UserError(f"{name} = {value} is out of range: {_text(low, high)}")
 
 

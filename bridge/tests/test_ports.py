@@ -6,9 +6,9 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import pytest
 import zenoh
 
@@ -60,7 +60,8 @@ def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeyp
     """Only while somebody looks is anything drawn; what is wrong is said once, not at each step."""
     monkeypatch.setattr(ports, "_UNDRAWN", set())
     _, router, client = sessions
-    see_through: Any = SimpleNamespace(unwrapped=SimpleNamespace(render_mode="rgb_array"))
+    see_through: Any = gymnasium.Env()
+    see_through.render_mode = "rgb_array"
     steps = itertools.count()
 
     def render():
@@ -68,7 +69,7 @@ def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeyp
 
     see_through.render = render
     if scene is not None:
-        see_through.unwrapped.scene = lambda: scene
+        see_through.scene = lambda: scene
     heard: list[bytes] = []
     key = "phil/v1/scene"
     viewer = client.declare_subscriber(key, lambda one: heard.append(bytes(one.payload)))

@@ -71,6 +71,29 @@ def test_summarise_by_hand():
         reports.summarise([], "left_turn", "nominal", "id", 7)
 
 
+def test_a_limit_of_steps_is_a_timeout_as_soon_as_another_episode_tells_its_end():
+    for outcomes, success, settled in (
+        (["truncated", "goal", "truncated"], 1 / 3, ["timeout", "goal", "timeout"]),
+        (["failed", "truncated", "ended"], 0.0, ["failed", "timeout", "ended"]),
+        (["truncated", "ended"], None, ["truncated", "ended"]),
+        (["truncated", "stopped"], None, ["truncated", "stopped"]),
+    ):
+        report = report_of(outcomes)
+        assert [row["outcome"] for row in report["per_episode"]] == settled
+        assert report["success_rate"] == success
+
+
+def test_an_acceleration_that_is_unknown_is_null():
+    unknown = replace(RESULT, lateral_acceleration_mps2=None)
+    lateral, longitudinal = reports.ACCELERATIONS
+    report = reports.summarise([unknown, unknown], "any", "nominal", "id", 0)
+    assert report[lateral] == {"mean": None, "std": None}
+    assert report[longitudinal] == {"mean": 0.0, "std": 0.0}
+    known = replace(RESULT, lateral_acceleration_mps2=2.0)
+    report = reports.summarise([unknown, known], "any", "nominal", "id", 0)
+    assert report[lateral] == {"mean": 2.0, "std": 0.0}
+
+
 def test_a_table_in_markdown_keeps_its_columns():
     lines = reports.markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
     assert list(lines) == ["| row | p50 |", "|---|---|", "| a/b | 1 |", "| c | None |", ""]

@@ -9,11 +9,19 @@ import time
 from importlib.metadata import EntryPoint
 from unittest.mock import Mock
 
+import gymnasium
 import numpy as np
 import pytest
 
-from bridge.environments import SCENARIO_GROUP, describe, make_environment
-from bridge.episode import EpisodeRunner
+from bridge.environments import (
+    SCENARIO_GROUP,
+    describe,
+    known_stops,
+    make_environment,
+    say_once,
+    scene_of,
+)
+from bridge.episode import Actuators, EpisodeRunner, pack
 from bridge.messages import Origin
 from bridge.tests.harness import (
     SLOW_TOY,
@@ -31,7 +39,9 @@ from bridge.tests.harness import (
     wait_until_driving,
     wait_until_driving_steadily,
 )
+from bridge.tests.odd import odd
 from bridge.virtual_link import NO_COMMAND, Decision
+from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import make_command
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy, write_rover
@@ -289,13 +299,106 @@ def test_what_an_environment_does_not_know_may_be_none(environment, monkeypatch)
 
         monkeypatch.setattr(environment.unwrapped, "step", step)
 
-    says(speed_mps=None, distance_m=None)
+    says(speed_mps=None, distance_m=None, longitudinal_acceleration_mps2=-3.0)
     clock = ScriptedClock()
     _, result = run(environment, clock)
     assert (clock.states[-1].speed_mps, result.distance_m) == (None, 0.0)
+    felt = result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2
+    assert felt == (None, 3.0)
     says(speed_mps="x")
     with pytest.raises(UserError, match="the environment's speed_mps is 'x', no number"):
         run(environment, ScriptedClock())
+
+
+@pytest.mark.parametrize(
+    ("name", "own_s", "says"),
+    [
+        ("Says", 0.25, ""),
+        ("HasFrequency", 0.2, ""),
+        ("HasDt", 0.05, ""),
+        ("Guessed", 0.05, "0.05 s is guessed from its render_fps"),
+    ],
+)
+def test_the_period_that_is_asked_for_wins_and_a_guess_comes_last(capsys, name, own_s, says):
+    say_once.cache_clear()
+    made = make_environment(odd(name))
+    assert describe(made, 0.5, 0.1).control_period_s == 0.5
+    assert capsys.readouterr().err == ""
+    assert describe(made, None, 0.1).control_period_s == describe(made).control_period_s == own_s
+    assert says in capsys.readouterr().err
+    with pytest.raises(UserError, match="the control period is 7"):
+        describe(made, 7.0)
+
+
+def test_where_nothing_says_it_a_period_is_asked_for_or_taken_with_a_line(capsys, monkeypatch):
+    say_once.cache_clear()
+    made = make_environment(odd("Plain"))
+    # Others use these names, too, for something else.
+    monkeypatch.setattr(made.unwrapped, "dt", lambda: 3, raising=False)
+    monkeypatch.setattr(made.unwrapped, "config", {"policy_frequency": "often"}, raising=False)
+    with pytest.raises(UserError, match="give it --period"):
+        describe(made)
+    assert describe(made, None, 0.1).control_period_s == 0.1
+    assert "0.1 s is taken" in capsys.readouterr().err
+    monkeypatch.setattr(made.unwrapped, "control_period_s", "long", raising=False)
+    with pytest.raises(UserError, match="control_period_s is 'long'"):
+        describe(made)
+
+
+def test_a_constructor_may_take_no_render_mode():
+    assert make_environment(odd("NoRenderMode")).render_mode is None
+
+
+def test_what_a_wrapper_offers_is_found_and_the_outermost_wins():
+    inner = make_environment(odd("Offers"))
+    task = describe(inner)
+    assert (task.control_period_s, list(task.observation)) == (0.2, ["numbers"])
+    assert [row.name for row in task.action] == ["pedal"]
+    assert known_stops(inner) == [None]  # It has a brake.
+    assert scene_of(inner) == {"road_width_m": 4.0}
+    actuators = Actuators(inner, task.action)
+    actuators.brake(True)
+    assert inner.get_wrapper_attr("pressed") == [True]
+    assert actuators.stop().tolist() == [-1.0]
+    outer = gymnasium.Wrapper(inner)
+    outer.control_period_s = 0.4  # type: ignore[attr-defined]
+    assert describe(outer).control_period_s == 0.4
+    assert list(pack(Layout(task), outer, np.zeros(3, np.float32))) == ["numbers"]
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")  # Gymnasium's
+@pytest.mark.parametrize(
+    ("given", "fits"),
+    [
+        (np.full((1, 16, 16), 0.9, np.float32), False),
+        (np.full((1, 16, 16), 1.0), False),  # It would be 0.9 in the next step.
+        (np.full((1, 16, 16), 300), False),
+        (np.full((1, 16, 16), -1, np.int8), False),
+        (np.full((1, 16, 16), 255), True),
+        ([[[True] * 16] * 16], True),
+    ],
+)
+def test_an_observation_that_is_not_of_its_spaces_numbers_is_refused(monkeypatch, given, fits):
+    made = make_environment(odd("FloatPicture"))
+    monkeypatch.setattr(made.unwrapped, "shown", given)
+    seen, _ = made.reset(seed=0)
+    layout = Layout(describe(made))
+    with contextlib.nullcontext() if fits else pytest.raises(UserError, match="it is to be uint8"):
+        assert pack(layout, made, seen)["observation"] == np.array(given, np.uint8).tobytes()
+
+
+class Steady(ScriptedClock):
+    """Drives with one action."""
+
+    def exchange(self, state):
+        command = make_command(state.step, action=[0.5])
+        return Decision(command, fresh=True, brake_reason="", undriven_s=0.0)
+
+
+def test_what_an_environment_does_to_its_action_is_its_own_affair():
+    _, result = run(make_environment(odd("WritesAction")), Steady())
+    assert result.actions == [[0.5]] * 20
+    assert result.outcome == "truncated"
 
 
 def test_a_scenario_is_known_by_its_id_in_a_process_that_has_not_imported_it():

@@ -15,7 +15,8 @@ GENTLE = replace(PHIL, penalty=False)  # a row of the table of algorithms: take-
 class Dock(gymnasium.Env):
     """Sees distance (m) and speed (m/s), and sets the acceleration (m/s2)."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    control_period_s = 0.1
     action_names, action_units = ("acceleration",), ("m/s2",)
     brake_action = (-2.0,)
     keys = {"up": (1.0,), "down": (-2.0,)}  # noqa: RUF012

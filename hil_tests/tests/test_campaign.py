@@ -178,6 +178,26 @@ def test_an_environment_that_knows_no_success_has_no_campaign(monkeypatch, tmp_p
         sweep.drive_all(task, ["none"], 1, tmp_path / "kept")
 
 
+def test_a_limit_of_steps_is_a_timeout_in_a_campaign(monkeypatch, tmp_path):
+    def rig(_, part):
+        ends = ["truncated"] * 2 if part.point == "delay=1s" else ["timeout", "goal"]
+        success = None if part.point == "delay=1s" else 0.5
+        return {**report_of(part.seed, ends), "success_rate": success, "wall_clock_stalls": 0}
+
+    monkeypatch.setattr(sweep, "run_rig", rig)
+    monkeypatch.setattr(
+        sweep,
+        "in_parallel",
+        lambda work, parts, _, done: [done(one, work(one)) for one in parts],
+    )
+    task = sweep.Task(POLICY, "any", "Pendulum-v1", "nominal", 1, 2)
+    found = sweep.drive_all(task, ["none", "delay=1s"], 1, tmp_path / "kept")
+    rows = {point: sweep.make_row(point, parts)["outcomes"] for point, parts in found.items()}
+    assert rows == {"none": {"timeout": 1, "goal": 1}, "delay=1s": {"timeout": 2}}
+    with pytest.raises(UserError, match="says of no episode whether it succeeded"):
+        sweep.drive_all(task, ["delay=1s"], 1, tmp_path / "others")
+
+
 def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):
     out, markdown = tmp_path / "r.json", tmp_path / "r.md"
     reports.check_report(out)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.network import DIRECTIONS, parse_spec
-from bridge.report import GOAL
+from bridge.report import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import trace
@@ -24,6 +24,7 @@ from hil_tests.envelope import (
     FRESH,
     HOLDS,
     TRIES,
+    Drivers,
     Search,
     SequentialTest,
     find_region,
@@ -136,6 +137,18 @@ def test_the_region_is_as_large_as_the_mixtures_that_were_tried(harm, joint, box
 def test_what_fails_without_a_network_has_no_envelope():
     with pytest.raises(UserError, match="not kept even on a perfect network"):
         find_region(Search(lambda spec, seeds: [seed % 5 > 0 for seed in seeds], 0.95, 0.95))
+
+
+def test_a_limit_of_steps_is_a_failure_where_another_drive_tells():
+    drivers: Any = Drivers.__new__(Drivers)
+    drivers.driven, drivers._ended, ends = [], {TRUNCATED}, [[TRUNCATED], [UNKNOWN, GOAL]]
+    drivers.map = lambda *_, **__: ends.pop()
+    for _ in range(2):  # None, or not all, tell how they ended.
+        drivers._ended = {TRUNCATED}
+        with pytest.raises(UserError, match="whether it succeeded"):
+            drivers.drive(network({}), [0])
+    ends[:] = [[TRUNCATED, TRUNCATED], [GOAL, TRUNCATED]]
+    assert [drivers.drive(network({}), [0, 1]) for _ in range(2)] == [[True, False], [False] * 2]
 
 
 def test_bursts_come_on_top_of_the_loss():

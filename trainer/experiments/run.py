@@ -224,7 +224,7 @@ def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
         record["training"] = _columns(rows, TRAINING_COLUMNS)
         record["validation"] = _columns(validated, VALIDATION_COLUMNS)
         record["period_s"] = env.control_period_s
-        record["totals"] = totals(rows, record["period_s"])
+        record["totals"] = totals(rows, record["period_s"], tested)
         record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
         seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
         # Not the task's: it may have been trained before.

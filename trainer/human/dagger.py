@@ -20,7 +20,7 @@ from trainer.human.config import FIELDS, MODEL_FILE, HumanModelConfig
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.model import REFINING_PARTS, HumanModel
 from trainer.person.recording import demonstrate, find_recordings
-from trainer.util import PERIOD_S, Purpose, claimed, episode_seed
+from trainer.util import Purpose, claimed, episode_seed
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
     end_s = options.deadline_s(arguments.max_minutes)
-    env = make_environment(arguments.scenario, period_s=PERIOD_S)
+    env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
     size, space = env.action_space.shape[0], env.observation_space
     model = HumanModel(config, arguments.seed, size, space)

@@ -5,6 +5,7 @@ left or right, pedals press up and down.
 """
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 
@@ -50,17 +51,20 @@ def _text(names: tuple[str, ...], action: Amount) -> str:
 @cache
 def controls_of(scenario: str) -> Controls:
     """The controls of an environment, by its name; UserError where a person could not drive it."""
-    env = make_environment(scenario)
-    if isinstance(env, Adapted) and not env.can_be_seen:
-        raise UserError(f"a person cannot see {scenario}: it offers no render() and no scene()")
-    if not env.keys:
-        raise UserError(f"a person cannot drive {scenario}: it has several actions, and no keys")
-    rest = amount(env.rest_action)
-    keys = {
-        name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(action, rest))
-        for name, action in env.keys.items()
-    }
+    with closing(make_environment(scenario)) as env:
+        if isinstance(env, Adapted) and not env.can_be_seen:
+            what = "it offers no render() and no scene()"
+            raise UserError(f"a person cannot see {scenario}: {what}")
+        if not env.keys:
+            what = "it has several actions, and no keys"
+            raise UserError(f"a person cannot drive {scenario}: {what}")
+        rest = amount(env.rest_action)
+        keys = {
+            name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(held, rest))
+            for name, held in env.keys.items()
+        }
+        controls = Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))
     if taken := sorted(RESERVED & keys.keys()):
         what = "pause, restart, discard, quit or hold without driving"
         raise UserError(f"{scenario} is driven with {', '.join(taken)}, which {what}: name others")
-    return Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))
+    return controls

@@ -174,6 +174,7 @@ class PersonRun(TrainingRun):
         before = [row for row in read_metrics(run_dir) if int(row["episode"]) < self.episode]
         given = spent(before, self.env.control_period_s)
         given["failures"] = sum(given["failures"].values())
+        self.sitting.ended = [row["outcome"] for row in before]
         self.sitting.cost.update({name: given[name] for name in self.sitting.cost})
         coach = Coach(typical_curve(config.scenario, config.algorithm), learning=True)
         coach.recall(before, self.env.control_period_s)

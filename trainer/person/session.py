@@ -18,16 +18,17 @@ from typing import Any
 from msgspec import structs
 
 from bridge.fork import ForkedEnvironment, find_fork
-from bridge.report import DISCARDED, RESTARTED, STOPPED, failed
+from bridge.report import DISCARDED, RESTARTED, STOPPED, failed, settled
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError, counted
-from trainer.drivers import load_driver
+from trainer.drivers import load_driver, located
 from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import trained_in
 from trainer.human.guide import Action, Driver, Observation
 from trainer.options import set_threads
 from trainer.person.coach import Coach, Episode
+from trainer.person.controls import controls_of
 from trainer.person.interface import (
     Amount,
     Person,
@@ -40,7 +41,7 @@ from trainer.person.interface import (
 from trainer.person.recording import Recorder, Step, packed
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios import SCENARIOS
-from trainer.util import PERIOD_S, Purpose, episode_seed
+from trainer.util import Purpose, episode_seed
 
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
@@ -53,6 +54,7 @@ person notices."""
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits; returns the exit status."""
     set_threads(arguments.threads)
+    arguments.policy = arguments.policy and located(arguments.policy)
     env, seed_of = _environment(arguments)
     arguments.scenario = env.scenario  # By it the cockpit knows its keys.
     policy = None
@@ -60,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
-    with closing(open_person(arguments)) as person:
+    with closing(env), closing(open_person(arguments)) as person:
         recorder = Recorder(out)
         made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         with closing(made) as sitting, quit_on_signals(sitting.quit):
@@ -78,17 +80,19 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
         if asked.at or asked.episode is not None or asked.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        period_s = PERIOD_S
+        period_s = None
         if asked.policy is not None:
             _, period_s = trained_in(asked.policy, asked.public_key)
-        return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
+        scenario = asked.scenario or "left_turn"
+        controls_of(scenario)  # Now: of some simulators only one may live, and this closes its own.
+        return make_environment(scenario, period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario, "--scenario")
     name = scenario_of(asked.scenario or recorded.origin.environment)
     is_ours = name in SCENARIOS
     env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
-    period_s = recorded.task.control_period_s
-    return (env if is_ours else Adapted(env, name, period_s)), lambda number: recorded.origin.seed
+    env.control_period_s = recorded.task.control_period_s
+    return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed
 
 
 def drive(
@@ -152,6 +156,7 @@ class Sitting:
         self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
         and the episodes that missed the goal. A run that goes on adds what it had."""
+        self.ended: list[str] = []  # How each episode ended
         self.coach = Coach()
         self._taken_over_at = math.nan  # The step at which the last take-over began
         self._paused = False
@@ -255,7 +260,8 @@ class Sitting:
                 self._write_last_step()  # At once: no kill shall take that back.
         self._write_last_step()
         told = DISCARDED if self._discard else outcome
-        self.cost["failures"] += failed(told)
+        self.ended.append(told)
+        self.cost["failures"] = sum(map(failed, settled(self.ended)))
         period_s = self.env.control_period_s
         driven_s = self._human_steps * period_s
         since_s = (self._number - self._taken_over_at) * period_s

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+import onnx
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict
@@ -19,6 +20,7 @@ from bridge import environments as bridge
 from bridge.fork import RecordedEpisode
 from bridge.messages import Origin
 from bridge.network import parse_spec
+from bridge.tests.odd import odd
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import environments, evaluate, export, train
@@ -339,11 +341,12 @@ def test_a_person_drives_on_at_the_period_that_a_drive_was_recorded_with(monkeyp
 def test_a_step_that_has_no_length_of_its_own_takes_the_period_that_is_asked_for(
     words, period_s, tmp_path, capsys
 ):
+    bridge.say_once.cache_clear()
     command = ["train", "--scenario", f"{__name__}:test/Dark-v0", "--out", str(tmp_path / "run")]
     short = ["--episodes", "1", "--algorithm", "per_td3", "--set", "evaluate_every_steps=0"]
     assert main([*command, *short, *words]) == 0
-    said = f"Dark-v0 does not say how long a step is: {period_s} s is taken"
-    assert said in capsys.readouterr().err
+    said = "Dark-v0 does not say how long a step is: 0.1 s is taken"
+    assert (said in capsys.readouterr().err) == (not words)
     export(tmp_path / "run", tmp_path / "p.onnx", scenario=f"{__name__}:test/Dark-v0")
     assert (
         load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest.control_period_s == period_s
@@ -355,6 +358,96 @@ def test_a_step_that_has_no_length_of_its_own_takes_the_period_that_is_asked_for
     config.write_text(json.dumps({**json.loads(config.read_text()), "period_s": "long"}))
     with pytest.raises(UserError, match=r"period_s .* is no number: 'long'"):
         evaluate(tmp_path / "run", scenario=f"{__name__}:test/Dark-v0", runs=1)
+
+
+SHORT: dict[str, float] = {"evaluation_runs": 2, "warmup_steps": 10, "batch_size": 8}
+
+
+@pytest.mark.parametrize("every", [0, 20])
+def test_a_simulator_that_lives_once_in_a_process_is_trained_evaluated_and_exported(
+    tmp_path, every
+):
+    settings = {**SHORT, "evaluate_every_steps": every}
+    run = train(odd("Single"), algorithm="per_td3", steps=40, settings=settings, out=tmp_path / "r")
+    assert [row["validation_success"] for row in run.metrics] == ["0.0" if every else "nan"] * 2
+    found = evaluate(run, runs=2)
+    assert found.report["lateral_acceleration_mps2"] == {"mean": None, "std": None}
+    assert [one.lateral_acceleration_mps2 for one in found.episodes] == [None, None]
+    assert export(run, tmp_path / "p.onnx").max_difference < 1e-5
+    controls_of(odd("Single"))  # Closed again
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")  # Gymnasium's
+def test_what_a_simulator_does_to_directory_and_observations_is_found_out(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    words = ["train", "--algorithm", "per_td3", "--steps", "20", "--out", "run", "--scenario"]
+    assert main([*words, odd("Wanders"), "--set", "warmup_steps=10"]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", "run", "--runs", "1", "--out", "e.json"]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "run", "--out", "p.onnx"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "e.json", "p.onnx"}
+    monkeypatch.chdir(tmp_path)
+    bridge.say_once.cache_clear()
+    with pytest.raises(UserError, match=r"holds 0\.89.* to be uint8"):
+        make_environment(odd("FloatPicture")).reset(seed=0)
+    assert capsys.readouterr().err.count("no network learns") == 0
+    make_environment(odd("Huge")).reset(seed=0)
+    make_environment(odd("Huge")).reset(seed=1)
+    assert capsys.readouterr().err.count("no network learns") == 1
+
+
+def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
+    for scenario in (odd("Says"), "left_turn"):
+        name = tmp_path / scenario.rpartition("/")[2]
+        settings = {"period_s": 0.5, "evaluate_every_steps": 0}
+        run = train(scenario, algorithm="per_td3", episodes=1, settings=settings, out=name)
+        made = export(run, name.with_suffix(".onnx"))
+        assert onnx.load_from_string(made.model).metadata_props[0].value.count('_s":0.5')
+        for policy in (run, name.with_suffix(".onnx")):
+            (episode,) = evaluate(policy, scenario, runs=1).episodes
+            assert episode.time_s == 0.5 * episode.steps
+        env, _ = session._environment(drive_options(scenario, str(run.directory)))
+        assert env.control_period_s == 0.5
+        env, _ = session._environment(drive_options(scenario, None))
+        assert env.control_period_s != 0.5
+        with pytest.raises(UserError, match=r"the control period is 0\.001"):
+            make_environment(scenario, period_s=0.001)
+
+
+def drive_options(scenario, policy):
+    asked = {"recording": None, "at": None, "episode": None, "vehicle_id": None, "seed": 0}
+    return SimpleNamespace(**asked, scenario=scenario, policy=policy, public_key=None)
+
+
+def test_a_limit_of_steps_is_a_timeout_where_another_episode_tells():
+    found = evaluate("constant:0", odd("Tells"), runs=4)
+    assert [one.outcome for one in found.episodes] == ["timeout", "goal", "goal", "timeout"]
+    assert found.success_rate == 0.5
+    assert found.report["lateral_acceleration_mps2"] == {"mean": 2.0, "std": 0.0}
+    found = evaluate("constant:0", odd("Says"), runs=2)
+    assert ({one.outcome for one in found.episodes}, found.success_rate) == ({"truncated"}, None)
+
+
+def test_what_a_wrapper_offers_is_found():
+    env = make_environment(odd("Offers"))
+    assert (env.control_period_s, env.action_names, env.key_rate_per_s) == (0.2, ("pedal",), 2.0)
+    assert (env.brake_action.tolist(), env.keys["w"].tolist()) == ([-1.0], [1.0])
+    assert (env.scene(), env.can_be_seen) == ({"road_width_m": 4.0}, True)
+    assert expert_of(env).act().tolist() == [0.5]
+    env.press_brake(True)
+    assert env.env.get_wrapper_attr("pressed") == [True]
+
+
+def test_a_stop_of_no_environments_own_begins_each_episode_with_hands_off():
+    env = make_environment(odd("Says"))
+    env.reset(seed=0)
+    env.step(np.ones(1, np.float32))
+    assert env.brake_action.tolist() == [1.0]
+    env.reset(seed=1)
+    assert env.brake_action.tolist() == [0.0]
 
 
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):

@@ -183,4 +183,4 @@ def test_it_sees_the_entries_of_any_environment():
     aware = DelayAware(make_environment("parking-v0"), parse_spec("100ms"))
     assert list(aware.space) == ["achieved_goal", "desired_goal", "observation", UNDER_WAY]
     assert aware.layout.dtype.names == tuple(aware.space)
-    assert aware.space[UNDER_WAY].shape == aware.layout.dtype[UNDER_WAY].shape == (4,)
+    assert aware.space[UNDER_WAY].shape == aware.layout.dtype[UNDER_WAY].shape == (2,)

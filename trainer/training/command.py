@@ -25,7 +25,7 @@ from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml
 from trainer import options
-from trainer.drivers import CHECKPOINT_FILE, is_expert
+from trainer.drivers import CHECKPOINT_FILE, is_expert, located
 from trainer.environments import scenario_of
 from trainer.learner.config import LearnerConfig, find_algorithm
 from trainer.person.interface import (
@@ -120,6 +120,7 @@ def train(
         known = ", ".join([DEFAULTS.human, *HUMANS])
         words = f"none of {known}, no module:Class and no human model's directory"
         raise UserError(f"--human {human} is {words}")
+    human = human if human in HUMANS else located(human)
     if not SLOWEST <= speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {speed}")
     if preset not in PRESETS:
@@ -147,7 +148,7 @@ def train(
     changed = dict(map(parse_setting, settings))  # All at once: some hold only together.
     ours = {name: changed.pop(name) for name in tuple(changed) if not hasattr(learner, name)}
     config = replace(config, **ours, learner=replace(learner, **changed))
-    run_dir = _new_directory(config) if out is None else Path(out)
+    run_dir = (_new_directory(config) if out is None else Path(out)).absolute()
     person = argparse.Namespace(
         human=human, scenario=config.scenario, host=host, port=port, speed=speed
     )

@@ -9,7 +9,7 @@ from typing import Any
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
-from trainer.util import FROM_ONE, PERIOD_S, SHARE, check_ranges
+from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
 """More than a machine could use. Torch dies where the system has fewer than it asks for."""
@@ -77,8 +77,8 @@ class RunConfig:
     """Share of the human's actions that are replaced by wrong ones (section VII-E: one third)."""
     poor_guidance: str = RANDOM
     """How they are wrong: ``random`` (the paper's), or ``biased``, always the same."""
-    period_s: float = PERIOD_S
-    """Seconds of a step, in an environment that does not say."""
+    period_s: float = 0.0
+    """Seconds of a step, whatever the environment says; 0: what it says."""
     printed_reward: bool = False
     """Weight 1 on the term of eq. 31 or 32, as the equations are printed, instead of the scenario's
     own (``LeftTurnConfig.speed_weight``, ``CongestionConfig.steer_weight``)."""
@@ -148,12 +148,15 @@ class RunConfig:
         }
 
 
-def period_of(config: Mapping[str, Any]) -> float:
-    """How long a step was in a saved run, s; UserError where its config is damaged."""
-    period_s = config.get("period_s", PERIOD_S)
+def period_of(config: Mapping[str, Any]) -> float | None:
+    """How long a step was in a saved run, s; None where the environment said it.
+
+    Raises UserError where its config is damaged.
+    """
+    period_s = config.get("period_s", 0.0)
     if not isinstance(period_s, int | float):
         raise UserError(f"period_s of the run's config is no number: {period_s!r}")
-    return period_s
+    return period_s or None
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)

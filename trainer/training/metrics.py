@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, SNAPSHOTS, EpisodeResult, failed
+from bridge.report import GOAL, SNAPSHOTS, EpisodeResult, failed, settled
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.drivers import BEST_FILE, TogetherDriver
@@ -33,7 +33,6 @@ from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
-MOST_ENVIRONMENTS = 8  # Driven at once in validation: another environment than our two may be large
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (
     "episode",
@@ -110,7 +109,7 @@ class MetricsWriter:
         writer.writerows(kept)
         write_atomic(str(self.path), text.getvalue().encode())
         self._period_s, self._spent = period_s, spent(kept, period_s)
-        self._failures = sum(self._spent["failures"].values())
+        self._outcomes = [row["outcome"] for row in kept]
         there = totals(kept, period_s).get("until", {})
         self._human_s_to = {level: it["human_s"] for level, it in there.items() if it}
         self._file = self.path.open("a", newline="")
@@ -121,9 +120,10 @@ class MetricsWriter:
         """Write one episode's row, with the totals so far; UserError where the disk is full."""
         self._spent["human_s"] += metrics.human_steps * self._period_s
         self._spent["takeovers"] += metrics.interventions
-        self._failures += failed(metrics.outcome)
+        self._outcomes.append(metrics.outcome)
         metrics.total_human_s = round(self._spent["human_s"], 6)
-        metrics.total_takeovers, metrics.total_failures = self._spent["takeovers"], self._failures
+        metrics.total_takeovers = self._spent["takeovers"]
+        metrics.total_failures = sum(map(failed, settled(self._outcomes)))
         for level in LEARNED:
             if is_reached(level, metrics.validation_success):
                 self._human_s_to.setdefault(f"{level:g}", metrics.total_human_s)
@@ -204,7 +204,7 @@ def is_reached(level: float, success: float) -> bool:
 def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     """What these episodes have cost: steps, the human's effort, failures by their outcome."""
     human_steps = sum(int(row["human_steps"]) for row in rows)
-    failures = Counter(row["outcome"] for row in rows if failed(row["outcome"]))
+    failures = Counter(filter(failed, settled(row["outcome"] for row in rows)))
     return {
         "steps": int(rows[-1]["total_steps"]) if rows else 0,
         "human_steps": human_steps,
@@ -214,29 +214,32 @@ def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     }
 
 
-def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
+def totals(
+    rows: Sequence[dict[str, str]], period_s: float, kept_episode: int | None = None
+) -> dict[str, Any]:
     """What a run cost and came to, from its rows; empty where there is none.
 
     ``failures`` are the training episodes, with the human's help, that missed the goal, by outcome;
-    ``validation`` has the best and the last success rate, and after how many steps the best was
-    first reached, or nothing where none was measured; ``until`` what was spent until the policy
-    alone first reached each of ``LEARNED``, or None.
+    ``validation`` has the best and the last success rate, and after how many steps the actor that
+    is kept drove so, or nothing where none was measured; ``until`` what was spent until the policy
+    alone first reached each of ``LEARNED``, or None. ``kept_episode``: after so many episodes it
+    did, where that is known; else the rows tell.
     """
     if not rows:
         return {}
     measured = [
-        (float(row["validation_success"]), number)
+        (float(row["validation_success"]), float(row.get("validation_reward") or "nan"), number)
         for number, row in enumerate(rows)
         if was_validated(row)
     ]
     validation = {}
     if measured:
-        best, number = max(measured, key=lambda one: (one[0], -one[1]))
-        at_step = int(rows[number]["total_steps"])
+        best, _, number = max(measured)  # As `Validation` keeps it: of equal ones the last.
+        at_step = int(rows[: kept_episode or number + 1][-1]["total_steps"])
         validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
     until = {}
     for level in LEARNED:
-        there = [number for success, number in measured if is_reached(level, success)]
+        there = [number for success, _, number in measured if is_reached(level, success)]
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
@@ -250,18 +253,22 @@ def totals(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
 class Trials:
     """The validation's episodes, which a policy drives without help, over the run's network."""
 
-    def __init__(self, config: RunConfig) -> None:
-        self.config, self.network = config, parse_spec(config.latency)
+    def __init__(self, config: RunConfig, env: Any = None) -> None:
+        """``env`` is one that is there: of some simulators no other may live beside it."""
+        self.config, self.network, self._env = config, parse_spec(config.latency), env
         self._seeds = [
             episode_seed(config.seed, Purpose.VALIDATION, run)
             for run in range(config.evaluation_runs)
         ]
-        self.envs = [
-            make_environment(
-                config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
-            )
-            for _ in self._seeds[: None if config.scenario in SCENARIOS else MOST_ENVIRONMENTS]
-        ]
+
+    @cached_property
+    def envs(self) -> list[Any]:
+        """What is driven at once: of our scenarios one for each seed, of any other only one."""
+        c = self.config
+        make = partial(
+            make_environment, c.scenario, printed_reward=c.printed_reward, period_s=c.period_s
+        )
+        return [make() for _ in self._seeds] if c.scenario in SCENARIOS else [self._env or make()]
 
     def drive(self, driver: TogetherDriver, more: Sequence[int] = ()) -> list[EpisodeResult]:
         """Drive them, and then ``more`` seeds."""
@@ -280,12 +287,14 @@ class Validation(Trials):
         run_dir: Path,
         learning: LearningThread,
         aware: DelayAware | None = None,
+        env: Any = None,
     ) -> None:
-        super().__init__(config)
+        super().__init__(config, env)
         self.run_dir, self.learning, self.aware = run_dir, learning, aware
         self.best = (-1.0, -1.0)
         """Success and return of the best actor of those validated when it was due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
+        self.kept_episode: int | None = None  # After so many was the actor that the file holds
 
     def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
         """Add to ``metrics`` how the policy drives after ``episode`` episodes.
@@ -319,6 +328,7 @@ class Validation(Trials):
             save_torch(snapshot / BEST_FILE, state)
         if (success, reward) >= self.best:
             save_torch(self.run_dir / BEST_FILE, state)
+            self.kept_episode = episode
             if due:
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
 
@@ -332,5 +342,6 @@ class Validation(Trials):
         self._best_actor = state["best_actor"]
         if self._best_actor is not None:
             save_torch(self.run_dir / BEST_FILE, self._best_actor)
+            self.kept_episode = self._best_actor["episode"]
         else:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)

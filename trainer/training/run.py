@@ -104,7 +104,7 @@ class TrainingRun:
         self.learning = self.learning_kind(
             *switches, config.seed, action_size, config.device, *seen
         )
-        self.validation = Validation(config, run_dir, self.learning, aware)
+        self.validation = Validation(config, run_dir, self.learning, aware, self.env)
         self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
         self.guidance = util.random_stream(config.seed, util.Purpose.GUIDANCE)
@@ -149,7 +149,9 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-            so_far = totals(read_metrics(self.run_dir), self.env.control_period_s)
+            self._copied.close()
+            rows, kept = read_metrics(self.run_dir), self.validation.kept_episode
+            so_far = totals(rows, self.env.control_period_s, kept)
             write_json(self.run_dir / REPORT_FILE, so_far)
 
     def advance(self) -> EpisodeMetrics:
