@@ -382,7 +382,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
     parser.add_argument("--human", metavar="web", help=human)
-    parser.add_argument("--record", metavar="G.mcap", type="path", help=record)
+    parser.add_argument("--record", metavar="G.mcap", help=record)
 
 
 def _run_fork(asked: Namespace) -> int:

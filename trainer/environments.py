@@ -273,7 +273,7 @@ class Adapted:
         given = observation if seen.dtype.names else {bridge.PLAIN: observation}
         for name, entry in entries_of(seen, bridge.PLAIN).items():
             entry[...] = array_of(given, name, entry.dtype, entry.shape)
-            largest = np.abs(entry).max() if entry.dtype.kind == "f" else 0.0
+            largest = np.abs(entry).max() if entry.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
                 what = "holds a number that is not finite"
                 raise UserError(f"an observation of {self.scenario} {what}")

@@ -13,7 +13,7 @@ ROWS = [
     ("simulate --env no_such_module:X-v0", "no_such_module"),
     ("simulate --env CartPole-v1", "acts in Discrete(2); the wire carries a Box with bounds"),
     ("simulate --env FrozenLake-v1", "observes Discrete(16); the wire carries Box or a flat Dict"),
-    ("simulate --env MountainCarContinuous-v0 --wait-edge-s 0", "no edge runtime after 0 s"),
+    ("simulate --env Pendulum-v1 --wait-edge-s 0", "no edge runtime after 0 s"),
     ("simulate --env somebody/Creep-v0", "a gymnasium id"),
     ("simulate --env bridge.tests.broken_module:X-v0", "RuntimeError: two"),
     ("simulate --env TOY --condition variant", "scene"),

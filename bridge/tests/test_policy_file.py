@@ -54,6 +54,13 @@ def test_a_model_with_names_of_its_own_becomes_a_signed_policy(tmp_path, capsys,
     assert "it drives Pendulum-v1: observation float32 3" in capsys.readouterr().out
 
 
+def test_the_period_that_is_asked_for_wins(tmp_path):
+    write_model(tmp_path / "model.onnx", f"{PENDULUM} {{ {TORQUE} }}")
+    status, out = policy(tmp_path, *STOP, "--period", "0.2")
+    assert status == 0
+    assert load_policy(out, allow_unsigned=True).manifest.control_period_s == 0.2
+
+
 @pytest.mark.parametrize(
     ("graph", "options", "match"),
     [
