@@ -104,7 +104,8 @@ def add_public_key(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--public-key",
         metavar="FILE",
-        type="path",
+        # One that is missing is named as it was typed.
+        type=lambda text: os.path.abspath(text) if os.path.exists(text) else text,
         help="Ed25519 public key of the policy's signer, PEM (default: keys/policy.pub where it"
         " exists; where an unsigned policy may drive, first policy.pub beside the policy)",
     )
