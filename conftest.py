@@ -15,7 +15,7 @@ def no_foreign_plugins(monkeypatch, tmp_path_factory):
 
     def is_met(package):
         foreign = any(point.group.startswith("phil.") for point in package.entry_points)
-        brought = Path(package.locate_file("")).resolve().is_relative_to(base)
+        brought = Path(str(package.locate_file(""))).resolve().is_relative_to(base)
         return not foreign or brought or package.metadata["Name"] == "phil-hil"
 
     monkeypatch.setattr(Distribution, "discover", lambda **how: filter(is_met, discover(**how)))

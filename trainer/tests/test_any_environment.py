@@ -382,12 +382,13 @@ def test_what_a_simulator_does_to_directory_and_observations_is_found_out(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    words = ["train", "--algorithm", "per_td3", "--steps", "20", "--out", "run", "--scenario"]
-    assert main([*words, odd("Wanders"), "--set", "warmup_steps=10"]) == 0
+    named = ["--scenario", odd("Wanders")]
+    words = ["train", "--algorithm", "per_td3", "--steps", "20", "--out", "run", *named]
+    assert main([*words, "--set", "warmup_steps=10"]) == 0
     monkeypatch.chdir(tmp_path)
-    assert main(["evaluate", "run", "--runs", "1", "--out", "e.json"]) == 0
+    assert main(["evaluate", "run", "--runs", "1", "--out", "e.json", *named]) == 0
     monkeypatch.chdir(tmp_path)
-    assert main(["export", "run", "--out", "p.onnx"]) == 0
+    assert main(["export", "run", "--out", "p.onnx", *named]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"run", "e.json", "p.onnx"}
     monkeypatch.chdir(tmp_path)
     bridge.say_once.cache_clear()

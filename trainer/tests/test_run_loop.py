@@ -1,6 +1,7 @@
 """The loop on a scripted road, with a scripted human and a learner that only listens."""
 
 import math
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.tests.test_commands import refusal
 from trainer.training.config import RunConfig
 from trainer.training.delayed import DelayedPolicy
+from trainer.training.metrics import MetricsWriter
 from trainer.training.run import TrainingRun
 
 POLICY, HUMAN = 0.25, -0.5
@@ -291,7 +293,8 @@ def bad_weights(run):
 @pytest.mark.parametrize("spoil", [bad_update, bad_action, bad_weights])
 def test_it_ends_where_it_shows_and_the_checkpoint_stays(spoil, tmp_path):
     run = scripted_run(tmp_path, replace(CONFIG, episodes=3), length=4)
-    run.advance()
+    with closing(MetricsWriter(tmp_path)) as metrics:
+        metrics.add(run.advance())
     run.save()
     before = (tmp_path / CHECKPOINT_FILE).read_bytes()
     spoil(run)
