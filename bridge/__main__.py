@@ -12,10 +12,6 @@ COMMANDS = {
     "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
     "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and go on in another way"),
-    "bisect": (
-        "bridge.fork:BISECT",
-        "find the policy of a run from which on a drive ends differently",
-    ),
     "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
     "view": ("bridge.rerun.command:view", "show the wire in rerun, live or in a file"),
 }

@@ -1,4 +1,4 @@
-"""``python -m bridge fork`` and ``bisect``: a recorded drive again, and on in another way.
+"""``python -m bridge fork``: a recorded drive again, and on in another way.
 
 The scene is rebuilt from its seed and from what the vehicle did in every step, the simulator's own
 brakes among it; each step is compared with the recorded one, to the bit. From the fork on the loop
@@ -7,20 +7,16 @@ network that has carried the recorded commands until then. So the same policy be
 network repeats a drive of lock-step.
 
 A person forks a drive in the trainer: the bridge imports nothing of it, and runs its command.
-
-``bisect`` finds the policy of a training from which on a drive changes. Each one tried drives on
-from the same place of the same drive, with the same scene and the same luck of the network.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import subprocess
 import sys
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
@@ -38,11 +34,10 @@ from bridge.inbound import CommandCheck
 from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene, decode
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
-from bridge.progress import ProgressBar
 from bridge.record import RecordingWriter, new_recording
 from bridge.recording import Recording, choose_vehicle, heard_of
 from bridge.replay import controller_of
-from bridge.report import GOAL, SNAPSHOTS, UNTOLD, EpisodeResult
+from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
 from edge_runtime.config import add_trust
@@ -363,18 +358,13 @@ def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
     return drive, drive.step_at(asked.at)
 
 
-def _add_common(parser: Any) -> None:
-    """Declare what `fork` and `bisect` have in common."""
+def _add_fork_arguments(parser: Any) -> None:
     drive = "what bridge record has written"
     parser.add_argument("recording", metavar="F.mcap", type="path", help=drive)
     add_place(parser)
     module = "the environment, where it is of a module: no file decides what is imported"
     parser.add_argument("--env", metavar="ENV", help=module)
     add_options(parser, "--out")
-
-
-def _add_fork_arguments(parser: Any) -> None:
-    _add_common(parser)
     policy = "who drives on (default: the recorded commands, while all is as recorded)"
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     record = "record the fork, as `bridge record` does; of a person's, the directory"
@@ -447,107 +437,10 @@ def _hand_over(asked: Namespace) -> int:
     given |= {"--vehicle-id": asked.vehicle_id, "--scenario": asked.env, "--out": asked.record}
     given |= {"--policy": asked.policy, "--public-key": asked.public_key}
     words = [str(w) for pair in given.items() if pair[1] is not None for w in pair]
-    os.execv(sys.executable, _trainer_command("drive", "--from", asked.recording, *words))
-
-
-def _trainer_command(*words: str) -> list[str]:
-    """A command of the trainer, of which nothing is imported here. UserError: not installed."""
-    if find_spec("trainer") is None:
+    if find_spec("trainer") is None:  # Nothing of it is imported here.
         raise UserError("this needs the trainer, which is not installed here")
-    return [sys.executable, "-m", "trainer", *words]
-
-
-def _add_bisect_arguments(parser: Any) -> None:
-    _add_common(parser)
-    runs = "a training run with snapshots (--set snapshots=true), or a directory of policy files,"
-    runs += " in the order of their names"
-    parser.add_argument("--runs", metavar="RUN_DIR", type="path", required=True, help=runs)
-
-
-def _run_bisect(asked: Namespace) -> int:
-    """Find the policy from which on the drive ends in another way."""
-    drive, fork = find_fork(asked.recording, asked)
-    outcomes: dict[int, str] = {}
-    with closing(drive.environment(asked.env)) as environment, tempfile.TemporaryDirectory() as tmp:
-        names, load = _policies(Path(asked.runs), Path(tmp), asked.env)
-        with ProgressBar("policies tried", len(names).bit_length() + 3) as bar:
-
-            def succeeds(number: int) -> bool:
-                if number not in outcomes:
-                    forked = ForkedDrive(drive, environment, fork, load(number))
-                    outcomes[number] = forked.run().outcome
-                    bar.advance({names[number]: outcomes[number]})
-                return outcomes[number] == GOAL
-
-            change, alone = first_change(len(names), succeeds)
-    if UNTOLD.issuperset(outcomes.values()):
-        raise UserError(f"{drive.origin.environment} does not say what a success is")
-    report = {
-        "recording": asked.recording, "episode": drive.number,
-        "at_s": round(fork * drive.task.control_period_s, 6), "policies": len(names),
-        "tried": {names[number]: outcomes[number] for number in sorted(outcomes)},
-        "changes_at": names[change] if change else None,
-        "before": names[change - 1] if change else None,
-        "one_change": alone,
-    }  # fmt: skip
-    write_json_out(asked.out, report)
-    tried = f"{len(outcomes)} of {len(names)} policies tried"
-    if change:
-        was = f"{outcomes[change - 1]} with {names[change - 1]}"
-        print(f"{outcomes[change]} from {names[change]} on, {was} before it; {tried}")
-    else:
-        ends = f"{outcomes[0]} with {names[0]}, {outcomes[len(names) - 1]} with {names[-1]}"
-        print(f"no change between the first and the last: {ends}; {tried}")
-    if not alone:
-        print("the policies beside it disagree: there is more than one change, this is one of them")
-    return 0
-
-
-def first_change(count: int, succeeds: Callable[[int], bool]) -> tuple[int, bool]:
-    """By bisection, the first policy that ends as the last does; 0: the first does so itself.
-
-    One change among the ``count`` policies is assumed, and tried beside the one that is found.
-
-    Returns:
-        The policy's number, and whether those beside it agree.
-    """
-    first, last, low, high = succeeds(0), succeeds(count - 1), 0, count - 1
-    if first == last:
-        return 0, True
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if succeeds(middle) == first else (low, middle)
-    beside = [n for n in (low - 1, high + 1) if 0 <= n < count]
-    return high, all(succeeds(n) == (first if n < high else last) for n in beside)
-
-
-def _policies(
-    place: Path, folder: Path, env: str | None
-) -> tuple[list[str], Callable[[int], Policy]]:
-    """The names of the policies there, in their order, and what loads one by its number.
-
-    A snapshot of ``env`` becomes a policy file in ``folder``. In a simulation none need be signed.
-    """
-    scenario = ["--scenario", env] if env else []
-    paths = sorted((place / SNAPSHOTS).glob("*/"))
-    if len(paths) < 2:
-        paths = sorted(place.glob("*.onnx"))
-    if len(paths) < 2:
-        many = "train with --set snapshots=true, or name a directory of policy files"
-        raise UserError(f"{place} holds fewer than two policies: {many}")
-
-    def load(number: int) -> Policy:
-        path = paths[number]
-        if path.is_dir():
-            path = folder / f"{path.name}.onnx"
-            words = _trainer_command("export", str(paths[number]), "--out", str(path), *scenario)
-            done = subprocess.run(words, capture_output=True, text=True)
-            if done.returncode:
-                why = (done.stderr.strip().splitlines() or [""])[-1]
-                raise UserError(f"{paths[number]} cannot be exported: {why}")
-        return load_policy(path, None, allow_unsigned=True)
-
-    return [path.name for path in paths], load
+    command = [sys.executable, "-m", "trainer", "drive", "--from", asked.recording, *words]
+    os.execv(sys.executable, command)
 
 
 FORK = cli.Command(
@@ -558,9 +451,4 @@ FORK = cli.Command(
     ),
     _add_fork_arguments,
     _run_fork,
-)
-BISECT = cli.Command(
-    cli.examples("python -m bridge bisect drive.mcap --runs runs/phil_1 --at 2s"),
-    _add_bisect_arguments,
-    _run_bisect,
 )

@@ -30,7 +30,6 @@ STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
 DISCARDED = "discarded"
 """The person threw it away: it is shown, and nothing learns from it."""
 UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
-SNAPSHOTS = "snapshots"  # In a training run: directories that are such runs themselves
 
 
 def failed(outcome: str) -> bool:

@@ -1,4 +1,4 @@
-"""``python -m bridge fork`` and ``bisect``: recordings of the real wire, driven again.
+"""``python -m bridge fork``: recordings of the real wire, driven again.
 
 Of the kept recording the second drive (episode 1) is forked: its car slows down for a gap, and
 arrives after 6.1 s.
@@ -8,7 +8,6 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -19,10 +18,8 @@ import onnx
 import pytest
 
 from bridge.environments import describe, make_environment
-from bridge.fork import first_change
 from bridge.policy_file import make_policy as make_any_policy
 from bridge.recording import Recording, choose_vehicle, heard_of
-from bridge.report import SNAPSHOTS
 from bridge.tests.harness import (
     LEFT_TURN,
     TOY,
@@ -263,64 +260,3 @@ def test_a_person_is_handed_to_the_trainer_with_all_that_was_said(monkeypatch):
     (command,) = ran
     where = ["--at", "3.0", "--human", "web", "--episode", "1", "--out", "rec"]
     assert command[1:] == ["-m", "trainer", "drive", "--from", str(LEFT_TURN), *where]
-
-
-def policies(folder: Path, values: Sequence[float]) -> Path:
-    folder.mkdir()
-    for number, value in enumerate(values):
-        make_policy(folder, "constant", value).rename(folder / f"after_{number:03d}.onnx")
-    return folder
-
-
-def bisected(path: Path, runs: Path) -> dict:
-    words = ["bisect", path, "--episode", 1, "--at", "2", "--runs", runs, "--out", "bisect.json"]
-    assert bridge_status([str(word) for word in words]) == 0
-    return read(Path("bisect.json"))
-
-
-STOPS, GOES = -1.0, 0.4  # From 2 s on in the recorded drive 1 the first waits, the other arrives
-
-
-@pytest.mark.parametrize("goes", [True, False])
-@pytest.mark.parametrize("planted", range(1, 20))
-def test_bisection_finds_every_place(planted, goes):
-    tried = set()
-
-    def arrives(number):
-        tried.add(number)
-        return (number >= planted) == goes
-
-    assert first_change(20, arrives) == (planted, True)
-    assert len(tried) <= 9
-
-
-def test_bisection_finds_the_policy_that_was_planted(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    planted = 12
-    runs = policies(tmp_path / "run", [STOPS] * planted + [GOES] * (20 - planted))
-    found = bisected(LEFT_TURN, runs)
-    names = [f"after_{number:03d}.onnx" for number in (planted - 1, planted)]
-    assert [found["before"], found["changes_at"]] == names
-    assert found["one_change"]
-    assert len(found["tried"]) <= 9
-    assert found["tried"][names[1]] == "goal"
-
-
-def test_bisection_says_where_there_is_no_change_or_more_than_one(
-    tmp_path, monkeypatch, capsys, refusal
-):
-    monkeypatch.chdir(tmp_path)
-    same = bisected(LEFT_TURN, policies(tmp_path / "same", [STOPS] * 5))
-    assert (same["changes_at"], len(same["tried"])) == (None, 2)
-    assert "no change between the first and the last" in capsys.readouterr().out
-    there_and_back = [STOPS, GOES, STOPS, GOES, GOES, GOES]
-    found = bisected(LEFT_TURN, policies(tmp_path / "several", there_and_back))
-    assert (found["changes_at"], found["one_change"]) == ("after_003.onnx", False)
-    assert "more than one change" in capsys.readouterr().out
-    bisect = ("bisect", LEFT_TURN, "--episode", 1, "--runs")
-    assert "--set snapshots=true" in refusal(*bisect, tmp_path)
-    # A run's snapshots come before what was exported from it.
-    run = policies(tmp_path / "run", [STOPS] * 2)
-    for number in (1, 2):
-        (run / SNAPSHOTS / f"after_{number}").mkdir(parents=True)
-    assert f"{run / SNAPSHOTS / 'after_1'} cannot be exported" in refusal(*bisect, run)

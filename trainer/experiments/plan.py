@@ -332,7 +332,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
 
 
 ID_LENGTH = 12
-NOT_DECIDING = ("device", "threads", "checkpoint_every", "human", "snapshots")
+NOT_DECIDING = ("device", "threads", "checkpoint_every", "human")
 """Fields of a run's config that do not decide its result; the human model's contents do."""
 
 

@@ -200,8 +200,9 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path)
     config = replace(TINY, episodes=2, evaluate_every_steps=0)
     with pytest.raises(UserError, match="holds no checkpoint to resume from"):
         check_directory(tmp_path, config, resume=True)
-    (tmp_path / "config.toml").write_text(config.as_toml())
-    (tmp_path / "config.json").write_text(json.dumps(asdict(config)))
+    # With a setting that it had in an earlier version, too.
+    (tmp_path / "config.toml").write_text(f"snapshots = true\n{config.as_toml()}")
+    (tmp_path / "config.json").write_text(json.dumps({**asdict(config), "snapshots": False}))
     words = ("train", "--out", str(tmp_path), "--config", str(tmp_path / "config.toml"))
     assert run_cli(main, [*words, "--resume"]) == 0
     assert len(read_metrics(tmp_path)) == 2

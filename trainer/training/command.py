@@ -36,7 +36,7 @@ from trainer.person.interface import (
     check_person_options,
 )
 from trainer.pictures import write_learning_curve
-from trainer.training.config import CONFIG_FILE, EXTENT, LATER, PRESETS, RunConfig
+from trainer.training.config import CONFIG_FILE, EXTENT, GONE, LATER, PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 from trainer.util import claimed
@@ -362,7 +362,14 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
-    """A config's settings by their names, those of the learner among them."""
+    """A config's settings by their names, those of the learner among them.
+
+    Former settings are left out. UserError where one has a value that is no longer possible.
+    """
+    for name, taken in GONE.items():
+        if values.get(name, taken[0]) not in taken:
+            raise UserError(f"the setting {name} is gone: {values[name]} is no longer possible")
+    values = {name: value for name, value in values.items() if name not in GONE}
     learner = values.get("learner")
     if not isinstance(learner, dict):
         return values

@@ -29,6 +29,8 @@ LATER = (
 )  # fmt: skip
 """Fields of a run's config and of an algorithm's row that came after the first records. A run or a
 record without one had its default."""
+GONE = {"snapshots": (False, True)}
+"""Former settings, and those of their values with which a run trained as it does today."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
@@ -88,8 +90,6 @@ class RunConfig:
     """Episodes of such an evaluation."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
-    snapshots: bool = False
-    """Whether the actor of every validation is kept, 2 MB each: what ``bridge bisect`` tries."""
     latency: str = "none"
     """The network between policy and vehicle, in training and validation alike, in the words of
     ``bridge simulate --latency``."""

@@ -19,15 +19,15 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, SNAPSHOTS, EpisodeResult, failed, settled
-from edge_runtime.files import make_directory, write_atomic
+from bridge.report import GOAL, EpisodeResult, failed, settled
+from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.drivers import BEST_FILE, TogetherDriver
 from trainer.environments import make_environment
 from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
-from trainer.training.config import CONFIG_FILE, RunConfig
+from trainer.training.config import RunConfig
 from trainer.training.delayed import DelayAware
 from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
@@ -320,12 +320,6 @@ class Validation(Trials):
         metrics.validation_success, metrics.validation_reward = success, reward
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
         state = {**self.config.label(episode), "actor": actor.state_dict()}
-        if due and self.config.snapshots:
-            # A run of its own: every command takes its actor.
-            snapshot = self.run_dir / SNAPSHOTS / f"after_{episode:06d}"
-            make_directory(snapshot)
-            write_atomic(snapshot / CONFIG_FILE, read_bytes(self.run_dir / CONFIG_FILE, "config"))
-            save_torch(snapshot / BEST_FILE, state)
         if (success, reward) >= self.best:
             save_torch(self.run_dir / BEST_FILE, state)
             self.kept_episode = episode
