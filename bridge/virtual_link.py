@@ -171,7 +171,6 @@ class VirtualLink(Generic[Message]):
         observation_bytes: what a state carries.
         on_heard: called with each newest answer's latency in s, state sent to command received.
         on_stale: called for each answer that is not newer than the newest.
-        on_command: called for each answer's command, whatever its age.
     """
 
     def __init__(
@@ -182,12 +181,11 @@ class VirtualLink(Generic[Message]):
         observation_bytes: int,
         on_heard: Callable[[float], None] = lambda latency_s: None,
         on_stale: Callable[[], None] = lambda: None,
-        on_command: Callable[[Command], None] = lambda command: None,
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
         self._link = make_link(spec, seed)
-        self._on_heard, self._on_stale, self._on_command = on_heard, on_stale, on_command
+        self._on_heard, self._on_stale = on_heard, on_stale
         self._under_way: list[tuple[float, int, Any]] = []
         """A heap by arrival time; messages of the same time keep their order."""
         self._numbers = itertools.count()
@@ -267,7 +265,6 @@ class VirtualLink(Generic[Message]):
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
         answered_step = self.hold.newest_step
-        self._on_command(answer.command)
         if not self.hold.admit(answer.command, now_s, answer.sent_s):
             self._on_stale()
             return

@@ -271,7 +271,7 @@ def _begin(policy: str, env: str, condition: str, public_key: str | None) -> Non
     set_threads(1)
     period_s = trained_in(policy, public_key)[1]
     environment = make_environment(env, condition, period_s=period_s)
-    _mine[:] = environment, load_driver(policy, environment, public_key, True)[0], condition
+    _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
 
 
 def _work(work: Callable[..., Any], *arguments: Any) -> Any:
@@ -363,7 +363,7 @@ def run(arguments: argparse.Namespace) -> int:
     policy = located(name or kept(f"results/policies/{env}.onnx"))
     period_s = trained_in(policy, arguments.public_key)[1]
     environment = make_environment(env, condition, period_s=period_s)
-    policy_id = load_driver(policy, environment, arguments.public_key, True)[1]
+    policy_id = load_driver(policy, environment, arguments.public_key)[1]
     if known and known.policy_id != policy_id:
         raise UserError(f"{arguments.confirm} is of another policy than {policy}")
     found: dict[str, Any] = {

@@ -6,14 +6,13 @@ training run or a human model.
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from bridge.network import parse_spec
 from edge_runtime.controller import limit_action, neutral_action, shared_limits
 from edge_runtime.util import UserError, name_in_file
 from trainer.environments import (
@@ -28,7 +27,6 @@ from trainer.human.config import MODEL_FILE
 from trainer.human.guide import Action, Driver, Observation
 from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
-from trainer.training.delayed import DelayAware
 from trainer.util import fitting, load_torch
 
 CONSTANT = "constant:"
@@ -41,12 +39,11 @@ ActTogether = Callable[[Observation], Action]  # Many actions for many observati
 class TogetherDriver(Driver):
     """Drives without a memory, one picture at a time or many at once.
 
-    ``act_together`` gives actions float32 [n, action size] for observations [n, ...]; ``aware`` is
-    what adds the actions under way to them.
+    ``act_together`` gives actions float32 [n, action size] for observations [n, ...].
     """
 
-    def __init__(self, act_together: ActTogether, aware: DelayAware | None = None) -> None:
-        self.act_together, self.aware = act_together, aware
+    def __init__(self, act_together: ActTogether) -> None:
+        self.act_together = act_together
 
     def act(self, observation: Observation) -> Action:
         """The action, float32 [action size]."""
@@ -100,13 +97,10 @@ def located(driver: str) -> str:
     return driver if is_expert(driver) or not Path(driver).exists() else os.path.abspath(driver)
 
 
-def load_driver(
-    policy: str, env: Any, public_key: str | None = None, knows_delay: bool = False
-) -> tuple[Driver, str]:
+def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[Driver, str]:
     """The driver that the word or path ``policy`` names, and its policy id.
 
     ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
-    ``knows_delay``: the caller shows the driver the actions under way.
 
     Raises UserError: nothing there that drives.
     """
@@ -137,23 +131,14 @@ def load_driver(
             f"{policy} is no policy: expected an .onnx file, a training run, "
             "a human model's directory, the word expert, module:Class of one, or constant:ACTION"
         )
-    aware = _awareness(env, about)
-    if aware and not knows_delay:
-        raise UserError(f"{policy} sees the actions on their way: only trainer evaluate shows them")
-    return TogetherDriver(actor.eval().act, aware), policy_id
-
-
-def _awareness(env: Any, about: Mapping[str, Any]) -> DelayAware | None:
-    """What the policy that a file is ``about`` sees beside the observation."""
-    spec = about.get("known_latency")
-    return DelayAware(env, parse_spec(spec)) if spec else None
+    return TogetherDriver(actor.eval().act), policy_id
 
 
 def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     """A run's actor: the best on the validation seeds, or the last one where none was validated.
 
-    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``; where it
-    knows a delay, ``known_latency``, too. ``env`` is by default the one that it names.
+    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``. ``env`` is
+    by default the one that it names.
 
     Raises UserError: no run there, or one in another environment than ``env``; without ``env``, in
     one of a module.
@@ -166,7 +151,9 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     with fitting(f"{path} is not a checkpoint of this project"):
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]
         weights = networks[state.get("kept_actor", "actor")]
-        keys = ("scenario", "algorithm", "seed", "episode", *({"known_latency"} & state.keys()))
+        if "known_latency" in state:  # Of an earlier version
+            raise UserError(f"{run_dir} was trained with delay_known, which is gone")
+        keys = ("scenario", "algorithm", "seed", "episode")
         label: dict[str, Any] = msgspec.convert(
             {key: state[key] for key in keys}, dict[str, str | int]
         )
@@ -174,10 +161,8 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
             name_in_file(label["scenario"], f"{run_dir} was trained in", "--scenario")
         )
         check_trained_in(env, run_dir, label["scenario"])
-        aware = _awareness(env, label)
-        space = aware.space if aware else env.observation_space
         first = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)
         frames = 2 if first is None else first.shape[1]
-        actor = Actor(len(weights["head.output.bias"]), frames, space)
+        actor = Actor(len(weights["head.output.bias"]), frames, env.observation_space)
         actor.load_state_dict(weights)
     return actor, label

@@ -105,7 +105,7 @@ def evaluate(
     goals = 0
     with ExitStack() as stack:
         env = stack.enter_context(closing(make_environment(scenario, condition, period_s=period_s)))
-        driver, policy_id = load_driver(policy, env, public_key, knows_delay=True)
+        driver, policy_id = load_driver(policy, env, public_key)
         stack.enter_context(limited_threads(1))  # The last bits must not depend on the cores.
         bar = stack.enter_context(ProgressBar("evaluating", runs))
 
@@ -218,9 +218,8 @@ def drive_episodes(
         drive = Drive(env, seed, CONDITIONS[condition].noise_std)
         driver.reset()
         network = None
-        aware = getattr(driver, "aware", None)  # Its commands wait, behind whatever network.
-        if latency != NO_NETWORK or aware:
-            network = VehicleEnd(env, latency, seed, drive.observation, aware)
+        if latency != NO_NETWORK:
+            network = VehicleEnd(env, latency, seed, drive.observation)
         while not drive.over:
             seen = drive.observation
             drive.step(network.tick(seen, driver.act) if network else driver.act(seen))

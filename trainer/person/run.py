@@ -314,8 +314,6 @@ def check_settings(config: RunConfig) -> None:
         raise UserError(f"{config.algorithm} takes no guidance: nobody could take over")
     if row.asks:
         raise UserError(f"{config.algorithm} asks a scripted human or its model, and no person yet")
-    if config.delay_known:
-        raise UserError("a person's recordings hold no actions under way: no delay_known")
     if config.guided_share != 1 or config.guided_until_episode or config.guided_until_step:
         wanted = "guided_share must be 1, guided_until_episode and guided_until_step 0"
         raise UserError(f"a person watches every episode: {wanted}")

@@ -54,7 +54,7 @@ def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name
         {"seed": torch.zeros(2)},
         {"episode": [1]},
         {"scenario": 7},
-        {"known_latency": 5},
+        {"known_latency": "delay=100ms"},
         {"kept_actor": []},
         {"actor": {"head.output.bias": 3}},
         {"actor": {"head.output.bias": torch.zeros(1), "picture.conv1.weight": torch.zeros(0)}},

@@ -5,17 +5,10 @@ import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
-from edge_runtime.util import UserError
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes
 from trainer.tests.test_evaluate import brightness
-from trainer.training.delayed import (
-    UNDER_WAY,
-    DelayAware,
-    DelayedPolicy,
-    VehicleEnd,
-    ticks_late,
-)
+from trainer.training.delayed import DelayedPolicy, VehicleEnd, ticks_late
 
 
 def frames(step):
@@ -25,9 +18,8 @@ def frames(step):
 
 def number(seen):
     """The tick of an observation whose two pictures follow each other."""
-    pictures = seen["observation"] if seen.dtype.names else seen
-    assert pictures[1, 0, 0] - pictures[0, 0, 0] in (0, 1)
-    return int(pictures[1, 0, 0])
+    assert seen[1, 0, 0] - seen[0, 0, 0] in (0, 1)
+    return int(seen[1, 0, 0])
 
 
 def answer(observation):
@@ -44,16 +36,15 @@ class Car:
 class Driven:
     """A policy behind a network, driven over numbered observations; the reward of tick n is n.
 
-    Keeps what the policy was ``asked``, what was ``carried`` out, and what would be learned: what
-    was ``stored``, and as ``rows``: observation, action, reward, next observation, ends.
+    Keeps what was ``carried`` out, and what would be learned: what was ``stored``, and as ``rows``:
+    observation, action, reward, next observation, ends.
     """
 
-    def __init__(self, spec, aware=False, seed=0):
-        self.spec, self.env = parse_spec(spec), make_environment("left_turn") if aware else Car()
-        self.aware: Any = DelayAware(self.env, self.spec) if aware else None
-        self.asked, self.carried, self.stored, self.rows = [], [], [], list[Any]()
+    def __init__(self, spec, seed=0):
+        self.spec, self.env = parse_spec(spec), Car()
+        self.carried, self.stored, self.rows = [], [], list[Any]()
         learner: Any = self  # as far as it is asked
-        self.delayed = DelayedPolicy(learner, self.env, self.spec, self.aware)
+        self.delayed = DelayedPolicy(learner, self.env, self.spec)
         self.delayed.start(frames(0), seed)
 
     def start_episode(self, observation):
@@ -65,13 +56,9 @@ class Driven:
         self.rows.append((*seen, *ends))
         self.stored.append(observation)
 
-    def act(self, seen):
-        self.asked.append(seen)
-        return answer(seen)
-
     def drive(self, ticks, terminated=False, human=(), **guidance):
         for tick in range(ticks):
-            action = self.delayed.act(frames(tick), self.act)
+            action = self.delayed.act(frames(tick), answer)
             action = np.array([0.9], np.float32) if tick in human else action
             end = terminated and tick == ticks - 1
             done = action, float(tick), frames(tick + 1), end, tick in human
@@ -143,44 +130,3 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
     for tick in range(8):
         end.tick(frames(tick), answer)
     assert end._link.hold.newest_step == 7 - ticks
-
-
-def told(observations):
-    """Tick and actions under way of observations, in hundredths."""
-    under_way = [np.round(100 * seen[UNDER_WAY]).astype(int).tolist() for seen in observations]
-    return [*map(number, observations)], under_way
-
-
-def test_a_policy_that_knows_the_delay_sees_what_is_on_its_way_in_order():
-    driven = Driven("100ms", aware=True).drive(7)
-    assert driven.aware.ticks == 2
-    under_way = [[0, 0], [0, 0], [0, 1], [1, 2], [2, 3], [3, 4]]
-    assert told(driven.asked) == (list(range(6)), under_way)
-    assert told(driven.stored) == (list(range(6)), under_way)
-
-
-def test_what_a_human_did_instead_is_stored_as_what_was_on_its_way():
-    driven = Driven("100ms", aware=True).drive(7, human=(4,))
-    assert told(driven.asked)[1][4] == [2, 3]  # It plans on: nobody tells it of the human.
-    assert told(driven.stored)[1][3:] == [[1, 90], [90, 3], [3, 4]]
-
-
-@pytest.mark.parametrize("spec", ["up.delay=100ms,jitter=40ms", "60ms+-10ms", "0ms+-30ms"])
-def test_a_command_waits_until_all_are_as_old(spec):
-    driven = Driven(spec, aware=True).drive(60)
-    late = driven.aware.ticks
-    assert late >= ticks_late(driven.spec, driven.env.control_period_s)
-    on_time = [np.isclose(done, n / 100) for n, done in enumerate(driven.carried[late:])]
-    assert np.mean(on_time) > 0.9  # Two deviations of the jitter are waited for.
-
-
-def test_a_network_without_a_tick_of_delay_is_refused():
-    with pytest.raises(UserError, match="behind delay=5ms no command is a tick late"):
-        DelayAware(make_environment("left_turn"), parse_spec("5ms"))
-
-
-def test_it_sees_the_entries_of_any_environment():
-    aware = DelayAware(make_environment("parking-v0"), parse_spec("100ms"))
-    assert list(aware.space) == ["achieved_goal", "desired_goal", "observation", UNDER_WAY]
-    assert aware.layout.dtype.names == tuple(aware.space)
-    assert aware.space[UNDER_WAY].shape == aware.layout.dtype[UNDER_WAY].shape == (2,)

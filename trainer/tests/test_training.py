@@ -23,13 +23,10 @@ from edge_runtime.util import UserError
 from trainer import drivers
 from trainer.__main__ import main
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
-from trainer.environments import make_environment
-from trainer.evaluation import evaluate
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.pictures import write_learning_curve
-from trainer.policy_file import export
 from trainer.tests.test_td3 import same_weights
 from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
@@ -206,6 +203,12 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path)
     words = ("train", "--out", str(tmp_path), "--config", str(tmp_path / "config.toml"))
     assert run_cli(main, [*words, "--resume"]) == 0
     assert len(read_metrics(tmp_path)) == 2
+    about = json.loads((tmp_path / "config.json").read_text()) | {"delay_known": True}
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    with pytest.raises(UserError, match="delay_known is gone"):
+        check_directory(tmp_path, config, resume=True)
+    (tmp_path / "config.json").write_text(json.dumps({**about, "delay_known": False}))
+    check_directory(tmp_path, config, resume=True)
     # One that has had its checkpoint is not written over.
     (tmp_path / CHECKPOINT_FILE).unlink()
     with pytest.raises(UserError, match="holds no checkpoint to resume from"):
@@ -296,20 +299,6 @@ def test_validation_has_seeds_of_its_own_and_the_network_of_the_run():
     (drive,) = Trials(replace(TINY, evaluation_runs=1, latency="300ms")).drive(full)
     assert drive.seed == episode_seed(3, Purpose.VALIDATION, 0)
     assert (drive.actions[0], drive.actions[-1]) == ([0.0], [1.0])  # hands off before the first
-
-
-def test_a_policy_that_knows_its_delay_is_evaluated_and_goes_nowhere_else(tmp_path):
-    run = tmp_path / "run"
-    known: dict[str, Any] = {"latency": "delay=100ms", "delay_known": True}
-    train(replace(TINY, episodes=1, evaluate_every_steps=0, **known), run)
-    assert load_actor(run)[1]["known_latency"] == "delay=100ms"
-    actions = evaluate(run, runs=1).episodes[0].actions
-    assert actions[:2] == [[0.0]] * 2  # It waits for its command, behind whatever network.
-    assert actions[2] != [0.0]
-    with pytest.raises(UserError, match="needs the actions that are under way"):
-        export(run, tmp_path / "policy.onnx")
-    with pytest.raises(UserError, match="sees the actions on their way"):
-        drivers.load_driver(str(run), make_environment("left_turn"))
 
 
 def test_the_printed_preset_is_the_papers(tmp_path):

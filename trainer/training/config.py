@@ -23,13 +23,13 @@ RANGES = {
 """What these numbers may be; all others are at least 0."""
 LATER = (
     "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
-    "delay_known", "period_s",
+    "period_s",
     "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
     "foresight", "preference_beta",
 )  # fmt: skip
 """Fields of a run's config and of an algorithm's row that came after the first records. A run or a
 record without one had its default."""
-GONE = {"snapshots": (False, True)}
+GONE = {"snapshots": (False, True), "delay_known": (False,)}
 """Former settings, and those of their values with which a run trained as it does today."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
@@ -93,9 +93,6 @@ class RunConfig:
     latency: str = "none"
     """The network between policy and vehicle, in training and validation alike, in the words of
     ``bridge simulate --latency``."""
-    delay_known: bool = False
-    """Whether the policy sees the actions that are on their way behind that network, and each
-    command waits until it is as old as they all are."""
     device: str = "cpu"
     threads: int = 0
     """Processor threads of the learner, set by whoever starts the run; 0: as many as torch takes.
@@ -108,8 +105,6 @@ class RunConfig:
             raise UserError(
                 f"poor_guidance must be one of {', '.join(GUIDANCE)}: {self.poor_guidance}"
             )
-        if self.delay_known and self.latency == "none":
-            raise UserError("delay_known needs a network: --latency")
         if self.late_to_s < self.late_from_s:
             raise UserError(f"late_to_s {self.late_to_s} is below late_from_s {self.late_from_s}")
 
@@ -138,13 +133,11 @@ class RunConfig:
 
     def label(self, episode: int) -> dict[str, Any]:
         """What a file of the run says of its run and episode."""
-        known = {"known_latency": self.latency} if self.delay_known else {}
         return {
             "scenario": self.scenario,
             "algorithm": self.algorithm,
             "seed": self.seed,
             "episode": episode,
-            **known,
         }
 
 

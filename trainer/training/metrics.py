@@ -28,7 +28,6 @@ from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
-from trainer.training.delayed import DelayAware
 from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
 
@@ -286,11 +285,10 @@ class Validation(Trials):
         config: RunConfig,
         run_dir: Path,
         learning: LearningThread,
-        aware: DelayAware | None = None,
         env: Any = None,
     ) -> None:
         super().__init__(config, env)
-        self.run_dir, self.learning, self.aware = run_dir, learning, aware
+        self.run_dir, self.learning = run_dir, learning
         self.best = (-1.0, -1.0)
         """Success and return of the best actor of those validated when it was due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
@@ -303,7 +301,7 @@ class Validation(Trials):
         resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
         """
         actor = getattr(self.learning.learner, self.config.kept_actor)
-        driver = TogetherDriver(partial(self.learning.in_thread, actor.act), self.aware)
+        driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
         self.take(self.drive(driver), actor, metrics, episode, due)
 
     def take(

@@ -33,7 +33,7 @@ from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.td3 import NETWORKS, TD3Learner
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
-from trainer.training.delayed import DelayAware, DelayedPolicy
+from trainer.training.delayed import DelayedPolicy
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -96,16 +96,13 @@ class TrainingRun:
         self._copied = self.env  # the bare environment: a person's run wraps `self.env` later
         action_size = self.env.action_space.shape[0]
         self.network = parse_spec(config.latency)
-        aware = DelayAware(self.env, self.network) if config.delay_known else None
         seen = self.env.observation_space, self.env.layout
-        if aware:
-            seen = aware.space, aware.layout
         switches = config.learner, self.algorithm
         self.learning = self.learning_kind(
             *switches, config.seed, action_size, config.device, *seen
         )
-        self.validation = Validation(config, run_dir, self.learning, aware, self.env)
-        self.policy = DelayedPolicy(self.learning, self.env, self.network, aware)
+        self.validation = Validation(config, run_dir, self.learning, self.env)
+        self.policy = DelayedPolicy(self.learning, self.env, self.network)
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
         self.guidance = util.random_stream(config.seed, util.Purpose.GUIDANCE)
         self.gate: Asking | None = None  # Where the robot asks for help
@@ -230,8 +227,6 @@ class TrainingRun:
             self.env, config.human if is_expert(config.human) else "expert"
         )
         if asks:
-            if config.delay_known:
-                raise UserError(f"{config.algorithm} asks about what is seen now: no delay_known")
             trigger = self.gate = Asking(trigger, asks)
         attention, period_s = None, self.env.control_period_s
         if config.late_to_s or config.missed_share:
