@@ -31,7 +31,7 @@ doctor:  ## what this machine can and cannot do, and how to get the rest
 	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
 
 pictures: $(STAMP)  ## the pictures of docs, all but the film
-	$(BIN)/python -m hil_tests pictures --out docs
+	$(BIN)/python docs/make_pictures.py
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
@@ -51,7 +51,7 @@ test-board: $(STAMP)  ## whole bundles installed, with every fault; minutes, roo
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
+	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests docs
 	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer \
 	  hil_tests/__init__.py hil_tests/__main__.py hil_tests/doctor.py
 
@@ -79,7 +79,7 @@ bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, 
 	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
-	$(BIN)/python -m hil_tests recording
+	$(BIN)/python hil_tests/recordings/make_recording.py
 
 $(MUTATION_STAMP): requirements/mutation.txt
 	$(PYTHON) -m venv $(MUTATION)

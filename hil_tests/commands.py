@@ -10,7 +10,6 @@ from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
 from trainer.environments import CONDITIONS as TEST_CONDITIONS
 from trainer.options import add_scenario
-from trainer.util import kept
 
 
 @command(
@@ -63,23 +62,3 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     confirms += "promise are the file's"
     add("--confirm", metavar="F.json", type="path", help=confirms)
     add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
-
-
-@command(
-    "hil_tests.pictures:run_pictures",
-    "python -m hil_tests pictures --out docs",
-    "python -m hil_tests pictures cockpit.png rerun.png --out runs",
-)
-def pictures(parser: argparse.ArgumentParser) -> None:
-    which = "which (default: all); a wrong one lists them"
-    parser.add_argument("names", metavar="NAME", nargs="*", help=which)
-    parser.add_argument("--out", metavar="DIR", default=kept("docs"), help="where they go")
-
-
-@command(
-    "hil_tests.pictures:run_recording",
-    "python -m hil_tests recording --out runs/left_turn.mcap",
-)
-def recording(parser: argparse.ArgumentParser) -> None:
-    out = kept("hil_tests/recordings/left_turn.mcap")
-    parser.add_argument("--out", metavar="F.mcap", default=out, help="where it is kept")

@@ -2,7 +2,7 @@
 
 import argparse
 import ast
-import importlib
+import importlib.util
 import os
 import re
 import shlex
@@ -25,9 +25,6 @@ from edge_runtime import __version__
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2 import DEFAULT_ROS2_ENDPOINT
-from hil_tests import pictures
-from hil_tests.__main__ import main
-from hil_tests.pictures import policy_sees, success_against_latency
 from trainer.util import kept
 
 ROOT = Path(__file__).parents[2]
@@ -122,7 +119,7 @@ def test_what_drives_any_policy_knows_none_of_ours(folder):
         assert OURS.search(path.read_text()) is None, path
 
 
-LEAST_WRITING = {"edge_runtime": 2, "bridge": 5, "trainer": 7, "deploy": 4, "hil_tests": 5}
+LEAST_WRITING = {"edge_runtime": 2, "bridge": 5, "trainer": 7, "deploy": 4, "hil_tests": 3}
 """Commands with an --out of those packages."""
 
 
@@ -377,15 +374,26 @@ def test_every_port_of_plain_text_beside_tls_and_every_target_is_named():
 DOCS = ROOT / "docs"
 
 
-def test_the_table_of_pictures_is_that_of_the_command_and_every_picture_is_small():
+@pytest.fixture(scope="module")
+def pictures():
+    """The script of the documents, which is in no package."""
+    spec = importlib.util.spec_from_file_location("make_pictures", DOCS / "make_pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+def test_the_table_of_pictures_is_that_of_the_script_and_every_picture_is_small(pictures):
     listed = re.findall(r"^\| \[(\S+)\]", (DOCS / "README.md").read_text(), re.M)
     assert set(pictures.PICTURES) <= set(listed)
     assert [name for name in listed if not (DOCS / name).is_file()] == []
     assert [path.name for path in DOCS.glob("*.*") if path.stat().st_size > 2_000_000] == []
 
 
-def test_pictures_of_what_is_kept_are_pictures(tmp_path):
-    for make in (policy_sees, success_against_latency):
+def test_pictures_of_what_is_kept_are_pictures(tmp_path, pictures):
+    for make in (pictures.policy_sees, pictures.success_against_latency):
         out = tmp_path / f"{make.__name__}.png"
         make(out, tmp_path)
         with Image.open(out) as picture:
@@ -393,21 +401,25 @@ def test_pictures_of_what_is_kept_are_pictures(tmp_path):
             assert len(np.unique(np.asarray(picture.convert("L")))) > 8
 
 
-def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(monkeypatch, tmp_path, capsys):
+def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(
+    monkeypatch, tmp_path, capsys, pictures
+):
     made = {
         "a.png": mock.Mock(side_effect=UserError("no viewer here")),
         "b.png": lambda out, _work: out.write_bytes(b"picture"),
     }
     monkeypatch.setattr(pictures, "PICTURES", made)
-    assert main(["pictures", "--out", str(tmp_path)]) == pictures.SOME_MISSING
+    assert pictures.make_pictures([], tmp_path) == pictures.SOME_MISSING
     assert (tmp_path / "b.png").read_bytes() == b"picture"
     assert capsys.readouterr().err == "a.png: not made: no viewer here\n"
-    assert main(["pictures", "b.png", "--out", str(tmp_path)]) == 0
+    assert pictures.make_pictures(["b.png"], tmp_path) == 0
+    with pytest.raises(UserError, match="choose from"):
+        pictures.make_pictures(["c.png"], tmp_path)
 
 
-def test_a_viewer_that_ends_as_it_draws_is_said(monkeypatch):
+def test_a_viewer_that_ends_as_it_draws_is_said(monkeypatch, pictures):
     gone = mock.Mock(open=mock.Mock(side_effect=ConnectionError("transport error")))
-    monkeypatch.setattr("hil_tests.pictures.Viewer", mock.Mock())
+    monkeypatch.setattr(pictures, "Viewer", mock.Mock())
     monkeypatch.setattr("rerun.experimental.ViewerClient.connect", lambda _: gone)
     with pytest.raises(UserError, match="mesa-vulkan-drivers"):
         pictures.screenshot(Path("x.rrd"), "step", sequence=1)

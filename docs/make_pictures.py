@@ -1,20 +1,13 @@
-"""``python -m hil_tests pictures`` and ``recording``: what is kept in the repository, made anew.
-
-The pictures of the READMEs, and the recording that the next release is replayed against: four left
-turns in lock-step, and one in real time whose simulator is stopped for half a second. There the
-edge runtime must go into safe stop, and drive again after five states.
-"""
+"""Make the pictures of this folder anew: ``python docs/make_pictures.py [NAME.png ...]``."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +16,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
-from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.reach import free_endpoint
-from edge_runtime.util import UserError, read_bytes, read_json
+from edge_runtime.cli import run_cli
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, read_json
 from hil_tests.campaign import draw_axes
-from hil_tests.processes import (
-    POLICY,
-    PUBLIC_KEY,
-    Process,
-    drive_shown,
-    run_command,
-)
+from hil_tests.processes import POLICY, PUBLIC_KEY, drive_shown, run_command
 from trainer.drivers import load_driver
 from trainer.environments import make_environment
 from trainer.pictures import write_figure
@@ -56,23 +43,17 @@ SOME_MISSING = 1  # Exit status where a picture could not be made here
 Make = Callable[[Path, Path], None]
 """Writes a picture, given its path and a directory for what is made on the way."""
 
-EPISODES = 4
-MAX_BYTES = 300_000
-DRIVEN_BEFORE_S, STOPPED_S = 2.0, 0.5
-PATIENCE_S = 60.0
 
+def make_pictures(names: Sequence[str], out: Path = Path(__file__).parent) -> int:
+    """Make the named pictures, or all; return the exit status, 1 where one cannot be made here.
 
-def run_pictures(arguments: argparse.Namespace) -> int:
-    """Make them, each as far as it can be made here. UserError for one that is not known."""
-    names = arguments.names or list(PICTURES)
-    for name in names:
-        if name not in PICTURES:
-            raise UserError(f"no picture {name!r}: choose from {', '.join(PICTURES)}")
-    out, status = Path(arguments.out), 0
-    for name in names:
-        check_writable(out / name)
+    Raises UserError for an unknown name.
+    """
+    if unknown := set(names) - set(PICTURES):
+        raise UserError(f"no picture {unknown.pop()!r}: choose from {', '.join(PICTURES)}")
+    status = 0
     with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
-        for name in names:
+        for name in names or PICTURES:
             try:
                 PICTURES[name](out / name, Path(folder))
             except UserError as error:
@@ -182,42 +163,5 @@ PICTURES: dict[str, Make] = {
     "rerun_training.png": rerun_training,
 }
 
-
-def run_recording(arguments: argparse.Namespace) -> int:
-    """Make the recording and check it by replay; the old one stays where anything goes wrong."""
-    out = Path(arguments.out)
-    check_writable(out)
-    with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / "drive.mcap"
-        _record(made)
-        run_command("bridge", "replay", str(made), *TRUST)
-        data = read_bytes(made, "recording")
-        if len(data) > MAX_BYTES:
-            raise UserError(f"the recording has {len(data)} bytes, more than {MAX_BYTES}")
-        write_atomic(out, data)
-    print(f"wrote {out}: {len(data)} bytes")
-    return 0
-
-
-def _record(out: Path) -> None:
-    """The runtime starts last, so that the drive begins once the recorder listens."""
-    endpoint = free_endpoint()
-    simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
-    record = ("bridge", "record", "--out", str(out), "--connect", endpoint)
-    first = Process(*simulate, "--episodes", str(EPISODES))
-    more = ("--wait-s", "30", "--linger-s", "30")
-    with first, Process(*record, *more, ready="recording") as recorder:
-        run = ("edge_runtime", "run", *TRUST, "--connect", endpoint)
-        with Process(*run, ready="ready", shown=True) as edge:
-            first.succeed(PATIENCE_S)
-            edge.lines.clear()  # What follows is of the second one.
-            realtime = ("--seed", str(EPISODES), "--clock", "realtime")
-            with Process(*simulate, *realtime) as second:
-                edge.wait_for_line("now=drive", PATIENCE_S)
-                time.sleep(DRIVEN_BEFORE_S)
-                second.send(signal.SIGSTOP)
-                time.sleep(STOPPED_S)
-                second.send(signal.SIGCONT)
-                second.succeed(PATIENCE_S)
-        recorder.send(signal.SIGTERM)
-        recorder.succeed(PATIENCE_S)
+if __name__ == "__main__":
+    sys.exit(run_cli(make_pictures))
