@@ -167,6 +167,7 @@ class Exchange:
     begun_s: float  # When the policy began with it
     finished_s: float  # When the policy's answer, or the verdict that it took too long, was there
     last_s: float  # When the last answer was heard, repetitions included
+    arrived_ns: int = 0  # `arrived_s` by the runtime's own clock
     answers: list[Answer] = field(default_factory=list)
 
 
@@ -309,11 +310,13 @@ def _first_exchange(
         arrived_s = sent_s
     begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
     finished_s = sent_s
-    if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
-        # The watchdog's verdict; the policy is still at it.
+    if command.inference_ns == 0:
+        # The watchdog's verdict: the policy is still at it, or the state came too late for it.
         begun_s = arrived_s
-        finished_s = max(sent_s, begun_s + period_s + JUST_AFTER_S)
-    return Exchange(arrived_s, begun_s, finished_s, sent_s)
+        finished_s = begun_s + JUST_AFTER_S
+        if command.reason == Event.TOO_LONG.value:
+            finished_s = max(sent_s, begun_s + period_s + JUST_AFTER_S)
+    return Exchange(arrived_s, begun_s, finished_s, sent_s, command.received_ns)
 
 
 def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> Answers:
@@ -378,8 +381,8 @@ class _Replay:
         rearmed = any(answer.mode == "drive" for answer in exchange.answers)
         if rearmed and self._controller.waits_for_rearm:
             self._controller.rearm(exchange.arrived_s)
-        arrived_ns = round(exchange.arrived_s * 1e9)
-        self._controller.begin(Received(state, exchange.arrived_s, arrived_ns), exchange.begun_s)
+        received = Received(state, exchange.arrived_s, exchange.arrived_ns)
+        self._controller.begin(received, exchange.begun_s)
         output, layout = None, self._policy.layout
         if layout.refusal(state.observation) is None and not is_foreign(state, layout.task_text):
             output, _ = infer(self._policy, layout.arrays(state.observation))

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.messages import Heard
 from bridge.record import RecordingWriter
-from bridge.replay import Answer, Exchange, compare
+from bridge.replay import Answer, Exchange, _first_exchange, compare
 from bridge.tests.harness import BridgeProcess, bridge_status, make_policy, start_edge
 from bridge.tests.test_inbound import health
 from edge_runtime.reach import free_endpoint
@@ -335,7 +335,7 @@ def test_a_watchdog_that_woke_with_the_state_after_the_silence_is_no_difference(
 def test_a_stop_that_nobody_repeated_is_a_difference_where_it_was_the_only_answer():
     stop = Answer("safe_stop", "no_fresh_state", (-1.0,))
     states = [("here", 0, step) for step in range(3)]
-    recorded = {key: Exchange(0.0, 0.0, 0.0, 0.0, [stop]) for key in states}
+    recorded = {key: Exchange(0.0, 0.0, 0.0, 0.0, answers=[stop]) for key in states}
     report = compare(recorded, {states[0]: [stop], states[2]: [stop]}, states, 0.0)
     assert (report["equal"], report["different"]) == (2, 1)
 
@@ -388,3 +388,12 @@ def test_through_a_running_edge_runtime(hand, tmp_path):
     report = json.loads(out.read_text())
     assert (report["compared"], report["equal"]) == (12, 12)
     assert len(report["policy_id"]) == 64
+
+
+def test_a_state_that_time_alone_has_answered_came_when_the_runtime_says_so():
+    """It came too late to be driven on, and the stop that answers it is the silence's."""
+    stop = make_command(mode="safe_stop", reason="no_fresh_state", received_ns=5 * 10**8,
+                        inference_ns=0, sent_ns=7 * 10**8)  # fmt: skip
+    exchange = _first_exchange(stop, 10.0, 0.1, 0.0)
+    assert (exchange.arrived_s, exchange.arrived_ns) == (pytest.approx(9.8), 5 * 10**8)
+    assert exchange.begun_s == exchange.arrived_s < exchange.finished_s < 9.81

@@ -21,7 +21,7 @@ from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command
 OUT = Path(__file__).with_name("left_turn.mcap")
 TRUST = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
 EPISODES = 4
-MAX_BYTES = 300_000
+MAX_BYTES = 500_000
 DRIVEN_BEFORE_S, STOPPED_S = 2.0, 0.5
 PATIENCE_S = 60.0
 
