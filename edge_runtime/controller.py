@@ -157,6 +157,7 @@ class Controller:
         self._ride = ride
         self._freshness = Freshness(self.safety.answer_s)
         self._lag_s = 0.0  # of the newest state
+        self._fresh_before_s: Optional[float] = None  # `last_fresh_s` before the newest state
         self.link_quality = link_quality  # of a policy with an envelope; the shell feeds it
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
@@ -188,14 +189,16 @@ class Controller:
 
     def begin(self, received: Received, now_s: float) -> None:
         """The policy starts on the newest state."""
-        session = received.state.session
+        session, final = received.state.session, received.state.final
         # The gap counts even where the watchdog did not get to run within it.
         event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
         if event is not None and not (event is Event.SILENT and self._stopped_late):
             self._apply(event)
         stands = self.safety.mode is Mode.SAFE_STOP
         sent_s, arrived_s = received.state.sent_ns * 1e-9, received.arrived_s
-        self._lag_s = self._freshness.lag_s(session, sent_s, arrived_s, received.trip_s, stands)
+        trip_s = received.trip_s
+        self._lag_s = self._freshness.lag_s(session, sent_s, arrived_s, trip_s, stands, final)
+        self._fresh_before_s = self.safety.last_fresh_s
         if not self._is_late:
             self.safety = rules.note_arrival(self.safety, session, arrived_s)
         self._newest = received
@@ -212,11 +215,15 @@ class Controller:
             return None
         overdue = now_s - self._begun_s > self._period_s
         # A process that was stopped in between would drive on what the road was then.
-        age_s = now_s - self._newest.arrived_s + (0.0 if self._is_late else self._lag_s)
+        age_s = now_s - self._newest.arrived_s
         if overdue or age_s > self.safety.answer_s:
             return self._give_up(now_s)
         self._begun_s = None
-        if now_s - self._newest.arrived_s > self._period_s:
+        if not self._is_late and self._lag_s + age_s > self.safety.answer_s:
+            # Too late by now: it is not answered, and so it ends no silence.
+            self._lag_s += age_s
+            self.safety = self.safety._replace(last_fresh_s=self._fresh_before_s)
+        if age_s > self._period_s:
             self.deadline_misses += 1
         wanted: List[float] = []
         form = (np.float32, (len(self._limits),))

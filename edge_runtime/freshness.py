@@ -42,17 +42,21 @@ class Freshness:
         arrived_s: float,
         trip_s: Optional[float],
         stands: bool,
+        final: bool = False,
     ) -> float:
         """The lag of a state, 0 for the first of its session.
 
         `sent_s` is the sender's stamp and `arrived_s` monotonic. `trip_s` is None where the sender
-        does not say what it has heard. `stands`: in a safe stop.
+        does not say what it has heard. `stands`: in a safe stop. A final state teaches nothing:
+        a simulator sends it past the network that it injects.
         """
         offset_s = arrived_s - sent_s
         known = self._leasts.get(session, _Least(arrived_s, offset_s, math.inf))
         grown_s = DRIFT * (arrived_s - known.noted_s)
         least_s, least_trip_s = known.offset_s + grown_s, known.trip_s + grown_s
         is_known, lag_s = least_trip_s < math.inf, offset_s - least_s
+        if final:
+            return max(lag_s, 0.0)
         stepped = abs(lag_s) > self._limit_s  # the delay, or a clock
         if trip_s is not None and trip_s < 0.0:
             trip_s = None  # a clock was set between its two readings

@@ -472,7 +472,7 @@ CAUSES = {
     Event.VEHICLE: fault_in_the_vehicle,
 }
 WAYS = {  # into each mode
-    Mode.STANDBY: [(0.3, "final", "final_state")],
+    Mode.STANDBY: [(0.2, "state", "drive"), (0.3, "final", "final_state")],
     Mode.DRIVE: [(0.3, "state", "drive")],
     Mode.SAFE_STOP: [FIRST, (0.25, "tick", SILENT), (0.3, "state", SILENT)],
 }

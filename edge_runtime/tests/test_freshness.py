@@ -76,6 +76,31 @@ def test_a_round_trip_is_held_against_the_quickest_whose_state_did_not_lag():
     assert lags(*back, trips={2: 2.0, 3: 2.0}, stands={3})[2:] == near(10.2, 10.2)
 
 
+def test_a_final_state_that_comes_past_the_injected_network_teaches_nothing():
+    freshness = Freshness(LIMIT_S)
+    states = [
+        (0.0, 0.2, 0.4, False, False),
+        (T, T, 0.2, False, True),
+        (1.0, 1.3, 0.5, False, False),
+        (9.0, 9.25, 0.45, True, False),
+        (9.0, 9.5, None, False, True),
+    ]
+    assert [freshness.lag_s("a", *state) for state in states] == near(0, 0, 0.1, 0.05, 0.3)
+
+
+def test_a_state_that_gets_too_late_while_the_policy_computes_is_left_out_and_ends_no_silence():
+    controller = Controller(shared_limits([PEDAL], {}), T, False)
+    seen = []
+    for step, delay_s in enumerate([0.0, 0.1, 0.2, 0.215, 0.215, 0.215]):
+        now_s = 1000.0 + step * T + delay_s
+        state = make_state(step, sent_ns=round((DECADES_S + step * T) * 1e9))
+        controller.begin(Received(state, now_s, 0), now_s)
+        order = controller.finish(GOOD, 1, now_s + 0.01)
+        seen.append(order.mode if order else "")
+    assert seen == ["drive", "drive", "drive", "", "", "safe_stop"]
+    assert controller.safety.reason == "state_late"
+
+
 class World:
     """A sender each T, a link in either direction that keeps the order, and a controller."""
 
@@ -97,7 +122,7 @@ class World:
         self.events: list = []
         self.numbers = itertools.count()
 
-    def lives(self, periods, up_s, growth_s, step_s, lost, fault, rearms):
+    def lives(self, periods, up_s, growth_s, step_s, lost, fault, rearms, ends):
         """So many control periods of one kind; the delay grows with each state."""
         self.up_s = up_s
         self.clock_s += step_s
@@ -110,12 +135,16 @@ class World:
             if rearms and self.controller.rearm(self.now_s) == "":
                 self.permitted = True
             self.run_until(self.now_s + T)
+        if ends:
+            self.send(False, final=True)
 
-    def send(self, lost):
+    def send(self, lost, final=False):
         sent_ns = round((self.now_s + self.clock_s + DECADES_S) * 1e9)
-        state = make_state(self.step, sent_ns=sent_ns, **self.heard)
+        state = make_state(self.step, sent_ns=sent_ns, final=final, **self.heard)
         self.step += 1
-        if not lost:
+        if final:  # past the network
+            self.arrive(state, self.now_s, self.heard_s)
+        elif not lost:
             self.up_free_s = max(self.up_free_s, self.now_s + self.up_s)
             self.push(self.up_free_s, ("state", state, (self.now_s, self.heard_s)))
 
@@ -144,11 +173,13 @@ class World:
 
     def arrive(self, state, sent_s, heard_s):
         delay_s = self.now_s - sent_s
-        if heard_s >= self.stepped_s:
+        if heard_s >= self.stepped_s and not state.final:
             self.least_s = min(self.least_s, delay_s)
         self.late_s = delay_s - self.least_s
         # A round trip shows a backlog where one without it was measured before.
-        self.measured |= heard_s > 0.0 > self.stepped_s and self.late_s < LIMIT_S
+        self.measured |= (
+            not state.final and heard_s > 0.0 > self.stepped_s and self.late_s < LIMIT_S
+        )
         if self.stopped and self.measured and heard_s > self.stepped_s:
             self.hidden_s = 0.0
         received = Received(state, self.now_s, round(self.now_s * 1e9))
@@ -184,6 +215,7 @@ kinds_of_life = st.fixed_dictionaries({
     "growth_s": st.sampled_from([0.0, 0.0, 0.0, 0.005, 0.05, 0.3]),
     "step_s": st.sampled_from([0.0] * 5 + [-0.15, -0.5, -3600.0, 0.15, 0.5, 3600.0]),
     "lost": st.booleans(), "fault": st.booleans(), "rearms": st.booleans(),
+    "ends": st.booleans(),
 })  # fmt: skip
 
 
@@ -198,7 +230,10 @@ def test_no_story_drives_on_a_late_state_or_without_a_permission(vehicle, ride_s
 @pytest.mark.parametrize("step_s", [-3600.0, -0.3, 0.0, 0.3, 3600.0])
 @pytest.mark.parametrize("ride_s", [0.0, 0.5])
 def test_it_drives_again_after_a_stop_whatever_was_done_to_the_clock(step_s, ride_s):
-    world, good = World(True, ride_s), {"growth_s": 0.0, "lost": False, "fault": False}
+    world, good = (
+        World(True, ride_s),
+        {"growth_s": 0.0, "lost": False, "fault": False, "ends": False},
+    )
     quick = {"up_s": 0.05, **good}
     world.lives(periods=20, step_s=0.0, rearms=False, **quick)
     assert world.drives > 15
