@@ -8,7 +8,8 @@ A step of the sender's clock looks like a lag, and counts as one until there is 
 the round trip of a command and the next state shows whether a backlog is left. It needs no offset:
 each of the two clocks is read twice (`heard_sent_ns`, `heard_ns` of the wire). Two things cannot be
 told apart: a clock set ahead and a backlog of just that size; a clock set back and a delay that has
-moved from the commands to the states.
+moved from the commands to the states. Where the stamps show no lag, `limit_s` of a round trip may
+be the command's: over jitter both ways it would else stay in a stop for good.
 """
 
 from __future__ import annotations
@@ -61,11 +62,18 @@ class Freshness:
         if trip_s is not None and trip_s < 0.0:
             trip_s = None  # a clock was set between its two readings
         if trip_s is not None and (is_known or not stepped):
-            quickest_s = trip_s if stepped else max(trip_s - max(lag_s, 0.0), 0.0)
+            # Only of the first is a lag taken off: later ones come of trips themselves.
+            quickest_s = trip_s if is_known else max(trip_s - max(lag_s, 0.0), 0.0)
             least_trip_s = min(least_trip_s, quickest_s)
         if stands and trip_s is not None and is_known:
-            lag_s = trip_s - least_trip_s
-            least_s = offset_s - lag_s
+            shown_s = offset_s - (trip_s - least_trip_s)  # the true least is no less
+            if lag_s < -self._limit_s:  # a clock was set ahead
+                least_s = shown_s
+            least_s = min(max(least_s, shown_s), offset_s)
+            # Commands lag, too: were all of the trip the state's, it would never drive over jitter.
+            lag_s = offset_s - min(least_s, shown_s + self._limit_s)
+            if lag_s <= self._limit_s:
+                least_s = offset_s - lag_s
         elif stepped and is_known:
             lag_s = abs(lag_s)  # no link gets so much better: where it is less, a clock was set
         else:

@@ -101,6 +101,32 @@ def test_a_state_that_gets_too_late_while_the_policy_computes_is_left_out_and_en
     assert controller.safety.reason == "state_late"
 
 
+def test_commands_that_are_late_in_a_stop_do_not_make_a_state_late():
+    states, stands = [(T * n, T * n) for n in range(4)], {2, 3}
+    trips = {0: 0.05, 1: 0.05, 2: 0.25, 3: 0.25}
+    assert lags(*states, trips=trips, stands=stands) == near(0, 0, 0, 0)
+    assert lags(*states, trips={**trips, 2: 0.7}, stands=stands) == near(0, 0, 0.65 - LIMIT_S, 0)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "delay_s", "jitter_s"), [(0.1, 0.15, 0.05), (0.02, 0.05, 0.01)]
+)
+def test_jitter_both_ways_does_not_keep_it_in_a_stop(period_s, delay_s, jitter_s):
+    rng, drives = np.random.default_rng(7), 0
+    controller = Controller(shared_limits([PEDAL], {}), period_s, False)
+    for step in range(1000):
+        up_s, down_s = rng.normal(delay_s, jitter_s, 2).clip(0.001)
+        sent_s = 1000.0 + step * period_s
+        now_s, sent_ns = sent_s + up_s, round((DECADES_S + sent_s) * 1e9)
+        heard = {"heard": 0, "heard_ns": sent_ns, "heard_sent_ns": round((sent_s - down_s) * 1e9)}
+        state = make_state(step, sent_ns=sent_ns, **heard)
+        controller.begin(Received(state, now_s, round(now_s * 1e9)), now_s)
+        # A policy that fails stops it.
+        order = controller.finish(GOOD if step % 200 else None, 1, now_s)
+        drives += order is not None and order.mode == "drive"
+    assert drives > 700
+
+
 class World:
     """A sender each T, a link in either direction that keeps the order, and a controller."""
 
@@ -181,7 +207,7 @@ class World:
             not state.final and heard_s > 0.0 > self.stepped_s and self.late_s < LIMIT_S
         )
         if self.stopped and self.measured and heard_s > self.stepped_s:
-            self.hidden_s = 0.0
+            self.hidden_s = min(self.hidden_s, LIMIT_S)
         received = Received(state, self.now_s, round(self.now_s * 1e9))
         self.controller.begin(received, self.now_s)
         self.now_s += 0.001
