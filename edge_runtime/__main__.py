@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 
 from edge_runtime.cli import program, run_cli
 
@@ -27,7 +29,12 @@ main = program(
 
 def script() -> None:
     """The entry point of `phil-edge`."""
-    sys.exit(run_cli(main))
+    status = run_cli(main)
+    if not all(one.daemon for one in threading.enumerate() if one is not threading.main_thread()):
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        os._exit(status)  # a driver left a thread of its own, and the exit would wait for that
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import gc
 import os
+import queue
 import signal
 import threading
 import time
@@ -31,6 +32,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
 
 _WAITING_PERIOD_S = 5.0
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
+_FORCE_S = 10.0  # longer than all that is waited for in the end
 
 
 class _StopSignal:
@@ -39,6 +41,11 @@ class _StopSignal:
     def __init__(self, until: Optional[threading.Event], undo: contextlib.ExitStack) -> None:
         self.came = False
         self.on_stop: Callable[[], None] = lambda: None
+        self._signals: queue.SimpleQueue[Any] = queue.SimpleQueue()  # a handler may put at any time
+        self._over = threading.Event()
+        undo.callback(self._signals.put, None)
+        undo.callback(self._over.set)
+        threading.Thread(target=self._force, name="force", daemon=True).start()
         take_signals({signal.SIGTERM, signal.SIGINT, *ending_signals()}, self._handle, undo)
         if until is not None:
             threading.Thread(target=self._wait, args=(until,), daemon=True).start()
@@ -47,9 +54,19 @@ class _StopSignal:
         until.wait()
         self._handle()
 
-    def _handle(self, *_: Any) -> None:
+    def _handle(self, *signalled: Any) -> None:
         self.came = True
+        if signalled:
+            self._signals.put(None)
         self.on_stop()
+
+    def _force(self) -> None:
+        """End the process where the main thread hangs, in a driver's constructor for one."""
+        self._signals.get()
+        if not self._over.wait(_FORCE_S):
+            log.event("error", "ended_by_force", waited_s=_FORCE_S)
+            log.close()
+            os._exit(1)
 
 
 EXAMPLE = r"""examples:

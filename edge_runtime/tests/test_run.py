@@ -160,6 +160,43 @@ def test_a_vehicle_is_left_braked_and_closed_or_the_log_says_that_it_hangs(
         assert (" driver_hangs " in edge.errors) == hangs
 
 
+HELD = """
+import os, threading, time
+from edge_runtime.vehicles.mock import MockVehicle
+
+class Held(MockVehicle):
+    def __init__(self, *parameters):
+        super().__init__(*parameters)
+        self.hold("constructor")
+        if os.path.exists("thread"):
+            threading.Thread(target=time.sleep, args=(1e6,)).start()
+    def enable(self, now_s):
+        self.hold("enable")
+        super().enable(now_s)
+    def hold(self, where):
+        if os.path.exists(where):
+            open("here", "w").close()
+            time.sleep(1e6)
+"""
+
+
+@pytest.mark.parametrize(("where", "status"), [("constructor", 1), ("enable", 2), ("thread", 0)])
+def test_a_driver_that_hangs_before_the_drive_or_leaves_a_thread_does_not_hold_the_end(
+    make_policy, tmp_path, where, status
+):
+    (tmp_path / "held_vehicle.py").write_text(HELD)
+    (tmp_path / where).touch()
+    endpoint, flags = free_endpoint(), make_policy("constant").flags
+    run = ["run", *flags, "--connect", endpoint, "--vehicle", "held_vehicle:Held"]
+    with CommandProcess("edge_runtime", *run, cwd=tmp_path) as edge:
+        if where == "thread":
+            assert edge.process.stdout.readline().startswith("ready ")
+        else:
+            wait_until((tmp_path / "here").exists, "the driver to hang")
+        assert edge.end() == status
+        assert (" ended_by_force " in edge.errors) == (where == "constructor")
+
+
 def test_silence_stops_at_the_control_rate_and_fresh_states_drive_again(edge_and_simulator):
     _, simulator = edge_and_simulator()
     assert simulator.ask(make_state(0)).mode == "drive"

@@ -322,13 +322,13 @@ class VehicleRunner:
 
         Raises UserError where it cannot be enabled.
         """
-        now_s = time.monotonic()
-        if armed:
-            self._take_control(now_s)
-            if self._not_enabled:
-                raise UserError(f"vehicle {self.name} cannot be enabled: {self._not_enabled}")
-        self._watch.begin(now_s)
+        self._enable_due = armed
+        self._watch.begin(time.monotonic())
         self._thread.start()
+        with self._due:
+            ended = self._due.wait_for(lambda: not self._enable_due, _LEAVE_S)
+        if words := self._not_enabled if ended else f"no end within {_LEAVE_S:g} s":
+            raise UserError(f"vehicle {self.name} cannot be enabled: {words}")
 
     def enable(self) -> None:
         """Have the vehicle enabled again: an operator has re-armed it. Never waits.
@@ -403,6 +403,7 @@ class VehicleRunner:
             self._ask()
         with self._due:
             self._enable_due = False
+            self._due.notify()
         if self._not_enabled:
             self.on_fault()
 
