@@ -296,7 +296,7 @@ class Controller:
             return "no vehicle is attached: it drives again by itself after fresh states"
         if self.vehicle_fault:
             return f"the vehicle is at fault: {self.vehicle_fault}"
-        if rules.is_silent(self.safety, now_s):
+        if self._is_late or rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
             arrives = "only late" if self._is_late else "no fresh"
             return f"{arrives} states arrive; re-arm when the link is back"
@@ -337,8 +337,8 @@ class Controller:
 
     @property
     def _stopped_late(self) -> bool:
-        """Whether late states are why it stands: that there are no others goes without saying."""
-        return self._is_late and self.safety.reason == Event.LATE.value
+        """Whether it stands and states come late: that there are no others goes without saying."""
+        return self._is_late and self.safety.mode is Mode.SAFE_STOP
 
     def _give_up(self, now_s: float) -> Order:
         """Stop because the policy takes too long; its answer, should it come, is not used."""

@@ -108,6 +108,34 @@ def test_commands_that_are_late_in_a_stop_do_not_make_a_state_late():
     assert lags(*states, trips={**trips, 2: 0.7}, stands=stands) == near(0, 0, 0.65 - LIMIT_S, 0)
 
 
+def answered(controller, step, now_s, lag_s=0.0, output=GOOD):
+    state = make_state(step, sent_ns=round((now_s - lag_s + DECADES_S) * 1e9))
+    controller.begin(Received(state, now_s, 0), now_s)
+    return controller.finish(output, 1, now_s)
+
+
+def test_no_permission_that_was_given_beside_a_late_state_outlasts_a_silence():
+    controller = Controller(shared_limits([PEDAL], MockVehicle.limits), T, True)
+    for step, lag_s in enumerate([0.0, 3.0, 3.0, 3.0, 0.0, 3.0]):
+        answered(controller, step, 1000.0 + T * step, lag_s)
+    assert controller.rearm(1000.51)
+    modes = [answered(controller, step, 1005.0 + T * step).mode for step in range(6, 20)]
+    assert set(modes) == {"safe_stop"}
+
+
+@pytest.mark.parametrize(("fault", "output"), [("estop", GOOD), ("", GOOD * np.float32(np.nan))])
+def test_what_else_stops_it_is_the_reason_while_states_are_late(fault, output):
+    controller = Controller(shared_limits([PEDAL], MockVehicle.limits), T, True)
+    answered(controller, 0, 1000.0)
+    controller.vehicle_fault = fault
+    reasons = []
+    for step in range(9):
+        controller.tick(1000.95 + T * step)
+        reasons.append(controller.safety.reason)
+        reasons.append(answered(controller, step, 1001.0 + T * step, 3.0, output).reason)
+    assert len(set(reasons[1:])) == 1
+
+
 @pytest.mark.parametrize(
     ("period_s", "delay_s", "jitter_s"), [(0.1, 0.15, 0.05), (0.02, 0.05, 0.01)]
 )
