@@ -26,7 +26,7 @@ from typing import Any
 import msgspec
 
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.network import Direction, LatencySpec, make_link
+from bridge.network import LatencyModel, LatencySpec, make_link
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
     BRAKE_PERIODS,
@@ -240,7 +240,7 @@ class RealTimeClock(_Clock):
         self._send(self._link.up, payload, self._publish)
         return tick_s
 
-    def _send(self, direction: Direction, payload: bytes, deliver: Publish) -> None:
+    def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
         for arrival_s in direction.arrivals(sent_s, len(payload)):

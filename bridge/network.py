@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -377,24 +377,14 @@ class LatencyModel:
         return max(0.0, under_way_ms) * 1e-3
 
 
-class Direction(Protocol):
-    """What becomes of each message of one direction: drawn, or played from a trace."""
-
-    def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
-        """As `LatencyModel.arrivals`."""
-        ...
-
-
 class Link(NamedTuple):
     """The two directions of one episode."""
 
-    up: Direction
-    down: Direction
+    up: LatencyModel
+    down: LatencyModel
 
 
-def make_link(spec: LatencySpec | Link, seed: int) -> Link:
-    """Make both directions, each with its own stream of the seed; a link is taken as it is."""
-    if isinstance(spec, Link):
-        return spec
+def make_link(spec: LatencySpec, seed: int) -> Link:
+    """Make both directions, each with its own stream of the seed."""
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Link(LatencyModel(spec.up, up), LatencyModel(spec.down, down))

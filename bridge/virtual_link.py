@@ -22,7 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from bridge.network import LatencySpec, Link, make_link
+from bridge.network import LatencySpec, make_link
 from edge_runtime.freshness import Freshness
 from edge_runtime.safety import (
     Event,
@@ -175,7 +175,7 @@ class VirtualLink(Generic[Message]):
 
     def __init__(
         self,
-        spec: LatencySpec | Link,
+        spec: LatencySpec,
         seed: int,
         period_s: float,
         observation_bytes: int,

@@ -33,19 +33,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
-from itertools import combinations, repeat
+from itertools import combinations
 from multiprocessing import get_context
 from typing import Annotated, Any
 
 import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
-from bridge.policy_file import network_of_file
 from bridge.report import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime import cli
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json
-from hil_tests.trace import failing_drive, shrunk
 from trainer.drivers import load_driver, located
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes, trained_in
@@ -254,7 +252,7 @@ class Drivers(ProcessPoolExecutor):
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
         """Drive each seed behind a network; whether it succeeded."""
         self.driven.append(len(seeds))
-        outcomes = list(self.map(partial(_work, _outcome, spec), seeds, chunksize=CHUNK))
+        outcomes = list(self.map(partial(_outcome, spec), seeds, chunksize=CHUNK))
         self._ended.update(outcomes)
         # A limit of steps alone is a timeout as soon as any other drive's end was told.
         if UNKNOWN in outcomes or len(self._ended) == 1:
@@ -274,26 +272,10 @@ def _begin(policy: str, env: str, condition: str, public_key: str | None) -> Non
     _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
 
 
-def _work(work: Callable[..., Any], *arguments: Any) -> Any:
-    """``work(environment, driver, condition, ...)``, with those of this process."""
-    return work(*_mine, *arguments)
-
-
-def _outcome(env: Any, driver: Any, condition: str, spec: LatencySpec, seed: int) -> str:
+def _outcome(spec: LatencySpec, seed: int) -> str:
+    env, driver, condition = _mine
     (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
     return result.outcome
-
-
-def find_trace(drivers: Drivers, edges: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
-    """A failing drive just outside, shrunk to the disturbed messages that it needs.
-
-    Of each network's first one it is the one with the fewest, since that shrinks soonest.
-    """
-    broken = [parse_spec(edge["outside"]) for edge in edges.values() if edge["outside"]]
-    seeds = repeat(range(seed, seed + FRESH))
-    failed = filter(None, drivers.map(partial(_work, failing_drive), broken, seeds))
-    least = min(failed, key=lambda found: sum(map(len, found[2].values())), default=None)
-    return least and drivers.submit(_work, shrunk, *least).result()
 
 
 class Edge(msgspec.Struct):
@@ -371,7 +353,6 @@ def run(arguments: argparse.Namespace) -> int:
         "promised_success": known.promised_success if known else arguments.promise,
         "confidence": told.confidence, "seed": arguments.seed,
         "control_period_s": environment.control_period_s,
-        "network": network_of_file(policy) if policy.endswith(".onnx") else "",
     }  # fmt: skip
     task = (jobs, policy, env, condition, arguments.public_key)
     with cli.sigterm_as_interrupt(), Drivers(*task) as drivers:
@@ -382,7 +363,6 @@ def run(arguments: argparse.Namespace) -> int:
             rule = found["promised_success"], found["confidence"]
             search = Search(drivers.drive, *rule, arguments.seed, jobs * CHUNK)
             found |= {**find_region(search), "tried": search.tried}
-            found["trace"] = find_trace(drivers, found["edges"], arguments.seed)
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)  # All of them have ended.
     found |= {"drives": sum(drivers.driven), "seconds": round(time.monotonic() - began_s, 1)}
     found["cpu_s"] = spent.ru_utime + spent.ru_stime

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode import accelerations, finite
-from bridge.network import LatencySpec, Link, parse_spec
+from bridge.network import LatencySpec, parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, of_known, summarise
 from edge_runtime.files import check_writable, write_json_out
@@ -205,13 +205,12 @@ def drive_episodes(
     seeds: Iterable[int],
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
-    latency: LatencySpec | Link = NO_NETWORK,
+    latency: LatencySpec = NO_NETWORK,
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
     Its noise is added here; its scene is the environment's own (``environments.make_environment``).
-    ``latency`` is the network between driver and vehicle, in virtual time; a link serves one
-    episode.
+    ``latency`` is the network between driver and vehicle, in virtual time.
     """
     results = []
     for seed in seeds:

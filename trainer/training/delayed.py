@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.network import LatencySpec, Link
+from bridge.network import LatencySpec
 from bridge.virtual_link import COMMAND_WINDOW, ROUNDING_S, VirtualLink
 from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Action, Observation
@@ -32,9 +32,7 @@ class VehicleEnd:
     ``bridge simulate``, ``observation`` any one, for its size.
     """
 
-    def __init__(
-        self, env: Any, spec: LatencySpec | Link, seed: int, observation: Observation
-    ) -> None:
+    def __init__(self, env: Any, spec: LatencySpec, seed: int, observation: Observation) -> None:
         self.env = env
         self._rest: Action = env.rest_action
         self._link: VirtualLink[Observation] = VirtualLink(
