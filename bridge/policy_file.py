@@ -8,7 +8,6 @@ board itself would load.
 from __future__ import annotations
 
 import argparse
-import hashlib
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +21,6 @@ from bridge.environments import Environment, changed, describe, known_stops, mak
 from bridge.episode import Actuators, pack
 from edge_runtime.cli import Command, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.link_quality import read_envelope
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
 from edge_runtime.policy import (
     MAX_POLICY_MIB,
@@ -33,10 +31,9 @@ from edge_runtime.policy import (
     check_answer,
     check_graph,
     open_policy,
-    policy_id_of,
 )
 from edge_runtime.tls import read_signing_key
-from edge_runtime.util import UserError, read_bytes, read_json
+from edge_runtime.util import UserError, read_bytes
 
 REAL_OBSERVATIONS = 200
 FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
@@ -55,7 +52,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     period = "seconds of a step (default: what the environment says, else its render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     algorithm = "what trained it, for the manifest"
-    add_envelope(parser)
     add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)
 
 
@@ -67,14 +63,13 @@ def _run(arguments: argparse.Namespace) -> int:
     check_writable(out)
     if key:
         read_signing_key(key)
-    envelope = arguments.envelope and read_json(arguments.envelope, "envelope")
     with closing(make_environment(arguments.env)) as environment:
         task = changed(describe(environment, arguments.period), arguments.changes)
         _ask_for_stops(environment, task, arguments.changes)
         model = read_bytes(arguments.model, "model", MAX_POLICY_MIB)
         training = {"source": Path(arguments.model).name, "environment": arguments.env}
         try:
-            data = make_policy(model, task, arguments.algorithm, training, envelope)
+            data = make_policy(model, task, arguments.algorithm, training)
             policy = open_policy(data, UNSIGNED)
             low, high = _drive(policy, environment)
         except UserError as error:
@@ -101,34 +96,11 @@ def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> 
             raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
 
 
-def add_envelope(parser: argparse.ArgumentParser) -> None:
-    """Declare the option of the networks that the policy bears."""
-    text = "the networks in which it may drive (hil_tests envelope), for the manifest"
-    parser.add_argument("--envelope", metavar="F.json", type="path", help=text)
-
-
-def network_of(model: onnx.ModelProto) -> str:
-    """SHA-256 of the graph with its weights, in hex: the same whatever manifest is beside it."""
-    return hashlib.sha256(model.graph.SerializeToString(deterministic=True)).hexdigest()
-
-
-def network_of_file(path: str) -> str:
-    """The same of a file."""
-    return network_of(onnx.load(path))
-
-
-def make_policy(
-    model: bytes,
-    task: Task,
-    algorithm: str,
-    training: dict[str, Any],
-    envelope: Any = None,
-) -> bytes:
+def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
     """The policy file's bytes: the model with its manifest in it.
 
     A single input and a single output may have any name: they get the manifest's. Raises UserError
-    for what is no ONNX model that the board can run. ``envelope`` is the JSON value of one that was
-    measured with this file (its ``policy_id``) or this graph (its ``network``); UserError else.
+    for what is no ONNX model that the board can run.
     """
     check_graph(model)
     graph = onnx.load_from_string(model)
@@ -144,12 +116,7 @@ def make_policy(
         algorithm=algorithm,
         training=training,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-        envelope=envelope,
     )
-    if envelope is not None:
-        measured = read_envelope(envelope, task)
-        if measured.policy_id != policy_id_of(model) and measured.network != network_of(graph):
-            raise UserError("the envelope was measured with another network")
     del graph.metadata_props[:]
     told = msgspec.json.encode(manifest).decode()
     graph.metadata_props.add(key=MANIFEST_KEY, value=told)

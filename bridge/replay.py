@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import msgspec
@@ -31,12 +30,11 @@ from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.ride import Ride
-from edge_runtime.safety import FRESH_STATES_TO_RECOVER, SILENCE_PERIODS, Event
+from edge_runtime.safety import SILENCE_PERIODS, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, name_in_file, printable
 from edge_runtime.vehicles import find_vehicle, installed_as, vehicle_limits
 from edge_runtime.wire import (
-    DRIVE,
     SAFE_STOP,
     Command,
     Health,
@@ -52,7 +50,6 @@ JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
 CLOCK_STEP_S = 1.0
 """Where the two clocks come apart by more than this, the runtime's has been stepped."""
 MOST_REPETITIONS = 1000  # Of a stop: by then nothing is new, however long the silence lasts
-OUTSIDE: Any = SimpleNamespace(outside=Event.OUTSIDE.value)  # A link's measurement, as recorded
 RESTART_S = 0.5  # Uptimes that disagree by more than this belong to two runtimes
 
 Key = tuple[str, int, int]  # Session, episode, step
@@ -212,31 +209,6 @@ class RecordedDrive:
             if (exchange := self.exchanges.get(key_of(state))) is not None:
                 yield state, exchange
 
-    def outside(self) -> set[Key]:
-        """The states that found the link outside of the policy's envelope.
-
-        The runtime gives this reason until enough states in a row were fresh. So before it drove
-        again, the last of them found the link inside.
-        """
-        found: set[Key] = set()
-        run: list[Key] = []
-        before: Exchange | None = None
-        for key, exchange in self.exchanges.items():
-            first = exchange.answers[0]
-            if first.reason == Event.OUTSIDE.value:
-                run.append(key)
-            else:
-                recovers = first.mode == DRIVE and not self._restarted(before, exchange)
-                found.update(run[: 1 - FRESH_STATES_TO_RECOVER] if recovers else run)
-                run = []
-            before = exchange
-        return found.union(run)
-
-    def _restarted(self, before: Exchange | None, after: Exchange) -> bool:
-        """Whether the runtime was started anew between two exchanges."""
-        from_s = before.arrived_s if before else 0.0
-        return any(from_s < start_s <= after.arrived_s for start_s in self.runtime_starts_s)
-
     def _take(self, heard: Heard) -> None:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
@@ -323,9 +295,9 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     """Return the answers to every state that was answered in the recording.
 
     Which vehicle was attached is the recording's, and so is what befell it: when it failed, when
-    an operator re-armed (before a state that was answered with ``drive``), when the link was
-    outside of the envelope, and when the runtime was started anew, armed or not. Its limits follow
-    from ``config``. UserError where it lacks an action of the policy or cannot follow its scenario.
+    an operator re-armed (before a state that was answered with ``drive``), and when the runtime was
+    started anew, armed or not. Its limits follow from ``config``. UserError where it lacks an
+    action of the policy or cannot follow its scenario.
     """
     name = drive.vehicle
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
@@ -354,7 +326,6 @@ class _Replay:
     def __init__(self, drive: RecordedDrive, policy: Policy, limits: Limits) -> None:
         self._drive, self._policy, self._limits = drive, policy, limits
         self._restarts_s = deque(drive.runtime_starts_s[1:])
-        self._outside = drive.outside()
         self._controller = self._make_controller(next(iter(drive.exchanges.values())))
         self._last_heard_s = 0.0
         self._answers: Answers = {}
@@ -389,9 +360,7 @@ class _Replay:
         self._pass_time(exchange.finished_s)
         first, *later = exchange.answers
         self._controller.vehicle_fault = self._new_fault([first])
-        self._controller.link_quality = OUTSIDE if key_of(state) in self._outside else None
         self._note(self._controller.finish(output, 1, exchange.finished_s))
-        self._controller.link_quality = None
         self._controller.vehicle_fault = self._new_fault(later)
         if self._controller.vehicle_fault:
             self._note(self._controller.tick(exchange.finished_s))

@@ -12,6 +12,7 @@ import msgspec
 from edge_runtime.cli import Command, examples
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link_quality import link_words
 from edge_runtime.policy import infer, load_policy, probes
 from edge_runtime.service import peak_memory_mb, quantiles_ms
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
@@ -122,7 +123,7 @@ _ROWS: List[Tuple[str, Callable[[Dict[str, Any]], str]]] = [
     ("mode", lambda s: _mode(s)),
     ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),
     ("vehicle fault", lambda s: s.get("vehicle_fault") or "none"),
-    ("link", lambda s: link_words(s.get("link", {}), s.get("envelope", {}))),
+    ("link", lambda s: link_words(s.get("link", {}))),
     ("rejected", lambda s: _counts(s["rejected"])),
     ("safe stops", lambda s: str(s["safe_stops"])),
     ("deadline misses", lambda s: str(s["deadline_misses"])),
@@ -148,15 +149,6 @@ def _mode(status: Dict[str, Any]) -> str:
     reason = f", because of {status['reason']}" if status["reason"] else ""
     rearm = "; waits for `rearm`" if status["needs_rearm"] else ""
     return f"{status['mode']}{reason}{rearm}"
-
-
-def link_words(link: Dict[str, float], limits: Dict[str, float]) -> str:
-    """The live link beside the policy's envelope; the delay each way can be off by its error."""
-    if not (link and limits):
-        return "not known yet" if limits else "the policy has no envelope"
-    axes = (f"{name} {link[name]:.3g} of {limit:g}" for name, limit in limits.items())
-    ways = "delay {up_ms:.1f} ms up, {down_ms:.1f} down, +-{error_ms:.1f}".format(**link)
-    return f"at {link['load']:.2f} of the envelope: {', '.join(axes)}; {ways}"
 
 
 def _counts(counts: Dict[str, int]) -> str:

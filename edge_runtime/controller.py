@@ -19,7 +19,6 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, State, is_foreign
 
 if TYPE_CHECKING:
-    from edge_runtime.link_quality import LinkQuality
     from edge_runtime.manifest import Action
     from edge_runtime.ride import Ride
 
@@ -151,14 +150,12 @@ class Controller:
         armed_at_start: bool = True,
         task: str = "",
         ride: Optional[Ride] = None,
-        link_quality: Optional[LinkQuality] = None,
     ) -> None:
         self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
         self._ride = ride
         self._freshness = Freshness(self.safety.answer_s)
         self._lag_s = 0.0  # of the newest state
         self._fresh_before_s: Optional[float] = None  # `last_fresh_s` before the newest state
-        self.link_quality = link_quality  # of a policy with an envelope; the shell feeds it
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._policy_is_dead = False
@@ -300,8 +297,6 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             arrives = "only late" if self._is_late else "no fresh"
             return f"{arrives} states arrive; re-arm when the link is back"
-        if self.link_quality is not None and (refusal := self.link_quality.refusal()):
-            return refusal
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)
         return ""
@@ -325,8 +320,6 @@ class Controller:
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
-        if self.link_quality is not None and self.link_quality.outside:
-            return Event.OUTSIDE
         if self._is_late:  # the end of the episode ends the drive, however late it is
             return Event.FINAL if final and self.safety.mode is Mode.DRIVE else Event.LATE
         return rules.classify_fresh(self.safety, final, self._needs_rearm)

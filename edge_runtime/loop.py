@@ -24,6 +24,7 @@ from edge_runtime import log, wire
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
+from edge_runtime.link_quality import LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
@@ -59,7 +60,7 @@ class ControlLoop:
         self._policy, self._controller, self._link = policy, controller, link
         self._vehicle, self._notifier = vehicle, notifier
         self._hold, self._rearm_command = hold, rearm_command
-        self._link_quality = controller.link_quality
+        self._link_quality, self._is_poor = LinkQuality(), False
         self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
         self._board = BoardWatch()
         self._logged_rejection_s: Dict[str, float] = {}  # by reason
@@ -99,7 +100,9 @@ class ControlLoop:
                 self._look_at_vehicle(now_s)
                 self._send(self._controller.tick(now_s))
                 if now_s >= next_health_s:
-                    self._link.send("health", self.health())
+                    health = self.health()
+                    self._link.send("health", health)
+                    self._log_link(health.link)
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
                 if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
                     self._notifier.tell("WATCHDOG=1")
@@ -150,7 +153,7 @@ class ControlLoop:
                 rivals=self._link.rivals,
                 vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
-                **(self._link_quality.health() if self._link_quality else {}),
+                link=self._link_quality.measured(),
             )
 
     def _on_state(self, payload: bytes) -> None:
@@ -162,7 +165,7 @@ class ControlLoop:
                 self._log_rejection(self._latest.reject(state), arrived_s)
                 return
             rejection = self._latest.offer(state, arrived_s)
-            if self._link_quality and (not rejection or rejection.reason is Reason.STALE):
+            if rejection is None or rejection.reason is Reason.STALE:
                 self._link_quality.note_state(state, arrived_ns, is_new=rejection is None)
             if rejection is not None:
                 self._log_rejection(rejection, arrived_s)
@@ -207,8 +210,6 @@ class ControlLoop:
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s
                     self._commands_ns.append(int(took_s * 1e9))
-                if self._link_quality:  # Now: no command waits for it.
-                    self._link_quality.judge()
 
     def _infer(self, state: State) -> Tuple[Optional[np.ndarray], int]:
         if wire.is_foreign(state, self._layout.task_text):
@@ -266,8 +267,7 @@ class ControlLoop:
         command = order.command(self._policy.policy_id, time.time_ns())
         if not order.ridden:
             self._link.send("command", command)
-            if self._link_quality:
-                self._link_quality.note_command(command.episode, command.sent_ns)
+            self._link_quality.note_command(command.episode, command.sent_ns)
         if self._vehicle is not None:
             # The end of an episode is no fault; and a stop that is repeated between the re-arm
             # and the first fresh state must not take back what the re-arm has given.
@@ -286,6 +286,11 @@ class ControlLoop:
         if waits and not self._logged_wait:
             log.event("warning", "waits_for_rearm", command=self._rearm_command)
         self._logged_wait = waits
+
+    def _log_link(self, link: Dict[str, float]) -> None:
+        if (poor := is_poor(link, self._period_s, self._is_poor)) is not self._is_poor:
+            self._is_poor = poor
+            log.event("warning" if poor else "info", "link", poor=poor, measured=link_words(link))
 
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
         """The first of each reason, then one a second: all are counted in the health message."""

@@ -107,13 +107,12 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 class Manifest(Task, frozen=True, kw_only=True):
     """All of it. `training` holds what is known of it: seed, episodes, config, source revision.
 
-    `created` is ISO 8601 in UTC, `envelope` as in link_quality.py. Other fields are not looked at.
+    `created` is ISO 8601 in UTC. Other fields are not looked at.
     """
 
     algorithm: str
     training: Dict[str, Any]
     created: str
-    envelope: Optional[Dict[str, Any]] = None
     schema: int = MANIFEST_SCHEMA
 
 
@@ -129,10 +128,6 @@ def decode_manifest(text: str) -> Manifest:
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise UserError(f"the manifest in the policy file is not valid: {error}") from None
     check_task(manifest)
-    if manifest.envelope is not None:
-        from edge_runtime.link_quality import read_envelope  # Here: most have none.
-
-        read_envelope(manifest.envelope, manifest)
     return manifest
 
 

@@ -19,6 +19,7 @@ from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.link import Link, require_free, taken, wait_for_router
+from edge_runtime.link_quality import link_words
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.transport import is_tls, open_session
@@ -179,19 +180,15 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             vehicle.control_period_s = period_s
             name, its_limits = vehicle.name, vehicle.limits
         limits = shared_limits(policy.manifest.action, its_limits)
-        ride, quality = None, None
+        ride = None
         # On hold its vehicle must get nothing, and nobody sees what follows when the hold ends.
         armed = config.armed_at_start and config.hold is None
         if config.ride_through.max_s:
             from edge_runtime.ride import Ride
 
             ride = Ride(config.ride_through.max_s, period_s, limits, plays=vehicle is not None)
-        if policy.manifest.envelope is not None:
-            from edge_runtime.link_quality import LinkQuality
-
-            quality, armed = LinkQuality(policy.manifest), False  # nobody knows the link yet
         task, needs_rearm = policy.layout.task_text, vehicle is not None
-        controller = Controller(limits, period_s, needs_rearm, armed, task, ride, quality)
+        controller = Controller(limits, period_s, needs_rearm, armed, task, ride)
         hold: Optional[Hold] = None
         if config.hold is not None:
             from edge_runtime.files import Hold
@@ -271,6 +268,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             deadline_misses=health.deadline_misses,
             safe_stops=health.safe_stops,
             uptime_s=round(health.uptime_s, 1),
+            link=link_words(health.link),
         )
     if failures:
         raise failures[0]

@@ -43,7 +43,6 @@ class Event(str, Enum):
     OTHER_TASK = "other_task"  # the state is of another task than the policy
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
-    OUTSIDE = "outside_envelope"  # the link is where the policy was never shown to be safe
     REARM = "rearm"  # an operator allows driving again
 
 
@@ -65,7 +64,6 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
     Event.OTHER_TASK: (_X, _X, _X),
     Event.NOT_ARMED: (_X, _X, _X),
     Event.VEHICLE: (_X, _X, _X),
-    Event.OUTSIDE: (_X, _X, _X),
     Event.REARM: (_S, _D, _X),  # a fresh state must follow
 }
 TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {

@@ -160,7 +160,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
     `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
-    a re-arm; empty if nothing. `link` and `envelope` are `LinkQuality.health`, or empty.
+    a re-arm; empty if nothing. `link` is `LinkQuality.measured`.
     """
 
     vehicle_id: str
@@ -184,7 +184,6 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     rivals: int = 0
     vehicle_fault: str = ""
     link: Dict[str, float] = msgspec.field(default_factory=dict)
-    envelope: Dict[str, float] = msgspec.field(default_factory=dict)
     schema: int = SCHEMA
 
 

@@ -7,7 +7,6 @@ import argparse
 from typing import Any
 
 from bridge.fork import add_place
-from bridge.policy_file import add_envelope
 from bridge.rerun import add_sink
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
@@ -175,7 +174,6 @@ def export(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser, "what the run was trained in")
     parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
     parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
-    add_envelope(parser)
 
 
 @command(

@@ -33,7 +33,7 @@ PARITY_TOLERANCE = 1e-5
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, check, sign; returns the exit status."""
-    names = ("out", "scenario", "key", "envelope")
+    names = ("out", "scenario", "key")
     made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
     signed = "signed" if arguments.key else "not signed"
     size = f"{len(made.model) / 1e6:.1f} MB"
@@ -48,13 +48,11 @@ def export(
     *,
     scenario: str | None = None,
     key: str | PathLike[str] | None = None,
-    envelope: str | PathLike[str] | None = None,
 ) -> Export:
     """Write a run's actor as a policy file, as ``python -m trainer export`` does.
 
     ``run`` is what ``train`` gave, or its directory; ``scenario`` what it was trained in, to be
-    named where that is of a module; ``key`` the private key (PEM) that signs; ``envelope`` the JSON
-    of ``hil_tests envelope`` for the same network.
+    named where that is of a module; ``key`` the private key (PEM) that signs.
 
     Raises UserError: no run there, a wrong name or key, or a file that would do something else.
     """
@@ -67,13 +65,12 @@ def export(
     check_writable(file)
     if key_file:
         read_signing_key(key_file)
-    measured = envelope and read_json(Path(envelope), "envelope")
     config = read_json(run / CONFIG_FILE, "run config")
     named = str(config.get("scenario"))
     scenario = scenario or name_in_file(named, f"{run} was trained in", "--scenario")
     with closing(make_environment(scenario, period_s=period_of(config))) as env:
         actor, label = load_actor(run, env)
-        made = export_policy(actor, label, config, measured, env)
+        made = export_policy(actor, label, config, env)
     write_policy(made.model, file, key_file)
     return made
 
@@ -88,17 +85,12 @@ class Export:
 
 
 def export_policy(
-    actor: Actor,
-    label: dict[str, Any],
-    training: dict[str, Any],
-    envelope: Any = None,
-    env: Any = None,
+    actor: Actor, label: dict[str, Any], training: dict[str, Any], env: Any = None
 ) -> Export:
     """Convert, describe, check and compare.
 
     ``label`` has ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run; the manifest
-    gets its whole config (``training``) and the networks in which it may drive (``envelope``).
-    ``env`` is that scenario, by default a new one.
+    gets its whole config (``training``). ``env`` is that scenario, by default a new one.
 
     Raises UserError: the file would not do what the network does.
     """
@@ -114,7 +106,7 @@ def export_policy(
         "source_revision": training.get("source_revision", "unknown"),
     }
     graph = _to_onnx(network, entries)
-    model = make_policy(graph, task, label["algorithm"], about, envelope)
+    model = make_policy(graph, task, label["algorithm"], about)
     difference = parity(network, model, entries)
     allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
     if not difference < allowed:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -36,7 +35,7 @@ from bridge.rerun.draw import Plot
 from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
-from edge_runtime.commands import link_words
+from edge_runtime.link_quality import link_words
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, counted
@@ -142,7 +141,7 @@ PLOTS = (
     Plot("action", "Command: asked and achieved"),
     Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     Plot("latency", "Latency, ms: round trip, and its parts"),
-    Plot("link", "Link: parts of the policy's envelope, whose edge is 1 (where it has one)"),
+    Plot("link", "Link each way: mean delay and jitter, ms; loss, %"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )
 SERIES = {
@@ -154,7 +153,12 @@ SERIES = {
     "latency/inference": draw.GREEN,
     "latency/downlink": draw.PURPLE,
     "latency/round_trip": draw.ORANGE,
-    "link/load": draw.RED,
+    "link/up_ms": draw.BLUE,
+    "link/down_ms": draw.PURPLE,
+    "link/up_jitter_ms": draw.GREEN,
+    "link/down_jitter_ms": draw.GREY,
+    "link/up_lost_percent": draw.ORANGE,
+    "link/down_lost_percent": draw.RED,
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
 
@@ -296,19 +300,15 @@ class WireLog:
 
     def write_health(self, health: Health, _arrived_ns: int) -> None:
         """Refresh the status text, and note what the edge runtime has newly rejected."""
-        needed = {"load", "up_ms", "down_ms", "error_ms", *health.envelope}
-        if not (needed <= health.link.keys() and all(health.envelope.values())):
-            health = msgspec.structs.replace(health, link={})  # None, or a stranger's
         before = self._health.rejected if self._health else {}
         for reason, count in health.rejected.items():
             new = count - before.get(reason, 0)
             if new > 0:
                 self._event(f"edge rejected {new} states: {reason}", rr.TextLogLevel.WARN)
         self._rejections("edge", health.rejected)
-        for name, limit in health.envelope.items() if health.link else ():
-            self._scalar(f"link/{name}", health.link[name] / limit)
-        if health.link:
-            self._scalar("link/load", health.link["load"])
+        for name, value in health.link.items():
+            if (path := f"link/{name}") in SERIES:
+                self._scalar(path, value)
         self._health = health
         self._write_status()
 
@@ -430,8 +430,7 @@ class WireLog:
                 f"states accepted {health.accepted}, rejected: {counts or 'none'}",
                 f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
             ]
-            if health.envelope:
-                lines.append(f"link: {link_words(health.link, health.envelope)}")
+            lines.append(f"link: {link_words(health.link)}")
             if {"p50", "p99"} <= set(health.inference_ms):
                 times = "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms"
                 lines.append(times.format(**health.inference_ms))

@@ -1,9 +1,5 @@
 """``python -m deploy policy``: any ONNX model becomes a policy file, or says why it cannot."""
 
-import hashlib
-import json
-from typing import Any
-
 import numpy as np
 import onnx
 import onnx.parser
@@ -12,7 +8,6 @@ from onnx import helper, numpy_helper
 
 from deploy.__main__ import main
 from deploy.certs import write_key_pair
-from edge_runtime.link_quality import ACCURACY, LinkQuality
 from edge_runtime.policy import VERIFIED, load_policy
 from edge_runtime.tests.harness import exit_status
 
@@ -95,43 +90,3 @@ def test_an_environment_that_does_not_fit_is_one_line(tmp_path, capsys, env, mat
     status, _ = policy(tmp_path, *STOP, "--set", "action.1.stop=0", env=env)
     assert status == 2
     assert match in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_an_envelope_goes_into_the_policy_that_it_was_measured_with(tmp_path, capsys):
-    """The file that was measured, or another with the same graph: no other one."""
-    write_model(tmp_path / "model.onnx", f"{PENDULUM} {{ {TORQUE} }}")
-    _, out = policy(tmp_path, *STOP)
-    measured, file = load_policy(out, allow_unsigned=True), tmp_path / "envelope.json"
-    graph = onnx.load(str(out)).graph.SerializeToString(deterministic=True)
-    limits = dict.fromkeys(ACCURACY, 7.0)
-    known = {
-        "policy_id": measured.policy_id, "env": "Pendulum-v1", "condition": "nominal",
-        "promised_success": 0.95, "confidence": 0.95, "limits": limits, "joint": 1.0, "tried": [],
-        "control_period_s": measured.manifest.control_period_s,
-    }  # fmt: skip
-    write_key_pair(tmp_path / "keys")
-    named = {**known, "policy_id": "another", "network": hashlib.sha256(graph).hexdigest()}
-    key = ("--key", str(tmp_path / "keys" / "policy.key"))
-    for content, model in ((named, "model.onnx"), (known, "measured.onnx")):
-        out.rename(tmp_path / "measured.onnx")
-        (tmp_path / "model.onnx").write_bytes((tmp_path / model).read_bytes())
-        file.write_text(json.dumps(content))
-        assert policy(tmp_path, *STOP, *key, "--envelope", str(file))[0] == 0
-        made = load_policy(out, tmp_path / "keys" / "policy.pub")
-        assert LinkQuality(made.manifest).limits == limits
-        assert (made.trust, made.policy_id != measured.policy_id) == (VERIFIED, True)
-        if model == "model.onnx":
-            (tmp_path / "measured.onnx").replace(out)
-    wrong: Any = (
-        ({**named, "network": "0"}, "the envelope was measured with another network"),
-        ({**named, "joint": None}, "the envelope is not valid: Expected `float`"),
-        ([], "holds no JSON object"),
-        ("", "is not JSON"),
-    )
-    out.unlink()
-    capsys.readouterr()
-    for content, words in wrong:
-        file.write_text(json.dumps(content) if content != "" else "")
-        status, _ = policy(tmp_path, *STOP, "--envelope", str(file))
-        (line,) = capsys.readouterr().err.splitlines()
-        assert (status, words in line, out.exists()) == (2, True, False), line

@@ -236,7 +236,6 @@ def test_an_attached_vehicle_and_its_operator_are_the_recordings(hand):
 
 
 NOT_ARMED = {"mode": "safe_stop", "reason": "not_armed", "action": [-1.0]}
-OUTSIDE = {"mode": "safe_stop", "reason": "outside_envelope", "action": [-1.0]}
 
 
 def test_a_vehicle_that_was_not_armed_at_first_nor_after_a_restart_is_the_recordings(hand):
@@ -246,36 +245,6 @@ def test_a_vehicle_that_was_not_armed_at_first_nor_after_a_restart_is_the_record
     hand.hear(1.55, "health", health(ns(1.55), 0.3, vehicle="mock", needs_rearm=True))
     hand.drive(13, 20, **NOT_ARMED)
     assert is_the_same(hand, compared=19)
-
-
-@pytest.mark.parametrize("vehicle", ["none", "mock"])
-def test_a_link_that_left_the_envelope_is_the_recordings(hand, vehicle):
-    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle=vehicle, needs_rearm=False))
-    hand.drive(0, 5)
-    hand.drive(5, 12, **OUTSIDE)  # Three found it outside, four inside again.
-    hand.drive(12, 15)
-    hand.drive(15, 20, **OUTSIDE)
-    hand.drive(20, 22)
-    hand.drive(22, 25, **OUTSIDE)  # Until the end
-    assert is_the_same(hand, compared=25)
-
-
-@pytest.mark.parametrize("end", ["silence", "fault", "restart"])
-def test_a_short_while_outside_that_something_else_ends_is_the_recordings(hand, end):
-    vehicle = "mock" if end == "fault" else "none"
-    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle=vehicle, needs_rearm=False))
-    hand.drive(0, 5)
-    hand.drive(5, 8, **OUTSIDE)
-    if end == "silence":
-        hand.stop(7, 4)
-        hand.drive(8, 12, start_s=0.5, **SAFE_STOP)
-        hand.drive(12, 14, start_s=0.5)
-    elif end == "fault":
-        hand.drive(8, 10, **FAULT)
-    else:
-        hand.hear(0.79, "health", health(ns(0.79), 0.01, vehicle=vehicle, needs_rearm=False))
-        hand.drive(8, 12)
-    assert is_the_same(hand)
 
 
 def test_a_vehicle_that_is_not_installed_is_named_by_the_settings(hand, refusal):

@@ -37,6 +37,7 @@ from bridge.rerun.wire_view import Timeline, WireLog
 from bridge.tests import harness
 from bridge.tests.toy import ToyEnv
 from bridge.tests.viewers import NO_GPU, in_place, listens
+from edge_runtime.link_quality import FIELDS
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.harness import HEALTH, make_command, make_state, wait_until
 from edge_runtime.tests.policies import TASK
@@ -415,13 +416,13 @@ def test_rejections_are_counted_by_side_and_reason(log, kept, events):
     assert kept["speed/vehicle"] == [0.5]
 
 
-@pytest.mark.parametrize(
-    ("link", "envelope"),
-    [({"x": 1.0}, {"y": 1.0}), ({"y": 1.0}, {"y": 1.0}), ({"y": 1.0, "load": 1.0}, {"y": 0.0})],
-)
-def test_the_link_of_a_stranger_is_not_drawn(log, kept, link, envelope):
-    log.write_health(msgspec.structs.replace(HEALTH, link=link, envelope=envelope), 10**18)
-    assert not [path for path in kept if path.startswith("link/")]
+def test_the_link_is_drawn_where_its_numbers_are_known(log, kept):
+    link = {name: float(n) for n, name in enumerate(FIELDS)}
+    for known in ({}, {"load": 1.0, "up_ms": 7.0}, link):  # none, another version's, ours
+        log.write_health(msgspec.structs.replace(HEALTH, link=known), 10**18)
+    drawn = {f"link/{name}": [value] for name, value in link.items() if name != "error_ms"}
+    drawn["link/up_ms"] = [7.0, 0.0]
+    assert {path: kept[path] for path in kept if path.startswith("link/")} == drawn
 
 
 def test_no_part_of_a_recording_takes_a_whole_ones_place(tmp_path):

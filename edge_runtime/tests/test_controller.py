@@ -509,37 +509,3 @@ def test_held_up_states_do_not_feed_the_watchdog():
         assert order is None or order.mode == "safe_stop"
     assert due[:6] == ["drive"] * 5 + [SILENT]
     assert controller.waits_for_rearm
-
-
-class Quality:
-    """A link's judge that says what it is told to."""
-
-    outside, why = "", ""
-
-    def refusal(self):
-        return self.why
-
-
-def test_outside_the_envelope_it_stops_and_is_not_armed():
-    link = Quality()
-    controller = make(needs_rearm=True, link_quality=link)
-    play(controller, [FIRST])
-    link.outside = link.why = "too late"
-    play(controller, [*states(0.1, 3, "outside_envelope"), (0.35, "rearm", "too late")])
-    assert controller.waits_for_rearm
-    link.outside = ""
-    play(controller, [*states(0.4, 9, "outside_envelope"), (1.25, "rearm", "too late")])
-    link.why = ""
-    play(controller, [(1.3, "state", "outside_envelope"), (1.35, "rearm", "")])
-    play(controller, [*states(1.4, 1, "drive")])
-
-
-def test_without_a_vehicle_it_waits_outside_and_drives_on_inside():
-    link = Quality()
-    controller = make(link_quality=link)
-    play(controller, [FIRST])
-    link.outside = "too late"
-    play(controller, states(0.1, 20, "outside_envelope"))
-    link.outside = ""
-    play(controller, [*states(2.1, 4, "outside_envelope"), (2.5, "state", "drive")])
-    assert controller.safety.safe_stops == 1

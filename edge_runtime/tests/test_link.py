@@ -198,7 +198,6 @@ def test_the_session_is_closed_even_where_nothing_can_be_undeclared(session, lin
 
 def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatch):
     policy = MagicMock()
-    policy.manifest.envelope = None
     monkeypatch.setattr(run, "load_policy", lambda *_: policy)
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))

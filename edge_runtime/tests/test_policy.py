@@ -1,5 +1,6 @@
 """Which policies may drive; and no byte of one, nor of its signature, can change: all are tried."""
 
+import json
 import random
 import re
 import subprocess
@@ -7,6 +8,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import onnx
 import pytest
@@ -32,6 +34,7 @@ from edge_runtime.tests.policies import (
     write_policy,
     write_rover,
 )
+from edge_runtime.tests.rigs import a_manifest
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS, Reason
 
@@ -254,6 +257,12 @@ def refused_or_without_manifest(data: bytes) -> bool:
         return MANIFEST_KEY not in check_graph(data)
     except UserError:
         return True
+
+
+def test_the_envelope_that_an_earlier_manifest_may_hold_is_ignored():
+    manifest = a_manifest()
+    earlier = {**msgspec.to_builtins(manifest), "envelope": {"joint": "whatever"}}
+    assert decode_manifest(json.dumps(earlier)) == manifest
 
 
 def test_what_the_onnx_package_wrote_is_read_and_every_truncation_refused(written):

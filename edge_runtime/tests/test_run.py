@@ -6,6 +6,7 @@ import gc
 import itertools
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -27,7 +28,6 @@ from edge_runtime.tests.harness import (
     wait_until,
 )
 from edge_runtime.tests.policies import T
-from edge_runtime.tests.test_link_quality import ENVELOPE, LIMITS
 
 WHITE_FRAMES = {"observation": frames(WHITE)}
 
@@ -368,29 +368,27 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
     assert edge.end() == 0
 
 
-def test_a_vehicle_is_armed_inside_its_policys_envelope_only(edge_and_simulator):
+def test_a_poor_link_is_shown_and_logged_once_and_stops_nothing(edge_and_simulator):
     """The simulator claims how long commands take to it."""
-    changes = {"envelope": {**ENVELOPE, "limits": {**LIMITS, "jitter_ms": 1000.0}}}
-    _, simulator = edge_and_simulator("constant", "--vehicle", "mock", manifest_changes=changes)
+    flags = ("--vehicle", "mock", "--log-format", "json")
+    edge, simulator = edge_and_simulator("constant", *flags)
     steps = itertools.count()
     heard: dict[str, int] = {}
 
-    def drive_on(count, down_ms):
-        for number in range(count):
+    def drive_until(down_ms, holds):
+        def does_after_a_state():
             command = simulator.ask(make_state(next(steps), **heard))
-            took_ns = round(down_ms * 1e6)
+            assert command.mode == "drive"
             heard.update(heard=heard.get("heard", 0) + 1, heard_sent_ns=command.sent_ns)
-            heard["heard_ns"] = command.sent_ns + took_ns + number
-        return command
+            heard["heard_ns"] = command.sent_ns + round(down_ms * 1e6)
+            return (link := simulator.health[-1].link) and holds(link["up_ms"] + link["down_ms"])
 
-    assert drive_on(50, 20.0).reason == "not_armed"
-    assert "not known yet" in simulator.query("rearm")["detail"]
-    drive_on(200, 20.0)
-    status = simulator.query("status")
-    assert status["link"]["delay_ms"] == pytest.approx(10.0, abs=8.0)
-    assert status["envelope"]["delay_ms"] == LIMITS["delay_ms"]
-    assert f"delay_ms {status['link']['delay_ms']:.3g} of 100" in render_status(status)
-    assert simulator.query("rearm")["accepted"]
-    assert drive_on(5, 20.0).mode == "drive"
-    assert drive_on(300, 400.0).reason == "outside_envelope"
-    assert not simulator.query("rearm")["accepted"]
+        wait_until(does_after_a_state, "such a link")
+
+    drive_until(20.0, lambda both_ms: True)
+    assert re.search(r"\nlink +up \d+\.\d ms, jitter", render_status(simulator.query("status")))
+    drive_until(500.0, lambda both_ms: both_ms > 480.0)
+    drive_until(20.0, lambda both_ms: both_ms < 100.0)
+    assert edge.end() == 0
+    told = [row for row in map(json.loads, edge.errors.splitlines()) if row["event"] == "link"]
+    assert [(row["level"], row["poor"]) for row in told] == [("warning", True), ("info", False)]

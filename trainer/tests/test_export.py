@@ -5,9 +5,7 @@ import onnx
 import pytest
 import torch
 
-from bridge.policy_file import network_of_file
 from deploy.certs import write_key_pair
-from edge_runtime.link_quality import ACCURACY, LinkQuality
 from edge_runtime.policy import check_graph, load_policy
 from edge_runtime.util import UserError
 from trainer import policy_file as export_module
@@ -83,20 +81,6 @@ def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, t
     # An unsigned export removes the signature of an older file.
     write_policy(exported.model, path, None)
     assert not (tmp_path / "policy.onnx.sig").exists()
-
-
-def test_an_envelope_goes_into_the_export_of_the_network_that_it_was_measured_with(
-    exported, tmp_path
-):
-    path, limits = tmp_path / "policy.onnx", dict.fromkeys(ACCURACY, 7.0)
-    write_policy(exported.model, path, None)
-    envelope = {
-        "policy_id": "as it was measured", "env": "left_turn", "condition": "nominal",
-        "promised_success": 0.95, "confidence": 0.95, "limits": limits, "joint": 1.0,
-        "control_period_s": 0.1, "network": network_of_file(path),
-    }  # fmt: skip
-    write_policy(export_policy(make_actor(), LABEL, {}, envelope).model, path, None)
-    assert LinkQuality(load_policy(path, allow_unsigned=True).manifest).limits == limits
 
 
 def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
