@@ -75,7 +75,8 @@ class Freshness:
             if lag_s <= self._limit_s:
                 least_s = offset_s - lag_s
         elif stepped and is_known:
-            lag_s = abs(lag_s)  # no link gets so much better: where it is less, a clock was set
+            # Where it is less, a clock was set, or the link was slow before: all is late from now.
+            least_s, lag_s = offset_s - abs(lag_s), abs(lag_s)
         else:
             least_s, lag_s = min(least_s, offset_s), max(lag_s, 0.0)
         self._leasts[session] = _Least(arrived_s, least_s, least_trip_s)

@@ -108,6 +108,12 @@ def test_commands_that_are_late_in_a_stop_do_not_make_a_state_late():
     assert lags(*states, trips={**trips, 2: 0.7}, stands=stands) == near(0, 0, 0.65 - LIMIT_S, 0)
 
 
+def test_after_a_quicker_state_those_as_slow_as_before_are_late_until_a_stop():
+    states = [(T * n, T * n + delay_s) for n, delay_s in enumerate([3.0, 3.0, 0.5, 3.0, 3.0, 0.5])]
+    trips = {0: 3.05, 1: 3.05, 2: 0.55, 4: 3.05, 5: 0.55}
+    assert lags(*states, trips=trips, stands={4, 5}) == near(0, 0, 2.5, 5.0, 2.5, 0)
+
+
 def answered(controller, step, now_s, lag_s=0.0, output=GOOD):
     state = make_state(step, sent_ns=round((now_s - lag_s + DECADES_S) * 1e9))
     controller.begin(Received(state, now_s, 0), now_s)
