@@ -40,8 +40,8 @@ def loaded_by(what: str) -> List[Path]:
     ("what", "most_lines"),
     [
         ("import edge_runtime", 30),
-        ("import edge_runtime.run", 3400),
-        ("import edge_runtime.__main__, edge_runtime.run", 3750),
+        ("import edge_runtime.run", 3500),
+        ("import edge_runtime.__main__, edge_runtime.run", 3850),
     ],
 )
 def test_run_without_a_vehicle_loads_no_more_than_it_needs(what, most_lines):
