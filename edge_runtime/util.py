@@ -45,8 +45,8 @@ def name_in_file(name: str, said: str, option: str) -> str:
     UserError for `module:thing`, which a person must type after `option`.
     """
     if ":" in name:
-        rule = f"no file decides on what is of a module: give {option} {shlex.quote(name)}"
-        raise UserError(f"{said} {name}, a module's: {rule}")
+        rule = f"a module is imported only when it is typed: give {option} {shlex.quote(name)}"
+        raise UserError(f"{said} {name}: {rule}")
     return name
 
 

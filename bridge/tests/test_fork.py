@@ -210,7 +210,7 @@ def of_a_module(topic, message):
         (an_action, "at step 6 (0.6 s) the "),
         (without_a_scene, "is recorded without a gap for 0.8 s"),
         (without_origins, "does not say how its drives were begun"),
-        (of_a_module, f"was driven in {TOY}, a module's"),
+        (of_a_module, f"was driven in {TOY}: a module is imported only"),
     ],
 )
 def test_a_recording_that_cannot_be_rebuilt_gets_one_line(tmp_path, refusal, change, said):

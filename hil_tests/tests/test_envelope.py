@@ -197,8 +197,8 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(monkeypa
         ({"edges": {"delay_ms": {"inside": "none"}}}, "missing required field `outside`"),
         ({"edges": {"delay_ms": {"inside": "none", "outside": "x"}}}, "'x' is not understood"),
         ({"condition": "windy"}, "no condition 'windy'"),
-        ({"env": "planted:Env-v0"}, "of a module: give --env planted:Env-v0"),
-        ({"policy": "planted:Expert"}, "of a module: give --policy planted:Expert"),
+        ({"env": "planted:Env-v0"}, "is typed: give --env planted:Env-v0"),
+        ({"policy": "planted:Expert"}, "is typed: give --policy planted:Expert"),
         ({"promised_success": "most"}, "`float`, got `str` - at `$.promised_success`"),
     ],
 )
