@@ -35,7 +35,7 @@ from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene, decode
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.record import RecordingWriter, new_recording
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.recording import Recording, choose_vehicle, heard_of, say_missing
 from bridge.replay import controller_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
@@ -157,7 +157,7 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
     """
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
-    recording.say_trouble()
+    say_missing(recording, vehicle_id)
     begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
     for heard, message in _messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:

@@ -24,6 +24,7 @@ import numpy as np
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
+from bridge.recording import say_missing
 from bridge.replay import Answer, RecordedDrive, key_of, without_repetitions
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
@@ -78,7 +79,7 @@ def run(arguments: Any) -> int:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     left_out = sum(not state.final for state in drive.states()) - frames
-    drive.recording.say_trouble()
+    say_missing(drive.recording, drive.vehicle_id)
     missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
     print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
     return 0

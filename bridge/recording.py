@@ -25,8 +25,9 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from bridge.messages import Heard
+from bridge.messages import DECODERS, Heard, decode
 from edge_runtime.util import UserError, counted, open_regular
+from edge_runtime.wire import Rejection
 
 WIRE_ENCODING = "msgpack"
 METADATA = "phil"
@@ -148,9 +149,13 @@ class Recording:
             reader = StreamReader(stream, True, True, record_size_limit=MAX_RECORD_BYTES)
             try:
                 for record in reader.records:
-                    parts = _parts(record, stream.tell() - at)
+                    end = stream.tell()
+                    stream.seek(at + 1)
+                    said = 9 + int.from_bytes(stream.read(8), "little")
+                    stream.seek(end)
+                    parts = _parts(record, end - at, said)
                     self._spend(RECORD_BYTES * len(parts))
-                    at = stream.tell()
+                    at = end
                     yield from parts
                     if isinstance(record, Footer):
                         self.cut_off = False
@@ -178,11 +183,15 @@ class Recording:
             )
 
 
-def _parts(record: McapRecord, size: int) -> list[McapRecord]:
-    """A record that took ``size`` bytes, a chunk as what it holds; one of TORN: it is not whole."""
+def _parts(record: McapRecord, size: int, said: int) -> list[McapRecord]:
+    """A record that took ``size`` bytes and is ``said`` to have so many, a chunk as what it holds.
+
+    Raises one of TORN: it is not whole.
+    """
     builder = RecordBuilder()
     record.write(builder)
-    if builder.count != size:  # The library reads on over lengths that do not fit, or skips some.
+    # The library reads on over lengths that do not fit, or skips some.
+    if not builder.count == size == said:
         raise ValueError("a record of another length than it says")
     if not isinstance(record, Chunk):
         return [] if isinstance(record, Message) else [record]  # No checksum is over that one.
@@ -226,6 +235,16 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
         if vehicle == vehicle_id:
             message, key = stored.message, stored.channel.topic
             yield Heard(key, topic, message.data, message.log_time, len(message.data))
+
+
+def say_missing(recording: Recording, vehicle_id: str) -> None:
+    """Say on stderr what cannot be read, and how many messages of the vehicle nobody can use."""
+    wire = (heard for heard in heard_of(recording, vehicle_id) if heard.topic in DECODERS)
+    invalid = sum(isinstance(decode(heard), Rejection) for heard in wire)
+    recording.say_trouble()
+    if invalid:
+        messages = counted(invalid, "message")
+        print(f"{recording.path}: left out: {messages} not valid", file=sys.stderr, flush=True)
 
 
 def _wire_topic(stored: Stored) -> tuple[str, str]:

@@ -22,7 +22,7 @@ import msgspec
 from bridge.messages import Heard, decode, period_of
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.recording import Recording, choose_vehicle, heard_of, say_missing
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import Controller, Limits, Order, Received, shared_limits
@@ -105,7 +105,7 @@ def run(arguments: Any) -> int:
     if report["compared"] == 0:
         raise UserError(f"{arguments.recording} holds answers, but none of the states they answer")
     write_json_out(arguments.out, report)
-    recording.say_trouble()
+    say_missing(recording, drive.vehicle_id)
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
@@ -303,7 +303,7 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
         name = config.vehicle  # A module:Class, of which the recording has the class's name
     elif name not in (NONE, *BUILT_IN):
-        option = "--config FILE.toml with [vehicle] driver ="
+        option = "--config FILE.toml whose table [vehicle] has as its driver"
         name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
     try:
         limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)

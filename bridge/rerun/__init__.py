@@ -280,7 +280,8 @@ def _page_ports(port: int | None) -> tuple[int, int]:
         except UserError:
             if port is not None:
                 raise UserError(f"port {each} is in use; name another --port") from None
-            return free_port(), free_port()  # Another view has the usual ones.
+            first = free_port()  # Another view has the usual ones.
+            return first, next(port for port in iter(free_port, None) if port != first)
     return ports
 
 

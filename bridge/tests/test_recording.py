@@ -461,6 +461,22 @@ def test_bytes_overwritten_at_any_place_make_no_message_and_take_one_chunk_at_mo
             assert found == whole or recording.is_damaged, at
 
 
+def test_no_flipped_bit_of_a_records_own_header_loses_anything_unsaid(small):
+    """Of a chunk's header, too: where its records end, the library believes the header."""
+    data, path, whole = small.read_bytes(), small.with_name("flipped.mcap"), told_in(small)
+    at = len(MCAP0_MAGIC)
+    while at < len(data) - len(MCAP0_MAGIC):
+        length = int.from_bytes(data[at + 1 : at + 9], "little")
+        for bit in range(8 * min(60, 9 + length)):
+            flipped = bytearray(data)
+            flipped[at + bit // 8] ^= 1 << bit % 8
+            path.write_bytes(flipped)
+            recording = Recording(path)
+            found = list(map(told, recording.messages()))
+            assert found == whole or recording.trouble(), (at, bit)
+        at += 9 + length
+
+
 def test_black_pictures_are_no_bomb(tmp_path):
     with writing(tmp_path / "black.mcap") as writer:
         state = encode(make_state(0, observation={"rgb": bytes(480 * 640 * 3)}))

@@ -432,7 +432,9 @@ def test_numbers_near_zero_are_taken_for_zero(plain):
             for policy in policies:
                 print(policy.act({{"frames": np.ones({SHAPE}, np.uint8)}}).tolist())
         act()
-        threading.Thread(target=act).start()
+        other = threading.Thread(target=act)
+        other.start()
+        other.join()
         print(np.float32(1e-20) * np.float32(1e-20) > 0.0)  # elsewhere nothing is changed"""
     done = subprocess.run([sys.executable, "-c", act], capture_output=True, text=True, check=True)
     assert sorted(done.stdout.split("\n")) == ["", "True", *["[0.0]"] * 4]

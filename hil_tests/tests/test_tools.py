@@ -240,7 +240,6 @@ MISTAKES = {
         "--minutes 0": "--minutes",
         "--runs none": "--runs",
     },
-    "pictures": {"x.png": "no picture 'x.png'", "--out /dev/null": "Not a directory"},
     "conformance": {"": "name it with --vehicle", "--vehicle tank": "'tank' is not"},
     "envelope --out {tmp}/r.json": {"--promise 0.4": "--promise", "--confidence 0.1": "--conf"},
     "doctor": {"--only wheels": "choose from basics, training"},

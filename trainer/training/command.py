@@ -350,7 +350,8 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
     changed = []
     for name in wanted:
         if name not in EXTENT and (name not in saved or saved[name] != wanted[name]):
-            option = f"--{name} " if name in OPTIONS else f"--set {name}="
+            option = "--period " if name == "period_s" else f"--set {name}="
+            option = f"--{name} " if name in OPTIONS else option
             before = f"{option}{_typed(name, saved)}" if name in saved else f"no {name}"
             changed.append(f"{before} (now {_typed(name, wanted)})")
     if changed:
@@ -377,4 +378,6 @@ def _flat(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _typed(name: str, values: dict[str, Any]) -> str:
+    if name == "period_s" and not values[name]:
+        return "left away"
     return "|".join(HUMANS) if (name, values[name]) == ("human", PERSON) else str(values[name])
