@@ -158,8 +158,8 @@ SLOWED_S = 0.5
 STARVED_S = 2.0
 SETTLED_S = 0.5
 """So long the drive is steady first: a vehicle may lag behind what it was asked before."""
-FULL_AT_BYTES = 60_000
-"""The recorder writes about 1 kB for each state: the picture of noise compresses badly."""
+FULL_AT_BYTES = 200_000
+"""Several of the recorder's chunks: noise compresses badly, and its copies for viewers are text."""
 RECORDED_S = 2.5
 MOST_LOST_S = 1.0
 _CANNOT_WRITE = 1  # Exit status of a recorder that cannot write
