@@ -280,8 +280,10 @@ def _page_ports(port: int | None) -> tuple[int, int]:
         except UserError:
             if port is not None:
                 raise UserError(f"port {each} is in use; name another --port") from None
-            first = free_port()  # Another view has the usual ones.
-            return first, next(port for port in iter(free_port, None) if port != first)
+            first = second = free_port()  # Another view has the usual ones.
+            while second == first:
+                second = free_port()
+            return first, second
     return ports
 
 

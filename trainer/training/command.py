@@ -350,9 +350,7 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
     changed = []
     for name in wanted:
         if name not in EXTENT and (name not in saved or saved[name] != wanted[name]):
-            option = "--period " if name == "period_s" else f"--set {name}="
-            option = f"--{name} " if name in OPTIONS else option
-            before = f"{option}{_typed(name, saved)}" if name in saved else f"no {name}"
+            before = _option(name, saved) if name in saved else f"no {name}"
             changed.append(f"{before} (now {_typed(name, wanted)})")
     if changed:
         raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
@@ -377,7 +375,12 @@ def _flat(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name != "learner"} | learner
 
 
+def _option(name: str, values: dict[str, Any]) -> str:
+    """The option with its value, as it was typed."""
+    if name == "period_s":  # 0: what the environment says
+        return f"--period {values[name]}" if values[name] else "no --period"
+    return (f"--{name} " if name in OPTIONS else f"--set {name}=") + _typed(name, values)
+
+
 def _typed(name: str, values: dict[str, Any]) -> str:
-    if name == "period_s" and not values[name]:
-        return "left away"
     return "|".join(HUMANS) if (name, values[name]) == ("human", PERSON) else str(values[name])
