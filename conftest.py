@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 discover = Distribution.discover
+pytest.register_assert_rewrite("hil_tests.testing")
 
 
 @pytest.fixture(autouse=True)

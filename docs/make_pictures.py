@@ -156,7 +156,7 @@ PICTURES: dict[str, Make] = {
     "policy_sees.png": policy_sees,
     # In the middle of a take-over; needs Chromium.
     "cockpit.png": lambda out, _work: run_command(
-        "trainer.person.tests.browser", "--picture", str(out)
+        "hil_tests.testing.browser", "--picture", str(out)
     ),
     "success_against_latency.png": success_against_latency,
     "rerun.png": rerun_loop,

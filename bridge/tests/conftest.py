@@ -2,7 +2,7 @@
 
 import pytest
 
-from bridge.tests.harness import bridge_status
+from hil_tests.testing.drives import bridge_status
 
 
 @pytest.fixture

@@ -12,7 +12,11 @@ from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
 from bridge.report import SafeStopLog
-from bridge.tests.harness import (
+from bridge.virtual_link import NO_COMMAND
+from edge_runtime.reach import free_endpoint
+from edge_runtime.util import UserError
+from edge_runtime.wire import encode
+from hil_tests.testing.drives import (
     SLOW_TOY,
     decoded,
     make_feedback,
@@ -22,12 +26,8 @@ from bridge.tests.harness import (
     start_simulate,
     wait_until_driving_steadily,
 )
-from bridge.virtual_link import NO_COMMAND
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import PATIENCE_S, make_command, make_state, wait_until
-from edge_runtime.tests.policies import TASK, T
-from edge_runtime.util import UserError
-from edge_runtime.wire import encode
+from hil_tests.testing.edge import PATIENCE_S, make_command, make_state, wait_until
+from hil_tests.testing.policies import TASK, T
 
 
 def test_what_an_action_raises_reaches_the_caller():

@@ -5,8 +5,8 @@ import shlex
 import pytest
 
 from bridge.ports import open_port
-from bridge.tests.harness import LEFT_TURN, TOY
 from edge_runtime.reach import free_endpoint
+from hil_tests.testing.drives import LEFT_TURN, TOY
 
 ROWS = [
     ("simulate --env phil/Nowhere-v0", "Nowhere"),

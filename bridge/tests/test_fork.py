@@ -20,7 +20,7 @@ import pytest
 from bridge.environments import describe, make_environment
 from bridge.policy_file import make_policy as make_any_policy
 from bridge.recording import Recording, choose_vehicle, heard_of
-from bridge.tests.harness import (
+from hil_tests.testing.drives import (
     LEFT_TURN,
     TOY,
     bridge_status,
@@ -34,7 +34,7 @@ from bridge.tests.harness import (
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"
-PARKING = "bridge.tests.toy:BridgeParking-v0"
+PARKING = "hil_tests.testing.environments:BridgeParking-v0"
 TWO = ("--episodes", "2")
 NETWORK = "60ms+-40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
 GRAPH = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation)

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from bridge import inbound
 from bridge.episode import Actuators, vehicle_action
 from bridge.report import SafeStopLog
-from bridge.tests.harness import make_feedback
-from bridge.tests.toy import ToyEnv
 from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.manifest import Action
-from edge_runtime.tests.harness import HEALTH, make_command
-from edge_runtime.tests.policies import STEERING, TASK, T
 from edge_runtime.wire import encode
+from hil_tests.testing.drives import make_feedback
+from hil_tests.testing.edge import HEALTH, make_command
+from hil_tests.testing.environments import ToyEnv
+from hil_tests.testing.policies import STEERING, TASK, T
 
 
 def checking(task=TASK):

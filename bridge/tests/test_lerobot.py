@@ -17,13 +17,13 @@ from bridge import lerobot
 from bridge.messages import Scene, encode_scene
 from bridge.record import RawImage
 from bridge.rerun import free_port
-from bridge.tests import harness
 from bridge.tests.test_recording import heard
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import make_command, make_state
-from edge_runtime.tests.policies import TASK
 from edge_runtime.wire import encode
+from hil_tests.testing import drives
+from hil_tests.testing.edge import make_command, make_state
+from hil_tests.testing.policies import TASK
 
 SEEN = {
     "a": Entry(dtype="uint8", shape=[6, 8, 3]),
@@ -39,7 +39,7 @@ FILE = "chunk-000/file-000"
 
 
 def recorded(path, task):
-    with harness.writing(path) as writer:
+    with drives.writing(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for (episode, step), mode in STEPS.items():
@@ -64,7 +64,7 @@ def export(path, out):
 
 def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
     out = tmp_path / "sets" / "a"
-    assert harness.bridge_status(export(recorded(tmp_path / "a.mcap", ROVER), out)) == 0
+    assert drives.bridge_status(export(recorded(tmp_path / "a.mcap", ROVER), out)) == 0
     assert capsys.readouterr().out.endswith("5 frames; left out: 1 state without a fit answer\n")
     rows = parquet.read_table(out / f"data/{FILE}.parquet").to_pylist()
     episodes = parquet.read_table(out / f"meta/episodes/{FILE}.parquet").to_pylist()
@@ -95,7 +95,7 @@ def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
 def drive_of(path, entry, values, action=0.5):
     """A recording of answered states, each of one array as bytes."""
     task = msgspec.structs.replace(ROVER, observation={"a": entry}, action=ACTIONS[:1])
-    with harness.writing(path) as writer:
+    with drives.writing(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for step, value in enumerate(values):
@@ -109,11 +109,11 @@ def test_large_numbers_have_finite_statistics_and_too_large_ones_are_left_out(tm
     large = np.full(2, np.finfo(np.float32).max, np.float32)
     values = [large.tobytes(), (-large).tobytes()] * 3
     path = drive_of(tmp_path / "a.mcap", SEEN["b"], values, action=1e11)
-    assert harness.bridge_status(export(path, tmp_path / "a")) == 0
+    assert drives.bridge_status(export(path, tmp_path / "a")) == 0
     stats = json.loads((tmp_path / "a/meta/stats.json").read_text())
     assert stats["observation.state"]["std"] == pytest.approx(large.astype(float).tolist())
     path = drive_of(tmp_path / "b.mcap", SEEN["b"], values, action=1e308)
-    assert harness.bridge_status(export(path, tmp_path / "b")) == 2
+    assert drives.bridge_status(export(path, tmp_path / "b")) == 2
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path, monkeypatch, shape, dtyp
     path = drive_of(tmp_path / "a.mcap", Entry(dtype=dtype, shape=shape), [zeros] * frames)
     tracemalloc.start()
     try:
-        assert harness.bridge_status(export(path, tmp_path / "a")) == 0
+        assert drives.bridge_status(export(path, tmp_path / "a")) == 0
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -138,7 +138,7 @@ def test_what_memory_holds_at_once_changes_nothing(tmp_path, monkeypatch):
     for number in (1 << 22, 7):
         monkeypatch.setattr(lerobot, "MOST_NUMBERS", number)
         out = tmp_path / f"{number}"
-        assert harness.bridge_status(export(path, out)) == 0
+        assert drives.bridge_status(export(path, out)) == 0
         tables = [f"data/{FILE}.parquet", f"meta/episodes/{FILE}.parquet"]
         rows = [parquet.read_table(out / table).to_pylist() for table in tables]
         pictures = [key for key in rows[1][0] if key.startswith("stats/observation.images")]
@@ -182,19 +182,19 @@ async def first_message(port, topic, start_drive):
 
 def test_a_drive_is_served_to_foxglove(tmp_path, refusal):
     endpoint, port = free_endpoint(), free_port()
-    policy = harness.make_policy(tmp_path, "constant")
+    policy = drives.make_policy(tmp_path, "constant")
     with (
-        harness.BridgeProcess("view", "--foxglove", str(port), "--connect", endpoint) as view,
+        drives.BridgeProcess("view", "--foxglove", str(port), "--connect", endpoint) as view,
         # So many drives that none is the last, however late a busy machine lets the client ask.
-        harness.start_simulate(
-            endpoint, tmp_path / "r.json", harness.SLOW_TOY, "--episodes", "1000"
+        drives.start_simulate(
+            endpoint, tmp_path / "r.json", drives.SLOW_TOY, "--episodes", "1000"
         ) as run,
         contextlib.ExitStack() as edge,
     ):
         assert view.process.stdout.readline() == f"open ws://127.0.0.1:{port} in Foxglove\n"
 
         def start_drive():
-            edge.enter_context(harness.start_edge(endpoint, policy))
+            edge.enter_context(drives.start_edge(endpoint, policy))
 
         data = asyncio.run(first_message(port, "view/hunter01/frames", start_drive))
         run.process.kill()

@@ -30,7 +30,25 @@ from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import Log, RawImage, RecordingWriter, _listen, describe
 from bridge.recording import Recording, Stored
 from bridge.replay import RecordedDrive, replay_in_process
-from bridge.tests.harness import (
+from bridge.tests.test_inbound import health
+from bridge.tests.test_replay import Hand
+from edge_runtime.cli import quit_on_signals
+from edge_runtime.config import Config
+from edge_runtime.manifest import Entry, Task
+from edge_runtime.policy import load_policy
+from edge_runtime.reach import free_endpoint
+from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
+from edge_runtime.wire import (
+    MAX_STATE_BYTES,
+    Command,
+    Feedback,
+    Health,
+    State,
+    decode_state,
+    encode,
+)
+from hil_tests.testing.drives import (
     LEFT_TURN,
     SLOW_TOY,
     bridge_status,
@@ -46,26 +64,8 @@ from bridge.tests.harness import (
     start_simulate,
     writing,
 )
-from bridge.tests.test_inbound import health
-from bridge.tests.test_replay import Hand
-from edge_runtime.cli import quit_on_signals
-from edge_runtime.config import Config
-from edge_runtime.manifest import Entry, Task
-from edge_runtime.policy import load_policy
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import PATIENCE_S, make_command, make_state, wait_until
-from edge_runtime.tests.policies import SIZE, TASK
-from edge_runtime.transport import open_session
-from edge_runtime.util import UserError
-from edge_runtime.wire import (
-    MAX_STATE_BYTES,
-    Command,
-    Feedback,
-    Health,
-    State,
-    decode_state,
-    encode,
-)
+from hil_tests.testing.edge import PATIENCE_S, make_command, make_state, wait_until
+from hil_tests.testing.policies import SIZE, TASK
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 

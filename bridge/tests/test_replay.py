@@ -8,11 +8,11 @@ import pytest
 from bridge.messages import Heard
 from bridge.record import RecordingWriter
 from bridge.replay import Answer, Exchange, _first_exchange, compare
-from bridge.tests.harness import BridgeProcess, bridge_status, make_policy, start_edge
 from bridge.tests.test_inbound import health
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import BLACK, WHITE, frames, make_command, make_state
 from edge_runtime.wire import encode
+from hil_tests.testing.drives import BridgeProcess, bridge_status, make_policy, start_edge
+from hil_tests.testing.edge import BLACK, WHITE, frames, make_command, make_state
 
 EPOCH_NS = 1_700_000_000 * 10**9
 ANSWER_S, INFERENCE_S = 0.002, 0.001

@@ -10,7 +10,9 @@ import pytest
 
 from bridge import report as reports
 from bridge.progress import ProgressBar
-from bridge.tests.harness import (
+from edge_runtime.__main__ import main as edge_main
+from edge_runtime.reach import free_endpoint
+from hil_tests.testing.drives import (
     SHORT_TOY,
     SLOW_TOY,
     make_feedback,
@@ -19,9 +21,7 @@ from bridge.tests.harness import (
     start_simulate,
     wait_until_driving_steadily,
 )
-from edge_runtime.__main__ import main as edge_main
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import make_command
+from hil_tests.testing.edge import make_command
 
 RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
 

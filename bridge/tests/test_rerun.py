@@ -34,15 +34,15 @@ from bridge.rerun import (
 )
 from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.wire_view import Timeline, WireLog
-from bridge.tests import harness
-from bridge.tests.toy import ToyEnv
-from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.link_quality import FIELDS
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import HEALTH, make_command, make_state, wait_until
-from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection, encode
+from hil_tests.testing import drives
+from hil_tests.testing.edge import HEALTH, make_command, make_state, wait_until
+from hil_tests.testing.environments import ToyEnv
+from hil_tests.testing.policies import TASK
+from hil_tests.testing.viewers import NO_GPU, in_place, listens
 
 
 def test_a_car_that_heads_down_the_picture_is_long_in_y():
@@ -239,8 +239,8 @@ def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
 
 
 def verify(recording):
-    harness.rerun("rrd", "verify", str(recording))
-    return harness.rerun("rrd", "stats", str(recording))
+    drives.rerun("rrd", "verify", str(recording))
+    return drives.rerun("rrd", "stats", str(recording))
 
 
 @pytest.mark.parametrize("told", ["the drive ends", "the view is interrupted"])
@@ -248,12 +248,12 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
     words = ("view", "--save", str(recording), "--connect", endpoint)
     with (
-        harness.BridgeProcess(*words) as view,
-        harness.start_simulate(endpoint, tmp_path / "r.json", harness.SLOW_TOY) as run,
+        drives.BridgeProcess(*words) as view,
+        drives.start_simulate(endpoint, tmp_path / "r.json", drives.SLOW_TOY) as run,
     ):
         wait_until(lambda: list(tmp_path.glob(".drive.rrd*")), "the recording to begin")
         if told == "the drive ends":
-            with harness.start_edge(endpoint, harness.make_policy(tmp_path, "constant")):
+            with drives.start_edge(endpoint, drives.make_policy(tmp_path, "constant")):
                 assert run.wait() == 0, run.errors
         else:
             time.sleep(0.3)
@@ -303,8 +303,8 @@ def test_a_ride_is_shown_and_no_silence(log, events):
 
 def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_path, capsys):
     path, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
-    shutil.copy(harness.LEFT_TURN, path)
-    harness.flip_chunk(path, 3)
+    shutil.copy(drives.LEFT_TURN, path)
+    drives.flip_chunk(path, 3)
     assert main(["view", str(path), "--save", str(out)]) == 0
     found, said = verify(out), capsys.readouterr()
     entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
@@ -321,7 +321,7 @@ LINE = [[0.0, 0.0], [1.0, 1.0]]
 GOOD: dict[str, dict] = {
     "state": msgspec.to_builtins(make_state(3), builtin_types=(bytes,)),
     "command": msgspec.to_builtins(make_command(3)),
-    "feedback": msgspec.to_builtins(harness.make_feedback(3)),
+    "feedback": msgspec.to_builtins(drives.make_feedback(3)),
     "health": msgspec.to_builtins(HEALTH),
     "scene": PLACE | {"roads": [LINE], "path": LINE, "goal": [1.0, 1.0], "vehicles": [CAR],
                           "round_trip_ms": 3.0, "answered_step": 2, "applied": [0.1]},
@@ -344,7 +344,7 @@ def with_each_number_absurd(value):
 def test_no_number_ends_a_viewer_or_makes_a_recording_unviewable(tmp_path, capsys):
     """What is absurd is left out and counted, by the recorder's copies and the view."""
     path, out, count = tmp_path / "drive.mcap", tmp_path / "drive.rrd", 0
-    with harness.writing(path) as writer:
+    with drives.writing(path) as writer:
 
         def write(topic, message):
             payload = msgspec.msgpack.encode(message)
@@ -410,7 +410,7 @@ def test_rejections_are_counted_by_side_and_reason(log, kept, events):
     sides = [f"rejected/{side}/{of}" for side in ("simulator", "edge") for of in ("all", "stale")]
     assert kept == {path: [0, 2, 5] for path in sides}
     assert events == [f"edge rejected {new} states: stale" for new in (2, 3)]
-    for payload in (b"\xc1", encode(harness.make_feedback(3, speed_mps=0.5))):
+    for payload in (b"\xc1", encode(drives.make_feedback(3, speed_mps=0.5))):
         log.write(messages.Heard("", "feedback", payload, 10**18, len(payload)))
     assert [event.split(": ")[0] for event in events[2:]] == ["unreadable feedback"]
     assert kept["speed/vehicle"] == [0.5]

@@ -23,7 +23,12 @@ from bridge.environments import (
 )
 from bridge.episode import Actuators, EpisodeRunner, pack
 from bridge.messages import Origin
-from bridge.tests.harness import (
+from bridge.virtual_link import NO_COMMAND, Decision
+from edge_runtime.manifest import Layout
+from edge_runtime.reach import free_endpoint
+from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
+from hil_tests.testing.drives import (
     SLOW_TOY,
     TOY,
     BridgeProcess,
@@ -39,14 +44,9 @@ from bridge.tests.harness import (
     wait_until_driving,
     wait_until_driving_steadily,
 )
-from bridge.tests.odd import odd
-from bridge.virtual_link import NO_COMMAND, Decision
-from edge_runtime.manifest import Layout
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import make_command
-from edge_runtime.tests.policies import PEDAL, STEERING, write_policy, write_rover
-from edge_runtime.transport import open_session
-from edge_runtime.util import UserError
+from hil_tests.testing.edge import make_command
+from hil_tests.testing.odd import odd
+from hil_tests.testing.policies import PEDAL, STEERING, write_policy, write_rover
 
 
 def drove_as_in_process(report, policy):
@@ -87,7 +87,7 @@ def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
 
 def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
     policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "never.json"
-    env = "bridge.tests.toy:BridgeToyNan-v0"
+    env = "hil_tests.testing.environments:BridgeToyNan-v0"
     with start_edge(endpoint, policy), start_simulate(endpoint, out, env) as run:
         refused(run, out, "reward is nan")
 

@@ -19,7 +19,7 @@ from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.certs import write_key_pair
 from deploy.installer.verify import Target
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.policies import public_pem, write_policy
+from hil_tests.testing.policies import public_pem, write_policy
 
 QUICK = ("--settle", "0.2")
 PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"

@@ -42,9 +42,9 @@ from deploy.installer.__main__ import trusted_key
 from deploy.installer.layout import Layout, unpack_wheel
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
-from edge_runtime.tests.harness import exit_status
-from edge_runtime.tests.policies import public_pem
 from edge_runtime.util import UserError
+from hil_tests.testing.edge import exit_status
+from hil_tests.testing.policies import public_pem
 
 MAX_JETPACK5_BYTES = 45_000_000
 

@@ -26,7 +26,7 @@ from deploy.installer.layout import LINKS, STATE, Layout, make_release, why_not_
 from deploy.installer.systemd import Limits, NoService
 from deploy.installer.verify import Bundle, Manifest, UnhealthyError, to_json
 from deploy.tests.boards import HERE
-from edge_runtime.tests.policies import public_pem
+from hil_tests.testing.policies import public_pem
 
 EARLIER, OLD, NEW = "0.1.0-earlier", "0.1.0-old", "0.1.0-new"
 KEY = public_pem(Ed25519PrivateKey.generate())

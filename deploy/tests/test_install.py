@@ -28,7 +28,7 @@ from deploy.installer import systemd
 from deploy.installer.layout import Layout, why_not_whole
 from deploy.installer.verify import UnhealthyError, UserError, read_bundle
 from deploy.tests.boards import HERE, Board, changed_wheel
-from edge_runtime.tests.harness import Simulator, make_state, wait_until
+from hil_tests.testing.edge import Simulator, make_state, wait_until
 
 RUN = "edge_runtime/run.py"
 MOCK = "edge_runtime/vehicles/mock.py"

@@ -3,8 +3,7 @@ from typing import Callable, NamedTuple
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-from edge_runtime.tests.policies import public_pem, write_policy
+from hil_tests.testing.policies import public_pem, write_policy
 
 
 class SignedPolicy(NamedTuple):

@@ -11,6 +11,8 @@ from typing import Tuple, Type
 
 import msgspec
 import pytest
+from hil_tests.testing.edge import HEALTH, exit_status, run_command
+from hil_tests.testing.policies import write_policy
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,8 +22,6 @@ from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import HEALTH, exit_status, run_command
-from edge_runtime.tests.policies import write_policy
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import HunterSettings

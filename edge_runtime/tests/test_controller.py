@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hil_tests.testing.edge import make_state
+from hil_tests.testing.policies import PEDAL, STEERING
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -11,8 +13,6 @@ from msgspec.structs import replace
 from edge_runtime.controller import ActionLimit, Controller, Received, limit_action, shared_limits
 from edge_runtime.ride import Ride
 from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
-from edge_runtime.tests.harness import make_state
-from edge_runtime.tests.policies import PEDAL, STEERING
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mock import MockVehicle
 

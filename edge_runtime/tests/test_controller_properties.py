@@ -11,14 +11,14 @@ from typing import Any, Optional
 import msgspec
 import numpy as np
 import pytest
+from hil_tests.testing.edge import make_state
+from hil_tests.testing.policies import PEDAL, STEERING
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
 from edge_runtime.controller import ActionLimit, Controller, Order, Received, shared_limits
 from edge_runtime.ride import Ride
-from edge_runtime.tests.harness import make_state
-from edge_runtime.tests.policies import PEDAL, STEERING
 
 T = 0.1
 SILENT_S = 2 * T + 0.02  # a grace within the contract's 50 ms

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hil_tests.testing.edge import make_state
+from hil_tests.testing.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.controller import Controller, Received, shared_limits
 from edge_runtime.freshness import DRIFT, Freshness
 from edge_runtime.ride import Ride
-from edge_runtime.tests.harness import make_state
-from edge_runtime.tests.policies import PEDAL
 from edge_runtime.vehicles.mock import MockVehicle
 
 T = 0.1

@@ -3,8 +3,8 @@
 import math
 
 import pytest
+from hil_tests.testing.vehicles import OK, PEDAL, SPEC, HunterRig
 
-from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
 from edge_runtime.vehicles import core as rules
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol

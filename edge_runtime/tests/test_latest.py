@@ -1,13 +1,13 @@
 from collections import Counter
 
 import pytest
+from hil_tests.testing.edge import make_state
+from hil_tests.testing.policies import T
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import latest as latest_module
 from edge_runtime.latest import LatestState
-from edge_runtime.tests.harness import make_state
-from edge_runtime.tests.policies import T
 from edge_runtime.wire import Reason
 
 

@@ -15,6 +15,7 @@ from unittest.mock import MagicMock
 
 import pytest
 import zenoh
+from hil_tests.testing.edge import HEALTH, wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +24,6 @@ from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.reach import Listener, free_endpoint, look
 from edge_runtime.run import say_what_is_missing
-from edge_runtime.tests.harness import HEALTH, wait_until
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError

@@ -6,11 +6,11 @@ import time
 from typing import Any
 
 import pytest
+from hil_tests.testing.edge import make_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.link_quality import FIELDS, KNOWN, LinkQuality, is_poor, link_words
-from edge_runtime.tests.harness import make_state
 
 MS = 1_000_000
 GOOD = dict.fromkeys(FIELDS, 1.0)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import List
 
 import pytest
+from hil_tests.testing.edge import EdgeProcess, Simulator, make_state
 
 import edge_runtime
 from edge_runtime.__main__ import script
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state
 
 ROOT = Path(edge_runtime.__file__).parent
 LOCK = ROOT.parent / "requirements" / "edge-py38.txt"

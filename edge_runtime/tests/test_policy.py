@@ -14,15 +14,7 @@ import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
-from hypothesis import given
-from hypothesis import strategies as st
-from msgspec.structs import replace
-from onnx import TensorProto, helper
-
-from edge_runtime import policy as module
-from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, Layout, decode_manifest
-from edge_runtime.policy import check_graph, infer, load_policy, probes, verify
-from edge_runtime.tests.policies import (
+from hil_tests.testing.policies import (
     PEDAL,
     ROVER,
     ROVER_INPUTS,
@@ -34,7 +26,15 @@ from edge_runtime.tests.policies import (
     write_policy,
     write_rover,
 )
-from edge_runtime.tests.rigs import a_manifest
+from hil_tests.testing.vehicles import a_manifest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from onnx import TensorProto, helper
+
+from edge_runtime import policy as module
+from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, Layout, decode_manifest
+from edge_runtime.policy import check_graph, infer, load_policy, probes, verify
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS, Reason
 

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from hil_tests.testing.edge import wait_until
+from hil_tests.testing.vehicles import a_manifest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests import ros2_side as second
-from edge_runtime.tests.harness import wait_until
-from edge_runtime.tests.rigs import a_manifest
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import make_vehicle, ros2

@@ -5,10 +5,10 @@ import math
 import time
 
 import pytest
+from hil_tests.testing.edge import EdgeProcess, Simulator, wait_until
+from hil_tests.testing.vehicles import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import EdgeProcess, Simulator, wait_until
-from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from edge_runtime.tests.ros2_side import RosHunter
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import Event, State

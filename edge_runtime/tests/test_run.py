@@ -13,11 +13,7 @@ import time
 from typing import Any
 
 import pytest
-
-import edge_runtime
-from edge_runtime.commands import render_status
-from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import (
+from hil_tests.testing.edge import (
     WHITE,
     CommandProcess,
     EdgeProcess,
@@ -27,7 +23,11 @@ from edge_runtime.tests.harness import (
     run_command,
     wait_until,
 )
-from edge_runtime.tests.policies import T
+from hil_tests.testing.policies import T
+
+import edge_runtime
+from edge_runtime.commands import render_status
+from edge_runtime.reach import free_endpoint
 
 WHITE_FRAMES = {"observation": frames(WHITE)}
 

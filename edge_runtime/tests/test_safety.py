@@ -1,12 +1,12 @@
 from pathlib import Path
 
 import pytest
+from hil_tests.testing.edge import render_table
+from hil_tests.testing.policies import T
 
 import edge_runtime
 from edge_runtime import safety as rules
 from edge_runtime.safety import TRANSITIONS, Event, Mode, Safety, advance, note_arrival
-from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.policies import T
 
 STANDBY, DRIVE, STOP = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
 GOOD = {"fresh_state", "recovered", "final_state"}

@@ -17,6 +17,8 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from hil_tests.testing.edge import EdgeProcess, make_state, wait_until
+from hil_tests.testing.policies import PEDAL, TASK, T
 
 from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, shared_limits
@@ -24,8 +26,6 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
-from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
-from edge_runtime.tests.policies import PEDAL, TASK, T
 from edge_runtime.tests.test_commands import HOSTILE
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.vehicles.base import VehicleRunner

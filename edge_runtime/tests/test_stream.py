@@ -5,8 +5,8 @@ import math
 import time
 
 import pytest
+from hil_tests.testing.edge import wait_until
 
-from edge_runtime.tests.harness import wait_until
 from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.stream import Stream
 

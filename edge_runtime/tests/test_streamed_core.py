@@ -4,12 +4,12 @@ import math
 from pathlib import Path
 
 import pytest
+from hil_tests.testing.edge import render_table
+from hil_tests.testing.vehicles import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 import edge_runtime
-from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from edge_runtime.vehicles.core import (
     DEVIATES_S,
     FOLLOWS_S,

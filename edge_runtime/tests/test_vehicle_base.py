@@ -7,13 +7,13 @@ import time
 import msgspec
 import numpy as np
 import pytest
+from hil_tests.testing.edge import make_command, wait_until
+from hil_tests.testing.policies import T
+from hil_tests.testing.vehicles import CAR, CARS, PEDAL, a_manifest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
-from edge_runtime.tests.harness import make_command, wait_until
-from edge_runtime.tests.policies import T
-from edge_runtime.tests.rigs import CAR, CARS, PEDAL, a_manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import base, make_vehicle
 from edge_runtime.vehicles.base import BRAKING, LYING, SILENT, STUCK, VehicleRunner, VehicleWatch

@@ -8,12 +8,12 @@ from typing import Any, cast
 
 import msgspec
 import pytest
+from hil_tests.testing.edge import Simulator, make_state, run_command, wait_until
+from hil_tests.testing.vehicles import CAR, a_manifest
 
 import edge_runtime
 from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import Simulator, make_state, run_command, wait_until
-from edge_runtime.tests.rigs import CAR, a_manifest
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits

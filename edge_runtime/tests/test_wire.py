@@ -5,13 +5,13 @@ from typing import Any, Dict, List, Optional, Union, get_type_hints
 import msgspec
 import numpy as np
 import pytest
+from hil_tests.testing.edge import HEALTH, make_command, make_state
+from hil_tests.testing.policies import SHAPE, SIZE, TASK
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import wire
 from edge_runtime.manifest import Entry, Layout
-from edge_runtime.tests.harness import HEALTH, make_command, make_state
-from edge_runtime.tests.policies import SHAPE, SIZE, TASK
 from edge_runtime.util import UserError
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 

@@ -24,7 +24,6 @@ import numpy as np
 from edge_runtime.commands import ask
 from edge_runtime.manifest import Task
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import GROUP
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
@@ -39,6 +38,7 @@ from hil_tests.faults.observe import (
     longest_gap_s,
 )
 from hil_tests.processes import Process, wait_until
+from hil_tests.testing.policies import TASK
 
 E = TypeVar("E")
 VEHICLE_ID = "faults"

@@ -28,7 +28,6 @@ from typing import Any, Literal
 import numpy as np
 
 from bridge.recording import Recording, heard_of
-from edge_runtime.tests.policies import T
 from edge_runtime.wire import SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
 from hil_tests.faults.observe import (
@@ -39,6 +38,7 @@ from hil_tests.faults.observe import (
 )  # fmt: skip
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig
 from hil_tests.processes import Process, wait_until
+from hil_tests.testing.policies import T
 
 GAP = "longest gap between commands"
 

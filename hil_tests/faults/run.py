@@ -13,13 +13,13 @@ from typing import Any
 
 from edge_runtime.manifest import Task
 from edge_runtime.policy import load_policy
-from edge_runtime.tests.policies import TASK, write_policy
 from edge_runtime.util import UserError
 from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import later_s, longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase, do_fault
 from hil_tests.processes import POLICY, in_parallel, trusting
+from hil_tests.testing.policies import TASK, write_policy
 
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from bridge.network import parse_spec
 from bridge.report import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime.policy import policy_id_of
-from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.envelope import (
@@ -29,6 +28,7 @@ from hil_tests.envelope import (
     find_region,
     network,
 )  # fmt: skip
+from hil_tests.testing.edge import exit_status
 from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes

@@ -11,7 +11,6 @@ import pytest
 
 from edge_runtime import wire
 from edge_runtime.manifest import Layout
-from edge_runtime.tests.policies import TASK
 from edge_runtime.util import UserError
 from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
@@ -21,6 +20,7 @@ from hil_tests.faults.rows import ROWS, Row, Try
 from hil_tests.faults.run import Outcome, _try, report_row, run_faults, run_row
 from hil_tests.mock_hunter.chassis import FAULTS
 from hil_tests.processes import in_parallel
+from hil_tests.testing.policies import TASK
 
 PLACE = ("session", 0, 7)
 STATES = {PLACE: 10.0}

@@ -7,10 +7,10 @@ import pytest
 
 from bridge.__main__ import main as bridge
 from bridge.network import parse_spec
-from bridge.tests.harness import LEFT_TURN, simulate_undisturbed, start_edge
 from edge_runtime.cli import run_cli
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY
+from hil_tests.testing.drives import LEFT_TURN, simulate_undisturbed, start_edge
 from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes

@@ -52,8 +52,9 @@ ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer",
 
 
 def sources(folder: str) -> list[Path]:
-    """The folder's files without its tests, which may use their neighbours' helpers."""
-    return [p for p in (ROOT / folder).rglob("*.py") if not {"tests", "build"} & set(p.parts)]
+    """The folder's files without its tests and what they share, which may use their neighbours."""
+    others = {"tests", "testing", "build"}
+    return [p for p in (ROOT / folder).rglob("*.py") if not others & set(p.parts)]
 
 
 @cache

@@ -20,18 +20,18 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from bridge.__main__ import main as bridge
 from bridge.ports import SimulatorPort, open_listener
 from bridge.recording import Recording
-from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from deploy.__main__ import main as deploy
 from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.commands import ask
 from edge_runtime.reach import free_endpoint, look
-from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
-from edge_runtime.tests.policies import T
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
+from hil_tests.testing.drives import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
+from hil_tests.testing.edge import EdgeProcess, make_state, run_command, wait_until
+from hil_tests.testing.policies import T
 
 SETTLE_S = 0.4
 """Until both ends know of a declaration, and until what must not come would have come."""

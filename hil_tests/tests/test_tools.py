@@ -17,13 +17,13 @@ import pytest
 from deploy.__main__ import main as deploy
 from deploy.bundle import build_installer
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import doctor
 from hil_tests.__main__ import main
 from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.sweep import simulate
+from hil_tests.testing.edge import exit_status
 
 ROOT = Path(__file__).parents[2]
 BY_NAME = {check.name: check for check in doctor.CHECKS}

@@ -20,9 +20,10 @@ from bridge import environments as bridge
 from bridge.fork import RecordedEpisode
 from bridge.messages import Origin
 from bridge.network import parse_spec
-from bridge.tests.odd import odd
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
+from hil_tests.testing.odd import odd
+from hil_tests.testing.people import QUICK, Puppet
 from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
@@ -47,7 +48,6 @@ from trainer.person.controls import controls_of
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
-from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
 from trainer.training.delayed import VehicleEnd
 from trainer.view import Shown, Steps

@@ -12,8 +12,8 @@ import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from edge_runtime.tests.harness import exit_status
-from edge_runtime.tests.policies import public_pem
+from hil_tests.testing.edge import exit_status
+from hil_tests.testing.policies import public_pem
 from trainer.__main__ import main
 from trainer.options import add_time_limit, deadline_s
 from trainer.training.command import SETTINGS

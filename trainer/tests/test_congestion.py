@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
+from hil_tests.testing.humans import drive
 from trainer.environments import make_environment
 from trainer.human.congestion import CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
 from trainer.scenarios.traffic import CAR, footprint
-from trainer.tests.humans import drive
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
+from hil_tests.testing.edge import wait_until
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments import guidance

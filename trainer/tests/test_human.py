@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from edge_runtime.util import UserError
+from hil_tests.testing.humans import BRAKE, FULL, drive
 from trainer.drivers import constant_driver, load_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.config import HumanModelConfig
@@ -17,7 +18,6 @@ from trainer.human.model import HumanModel, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, drive
 
 LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 

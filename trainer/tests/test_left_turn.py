@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
+from hil_tests.testing.humans import BRAKE, FULL, NOTHING, drive, episode
 from trainer.drivers import constant_driver
 from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, drive, episode
 
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
 

@@ -14,6 +14,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from bridge.environments import CONDITIONS as SERVED
 from bridge.environments import describe
 from edge_runtime.manifest import Car
+from hil_tests.testing.humans import episode
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.human.guide import HumanGuide, steps_held
@@ -23,7 +24,6 @@ from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.scenarios.picture import overlap
 from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED, draw_types, footprint, idm_acceleration
-from trainer.tests.humans import episode
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 

@@ -17,15 +17,15 @@ from rerun.chunk import RrdReader
 
 from bridge.messages import SeenScene
 from bridge.rerun import APPLIED, HUMAN, POLICY, open_sink
-from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
+from hil_tests.testing.people import record, recorded_step
+from hil_tests.testing.viewers import in_place
 from trainer import view
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
 from trainer.person.recording import Recorder, packed, read_steps
-from trainer.person.tests.people import record, recorded_step
 from trainer.tests.test_td3 import same_weights
 from trainer.tests.test_training import rows_of
 from trainer.training.config import CURVE_FILE, RunConfig

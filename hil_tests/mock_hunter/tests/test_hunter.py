@@ -14,8 +14,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.rigs import CARS, STREAM_S, Rig
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
 from edge_runtime.vehicles.core import Event as CoreEvent
@@ -35,6 +33,8 @@ from hil_tests.mock_hunter.hunter import (
 )
 from hil_tests.mock_hunter.process import Server, read_orders
 from hil_tests.processes import wait_until
+from hil_tests.testing.edge import render_table
+from hil_tests.testing.vehicles import CARS, STREAM_S, Rig
 
 TIMEOUT_S = 0.5
 REMOTE = {rules.Control.REMOTE, rules.Control.REMOTE_OVER_CAN}

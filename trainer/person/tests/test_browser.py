@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from bridge.rerun import BY_NAME, shades
-from trainer.person.coach import Coaching, Episode, advise
-from trainer.person.tests.browser import (
+from hil_tests.testing.browser import (
     LIVE,
     OVER,
     READY,
@@ -23,7 +22,8 @@ from trainer.person.tests.browser import (
     until,
     view_of_step,
 )
-from trainer.person.tests.people import LET_GO
+from hil_tests.testing.people import LET_GO
+from trainer.person.coach import Coaching, Episode, advise
 from trainer.person.web import VIEWS_UNDERWAY, Cockpit
 from trainer.tests.test_any_environment import ROVER
 

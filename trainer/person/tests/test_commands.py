@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from bridge.report import STOPPED
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
-from trainer.environments import make_environment
-from trainer.person.interface import Reading
-from trainer.person.recording import find_recordings, packed, read_steps
-from trainer.person.tests.people import (
+from hil_tests.testing.people import (
     LET_GO,
     QUIT,
     Discarding,
@@ -22,6 +18,10 @@ from trainer.person.tests.people import (
     record,
     recorded_step,
 )
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
+from trainer.environments import make_environment
+from trainer.person.interface import Reading
+from trainer.person.recording import find_recordings, packed, read_steps
 from trainer.tests.test_commands import call, refusal
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bridge.fork import RecordedEpisode, read_episode
-from bridge.tests.harness import record_in_process
-from edge_runtime.tests.policies import write_policy
+from hil_tests.testing.drives import record_in_process
+from hil_tests.testing.people import LET_GO, QUIT, Puppet, hold
+from hil_tests.testing.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
-from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
 from trainer.tests.test_commands import call
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]

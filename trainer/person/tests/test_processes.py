@@ -16,11 +16,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from edge_runtime.util import UserError
-from trainer.drivers import CHECKPOINT_FILE
-from trainer.person.interface import vector
-from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
-from trainer.person.takeover import MAX_SLEW
-from trainer.person.tests.browser import (
+from hil_tests.testing.browser import (
     PERSON_DRIVES,
     POLICY_DRIVES,
     address,
@@ -30,6 +26,10 @@ from trainer.person.tests.browser import (
     say,
     until,
 )
+from trainer.drivers import CHECKPOINT_FILE
+from trainer.person.interface import vector
+from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
+from trainer.person.takeover import MAX_SLEW
 from trainer.util import load_torch
 
 SOON_S = 60.0

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
+from hil_tests.testing.edge import wait_until
+from hil_tests.testing.people import record, recorded_step
 from trainer.learner.replay import ReplayBuffer
 from trainer.person import recording
 from trainer.person.recording import Recorder, read_steps, sittings
-from trainer.person.tests.people import record, recorded_step
 
 
 def record_some(directory, count: int) -> list[recording.Step]:

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from bridge.report import DISCARDED, RESTARTED, STOPPED
+from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 from trainer.drivers import constant_driver
 from trainer.person.interface import Reading
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import Pacer, drive
 from trainer.person.takeover import MAX_SLEW
-from trainer.person.tests.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 from trainer.scenarios.environment import DrivingEnv
 from trainer.scenarios.picture import draw_scene
 

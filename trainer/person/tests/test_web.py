@@ -22,9 +22,7 @@ import pytest
 import segno
 
 from edge_runtime.util import UserError
-from trainer.person import web
-from trainer.person.interface import open_person
-from trainer.person.tests.browser import (
+from hil_tests.testing.browser import (
     WAIT_S,
     first_view,
     hear,
@@ -35,7 +33,9 @@ from trainer.person.tests.browser import (
     say,
     view_of_step,
 )
-from trainer.person.tests.people import LET_GO
+from hil_tests.testing.people import LET_GO
+from trainer.person import web
+from trainer.person.interface import open_person
 from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit, encode_view
 
 RESET = struct.pack("ii", 1, 0)

@@ -3,18 +3,18 @@
 import math
 
 from edge_runtime.manifest import Car, Manifest
-from edge_runtime.tests.policies import FRAMES, STEERING, T
-from edge_runtime.tests.policies import PEDAL as PEDAL_ACTION
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.ros2 import STEERING as ANGLE
 from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
+from hil_tests.testing.policies import FRAMES, STEERING, T
+from hil_tests.testing.policies import PEDAL as PEDAL_ACTION
 
 
 def scenario_car(*numbers):
-    return Car(**dict(zip(Car.__struct_fields__, numbers)))
+    return Car(**dict(zip(Car.__struct_fields__, numbers, strict=True)))
 
 
 SPEC = SPECS["2.0"]

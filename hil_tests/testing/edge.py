@@ -9,32 +9,33 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any
 
 import zenoh
 
 from edge_runtime import wire
 from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
-from edge_runtime.tests.policies import SIZE, T
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
+from hil_tests.testing.policies import SIZE, T
 
 # This machine may be busy: waits are long, and only what must never happen has a short limit.
 PATIENCE_S = 20.0
 BLACK, WHITE = 0, 255
 
 
-def frames(level: int) -> Dict[str, bytes]:
+def frames(level: int) -> dict[str, bytes]:
     """The observation of pictures that are grey throughout."""
     return {"frames": bytes([level]) * SIZE}
 
 
 def make_state(step: int, **changes: Any) -> State:
     """A valid black state; `changes` replace its fields."""
-    fields: Dict[str, Any] = {
+    fields: dict[str, Any] = {
         "session": "simulator-a", "episode": 0, "step": step,
         "sim_time_s": step * 0.1, "sent_ns": time.time_ns(),
         "observation": frames(BLACK), "speed_mps": 1.0, "final": False,
@@ -44,7 +45,7 @@ def make_state(step: int, **changes: Any) -> State:
 
 def make_command(step: int = 0, **changes: Any) -> Command:
     """A valid command to drive; `changes` replace its fields."""
-    fields: Dict[str, Any] = {
+    fields: dict[str, Any] = {
         "session": "here", "episode": 0, "step": step, "mode": "drive", "action": [0.5],
         "policy_id": "p", "received_ns": 1, "inference_ns": 1, "sent_ns": 1,
     }  # fmt: skip
@@ -113,8 +114,8 @@ class Simulator:
     def __init__(self, endpoint: str, vehicle_id: str = "hunter01") -> None:
         self.endpoint, self.vehicle_id = endpoint, vehicle_id
         self.commands: queue.Queue[Command] = queue.Queue()
-        self.health: List[Health] = []
-        self.feedback: List[Feedback] = []
+        self.health: list[Health] = []
+        self.feedback: list[Feedback] = []
         self.steps = itertools.count()
         self._session = open_session(listen=endpoint, mode="router")
         self.alive = threading.Event()
@@ -166,10 +167,10 @@ class Simulator:
     def next_command(self) -> Command:
         return self.commands.get(timeout=PATIENCE_S)
 
-    def drain(self) -> List[Command]:
+    def drain(self) -> list[Command]:
         return [self.commands.get_nowait() for _ in range(self.commands.qsize())]
 
-    def query(self, topic: str) -> Dict[str, Any]:
+    def query(self, topic: str) -> dict[str, Any]:
         """The status or rearm query, as an operator's command asks it."""
         return ask(self.endpoint, self.vehicle_id, topic)
 
@@ -190,12 +191,12 @@ class Simulator:
         (self.alive.set if str(sample.kind).endswith("PUT") else self.alive.clear)()
 
 
-def run_command(*arguments: str, cwd: Optional[Path] = None) -> subprocess.CompletedProcess:
+def run_command(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "edge_runtime", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=cwd, check=False)
 
 
-def exit_status(main: Callable[[List[str]], int], arguments: List[str]) -> int:
+def exit_status(main: Callable[[list[str]], int], arguments: list[str]) -> int:
     """The status with which the command ends, also where argparse ends it."""
     try:
         return run_cli(main, arguments)

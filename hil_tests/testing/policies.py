@@ -1,8 +1,9 @@
 """Small policy files for tests, made with the onnx package (which the board never sees)."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Dict, Optional, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,9 +44,9 @@ def write_policy(
     path: Any,
     kind: str = "constant",
     value: float = 0.3,
-    key: Optional[Ed25519PrivateKey] = None,
+    key: Ed25519PrivateKey | None = None,
     actions: Sequence[Action] = (PEDAL,),
-    manifest_changes: Optional[Dict[str, Any]] = None,
+    manifest_changes: dict[str, Any] | None = None,
     opset: int = 17,
     ir_version: int = 8,
     graph: str = "",
@@ -60,7 +61,7 @@ def write_policy(
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
-    fields: Dict[str, Any] = {
+    fields: dict[str, Any] = {
         "task": "left_turn", "algorithm": "test", "observation": FRAMES, "action": list(actions),
         "control_period_s": T, "car": CAR, "training": training, "created": "2025-01-01T00:00:00Z",
     }  # fmt: skip
@@ -82,12 +83,12 @@ ROVER_INPUTS = {"camera": "uint8[b, 4, 6, 3]", "ranges": "float[b, 2]", "lit": "
 WHEELS = [*(Action(name=name, low=-40.0, high=80.0, stop=0.0) for name in ("left", "right"))]
 
 
-def write_rover(path: Any, kinds: Dict[str, str] = ROVER_INPUTS, **changes: Any) -> str:
+def write_rover(path: Any, kinds: dict[str, str] = ROVER_INPUTS, **changes: Any) -> str:
     """A policy of another kind of robot: its wheels are its ranges, tenfold."""
     inputs = ", ".join(f"{kind} {name}" for name, kind in kinds.items())
     graph = f"rover ({inputs}) => (float[b, 2] action) {{ action = Mul(ranges, ten) }}"
     fields = {"task": "rover", "observation": ROVER, "control_period_s": 0.02, "car": None}
-    options: Dict[str, Any] = {"opset": 21, "ir_version": 10, "actions": WHEELS}
+    options: dict[str, Any] = {"opset": 21, "ir_version": 10, "actions": WHEELS}
     return write_policy(path, graph=graph, manifest_changes={**fields, **changes}, **options)
 
 
@@ -109,7 +110,7 @@ _ANSWERS = {
 
 
 def _graph(text: str, kind: str, value: float, n_actions: int) -> onnx.GraphProto:
-    weights: Dict[str, np.ndarray] = {
+    weights: dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "ten": np.array(10.0, np.float32),

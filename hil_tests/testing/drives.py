@@ -26,19 +26,19 @@ from bridge.record import RecordingWriter
 from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.harness import (
+from edge_runtime.wire import Feedback, State, decode_state
+from hil_tests.testing.edge import (
     PATIENCE_S,
     CommandProcess,
     EdgeProcess,
     exit_status,
     wait_until,
 )
-from edge_runtime.tests.policies import write_policy
-from edge_runtime.wire import Feedback, State, decode_state
+from hil_tests.testing.policies import write_policy
 
-TOY = "bridge.tests.toy:BridgeToy-v0"
-SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
-SLOW_TOY = "bridge.tests.toy:BridgeToySlow-v0"
+TOY = "hil_tests.testing.environments:BridgeToy-v0"
+SHORT_TOY = "hil_tests.testing.environments:BridgeToyShort-v0"
+SLOW_TOY = "hil_tests.testing.environments:BridgeToySlow-v0"
 
 
 BridgeProcess = partial(CommandProcess, "bridge")

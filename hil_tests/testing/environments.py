@@ -75,7 +75,7 @@ VARIANTS: dict[str, dict[str, float]] = {
 }
 for name, options in VARIANTS.items():
     if name not in gymnasium.registry:
-        made: Any = {"entry_point": "bridge.tests.toy:ToyEnv", "kwargs": options}
+        made: Any = {"entry_point": "hil_tests.testing.environments:ToyEnv", "kwargs": options}
         gymnasium.register(name, **made, disable_env_checker=True, order_enforce=False)
 SHORT_PARKING = "BridgeParking-v0"  # One of highway-env's, which alone has 100 s
 if SHORT_PARKING not in gymnasium.registry:

@@ -1,6 +1,6 @@
 """The cockpit's pages for tests: a WebSocket that talks as a page does, and a real Chromium.
 
-``python -m trainer.person.tests.browser --picture docs/cockpit.png`` takes that picture.
+``python -m hil_tests.testing.browser --picture docs/cockpit.png`` takes that picture.
 """
 
 import asyncio
