@@ -7,6 +7,7 @@ import pytest
 
 discover = Distribution.discover
 pytest.register_assert_rewrite("hil_tests.testing")
+pytest_plugins = ["hil_tests.testing.fixtures"]
 
 
 @pytest.fixture(autouse=True)

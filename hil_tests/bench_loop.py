@@ -33,8 +33,8 @@ from edge_runtime.files import write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
-from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, CommandTimeoutError, Process, wait_until
+from hil_tests.testing.messages import make_state
 from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -29,8 +29,8 @@ Result = TypeVar("Result")
 POLICY = Path(kept("results/policies/left_turn.onnx"))
 PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what it is verified with
 PATIENCE_S = 30.0
-STOP_TIMEOUT_S = 10.0
-POLL_S = 0.002
+STOP_TIMEOUT_S = 20.0
+POLL_S = 0.005
 OPERATOR_LOOKS_EVERY_S = 0.5
 _LAST_WORDS_S = 1.0
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
@@ -41,12 +41,14 @@ class CommandTimeoutError(UserError, TimeoutError):
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us; ``lines`` are its output with their monotonic times.
+    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block.
 
-    ``ready`` is a text of its output that says it has started (None: no wait); ``shown`` prints the
-    command; ``environment`` are variables beside ours. With ``told`` it reads its standard input,
-    and `tell` writes there. ``on_line`` is called with the time and text of each line, in a thread.
-    Raises UserError where it ended, or said nothing for too long, before it was ready.
+    ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
+    are the text of each stream. ``ready`` is a text that says it has started (None: no wait).
+    ``shown`` prints the command; ``environment`` are variables beside ours; with ``told``, `tell`
+    writes to its standard input. ``on_line`` is called with the time and text of each line, in a
+    thread. ``options`` are further ones of Popen. Raises UserError where it ended, or said nothing
+    for too long, before it was ready.
     """
 
     def __init__(
@@ -57,6 +59,8 @@ class Process:
         environment: Mapping[str, str] | None = None,
         told: bool = False,
         on_line: Callable[[float, str], None] = lambda seen_s, line: None,
+        python: str = sys.executable,
+        **options: Any,
     ) -> None:
         if shown:
             print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
@@ -64,18 +68,27 @@ class Process:
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         self._on_line = on_line
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", *arguments],
-            stdin=subprocess.PIPE if told else subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+        pipes = {
+            "stdin": subprocess.PIPE if told else subprocess.DEVNULL,
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.PIPE,
+        }
+        self._process: subprocess.Popen[str] = subprocess.Popen(
+            [python, "-m", *arguments],
             text=True,
             errors="surrogateescape",  # what is no text goes through as it is
             env={**os.environ, **(environment or {})},
+            **{**pipes, **options},
         )
         self.pid = self._process.pid
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._output: list[str] = []
+        self._errors: list[str] = []
+        streams = (self._process.stdout, self._output), (self._process.stderr, self._errors)
+        self._readers = [
+            threading.Thread(target=self._read, args=each, daemon=True) for each in streams
+        ]
+        for reader in self._readers:
+            reader.start()
         if ready is not None:
             try:
                 wait_until(lambda: self.has_ended or self._when(ready), self.name)
@@ -84,6 +97,16 @@ class Process:
             if self.has_ended:
                 self._gone(None)
                 raise self._failure()
+
+    @property
+    def output(self) -> str:
+        """Its standard output so far."""
+        return "".join(self._output)
+
+    @property
+    def errors(self) -> str:
+        """Its standard error so far."""
+        return "".join(self._errors)
 
     @property
     def has_ended(self) -> bool:
@@ -121,7 +144,7 @@ class Process:
             self.kill()
             return -signal.SIGKILL
 
-    def wait(self, timeout_s: float = PATIENCE_S) -> int:
+    def wait(self, timeout_s: float = 2 * PATIENCE_S) -> int:
         """The exit status, once it has ended by itself; CommandTimeoutError."""
         try:
             return self._gone(timeout_s)
@@ -129,7 +152,7 @@ class Process:
             said = f"python -m {self.name} did not end within {timeout_s:g} s"
             raise CommandTimeoutError(said) from None
 
-    def succeed(self, timeout_s: float = PATIENCE_S) -> None:
+    def succeed(self, timeout_s: float = 2 * PATIENCE_S) -> None:
         """Wait until it has ended by itself; UserError with its last line where it failed."""
         if self.wait(timeout_s):
             raise self._failure()
@@ -156,21 +179,22 @@ class Process:
     def _gone(self, timeout_s: float | None) -> int:
         self._ended_by_us = True
         status = self._process.wait(timeout_s)
-        self._reader.join(_LAST_WORDS_S)
+        for reader in self._readers:
+            reader.join(_LAST_WORDS_S)
         return status
 
     def _when(self, text: str) -> float | None:
         return next((seen_s for seen_s, line in self.lines if text in line), None)
 
     def _failure(self) -> UserError:
-        said = [line for _, line in self.lines if line.strip()]
-        last = said[-1].strip() if said else "it said nothing"
+        said = [*self.output.split("\n"), *self.errors.split("\n")]
+        last = next((line.strip() for line in reversed(said) if line.strip()), "it said nothing")
         return UserError(f"python -m {self.name}: {last}")
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+    def _read(self, stream: Iterable[str] | None, kept: list[str]) -> None:
+        for line in stream or ():
             seen_s = time.monotonic()
+            kept.append(line)
             self.lines.append((seen_s, line.rstrip()))
             self._on_line(seen_s, line)
 

@@ -1,17 +1,13 @@
 """How a refusal looks."""
 
+from functools import partial
+
 import pytest
 
-from hil_tests.testing.drives import bridge_status
+from hil_tests.testing import commands
 
 
 @pytest.fixture
 def refusal(capsys):
     """Run ``python -m bridge`` with arguments that it refuses; return its only line."""
-
-    def refused(*arguments):
-        assert bridge_status([str(argument) for argument in arguments]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        return line
-
-    return refused
+    return partial(commands.refusal, capsys, package="bridge")

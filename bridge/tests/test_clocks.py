@@ -6,6 +6,7 @@ import time
 from functools import partial
 from typing import Any
 
+import msgspec
 import pytest
 
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
@@ -16,17 +17,10 @@ from bridge.virtual_link import NO_COMMAND
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import encode
-from hil_tests.testing.drives import (
-    SLOW_TOY,
-    decoded,
-    make_feedback,
-    make_policy,
-    read,
-    start_edge,
-    start_simulate,
-    wait_until_driving_steadily,
-)
-from hil_tests.testing.edge import PATIENCE_S, make_command, make_state, wait_until
+from hil_tests.processes import PATIENCE_S, wait_until
+from hil_tests.testing.drives import SLOW_TOY, make_policy, read, start_simulate
+from hil_tests.testing.edge import start_edge, wait_until_driving_steadily
+from hil_tests.testing.messages import make_command, make_feedback, make_state
 from hil_tests.testing.policies import TASK, T
 
 
@@ -74,7 +68,7 @@ class Rig:
         self.answer = answer
 
     def publish(self, payload):
-        step = decoded(payload).step
+        step = msgspec.msgpack.decode(payload)["step"]
         # The edge runtime answers no state that is as old as one it has seen, or older.
         refused = any(step <= before for before in self.published)
         self.published.append(step)
@@ -282,7 +276,7 @@ class VehicleRig(Rig):
         self.close = self.clock.close
 
     def publish(self, payload):
-        step = decoded(payload).step
+        step = msgspec.msgpack.decode(payload)["step"]
         self.clock.receive(encode(make_command(step)))
         threading.Timer(0.03, self.report, [step]).start()
 
@@ -347,15 +341,14 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
 
 def test_the_car_does_what_the_vehicle_did(tmp_path):
     policy, endpoint = make_policy(tmp_path, "constant", 0.3), free_endpoint()
-    out, log = tmp_path / "report.json", tmp_path / "edge.log"
+    out = tmp_path / "report.json"
     options = ("--clock", "realtime", "--loop", "vehicle")
     with (
         start_simulate(endpoint, out, SLOW_TOY, *options) as run,
-        log.open("w") as errors,
-        start_edge(endpoint, policy, "--vehicle", "mock", stderr=errors) as edge,
+        start_edge(endpoint, policy, "--vehicle", "mock") as edge,
     ):
-        wait_until_driving_steadily(log, 2.0)
-        edge.process.kill()
+        wait_until_driving_steadily(edge, 2.0)
+        edge.kill()
         assert run.wait() == 0, run.errors
     report = read(out)
     assert (report["loop"], report["clock"], report["standing"]) == ("vehicle", "realtime", True)

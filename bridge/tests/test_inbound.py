@@ -13,9 +13,8 @@ from bridge.report import SafeStopLog
 from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.manifest import Action
 from edge_runtime.wire import encode
-from hil_tests.testing.drives import make_feedback
-from hil_tests.testing.edge import HEALTH, make_command
 from hil_tests.testing.environments import ToyEnv
+from hil_tests.testing.messages import HEALTH, make_command, make_feedback
 from hil_tests.testing.policies import STEERING, TASK, T
 
 

@@ -21,8 +21,10 @@ from bridge.tests.test_recording import heard
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.wire import encode
+from hil_tests.processes import Process
 from hil_tests.testing import drives
-from hil_tests.testing.edge import make_command, make_state
+from hil_tests.testing.edge import start_edge
+from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import TASK
 
 SEEN = {
@@ -184,20 +186,20 @@ def test_a_drive_is_served_to_foxglove(tmp_path, refusal):
     endpoint, port = free_endpoint(), free_port()
     policy = drives.make_policy(tmp_path, "constant")
     with (
-        drives.BridgeProcess("view", "--foxglove", str(port), "--connect", endpoint) as view,
+        Process("bridge", "view", "--foxglove", str(port), "--connect", endpoint) as view,
         # So many drives that none is the last, however late a busy machine lets the client ask.
         drives.start_simulate(
             endpoint, tmp_path / "r.json", drives.SLOW_TOY, "--episodes", "1000"
         ) as run,
         contextlib.ExitStack() as edge,
     ):
-        assert view.process.stdout.readline() == f"open ws://127.0.0.1:{port} in Foxglove\n"
+        view.wait_for_line(f"open ws://127.0.0.1:{port} in Foxglove")
 
         def start_drive():
-            edge.enter_context(drives.start_edge(endpoint, policy))
+            edge.enter_context(start_edge(endpoint, policy))
 
         data = asyncio.run(first_message(port, "view/hunter01/frames", start_drive))
-        run.process.kill()
+        run.kill()
         assert view.wait(30) == 0, view.errors  # with the simulator
     assert msgspec.json.decode(data, type=RawImage).height == 90
     assert "by itself" in refusal("view", "a.mcap", "--foxglove")

@@ -21,7 +21,8 @@ import zenoh
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Chunk, Header, Message
+from mcap.records import Chunk, ChunkIndex, Header, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from bridge import recording as records
@@ -48,6 +49,7 @@ from edge_runtime.wire import (
     decode_state,
     encode,
 )
+from hil_tests.processes import PATIENCE_S, wait_until
 from hil_tests.testing.drives import (
     LEFT_TURN,
     SLOW_TOY,
@@ -56,15 +58,14 @@ from hil_tests.testing.drives import (
     flip,
     flip_chunk,
     make_policy,
-    messages_of,
     read,
     record_drive,
-    start_edge,
     start_record,
     start_simulate,
     writing,
 )
-from hil_tests.testing.edge import PATIENCE_S, make_command, make_state, wait_until
+from hil_tests.testing.edge import start_edge
+from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import SIZE, TASK
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
@@ -211,9 +212,9 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
     ):
         wait_until(lambda: len(states_in(recording)) > 10, "a second")
         time.sleep(1.2)  # Just after a flush there would be nothing to lose.
-        run.process.send_signal(signal.SIGKILL)
+        run.send(signal.SIGKILL)
         killed_ns = time.time_ns()
-        run.process.wait()
+        run.wait()
     return recording, (killed_ns - states_in(recording)[-1][0]) * 1e-9
 
 
@@ -259,7 +260,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
     ):
         wait_until(lambda: states_in(recording), "the first states")
         written, full = states_in(recording), recording.stat().st_size + 100
-        resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (full, full))
+        resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (full, full))
         assert recorder.wait() == 1, recorder.errors
         assert run.wait() == 0, run.errors
     (line,) = recorder.errors.splitlines()
@@ -352,10 +353,10 @@ def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
         with start_simulate(endpoint, tmp_path / "1.json", SLOW_TOY) as first:
             recorder = start_record(endpoint, recording, "--linger-s", "10")
             wait_until(lambda: len(states_in(recording)) > 5, "the first drive")
-            first.process.kill()
+            first.kill()
         with recorder, start_simulate(endpoint, tmp_path / "2.json", SLOW_TOY) as second:
             assert second.wait() == 0, second.errors
-            recorder.process.send_signal(signal.SIGTERM)
+            recorder.send(signal.SIGTERM)
             assert recorder.wait(PATIENCE_S) == 0, recorder.errors
     sessions = {state.session for _, state in states_in(recording)}
     assert len(sessions) == 2
@@ -366,6 +367,15 @@ def copy(tmp_path):
     path = tmp_path / "drive.mcap"
     shutil.copy(LEFT_TURN, path)
     return path
+
+
+def messages_of(path: Path, chunk: ChunkIndex) -> int:
+    """How many messages a chunk of an undamaged file holds."""
+    with path.open("rb") as stream:
+        stream.seek(chunk.chunk_start_offset)
+        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+    assert isinstance(record, Chunk)
+    return sum(isinstance(part, Message) for part in breakup_chunk(record, True))
 
 
 def without_chunk(number: int) -> list[tuple[str, int, bytes]]:

@@ -11,8 +11,10 @@ from bridge.replay import Answer, Exchange, _first_exchange, compare
 from bridge.tests.test_inbound import health
 from edge_runtime.reach import free_endpoint
 from edge_runtime.wire import encode
-from hil_tests.testing.drives import BridgeProcess, bridge_status, make_policy, start_edge
-from hil_tests.testing.edge import BLACK, WHITE, frames, make_command, make_state
+from hil_tests.processes import Process
+from hil_tests.testing.drives import bridge_status, make_policy
+from hil_tests.testing.edge import start_edge
+from hil_tests.testing.messages import BLACK, WHITE, frames, make_command, make_state
 
 EPOCH_NS = 1_700_000_000 * 10**9
 ANSWER_S, INFERENCE_S = 0.002, 0.001
@@ -349,7 +351,7 @@ def test_through_a_running_edge_runtime(hand, tmp_path):
     with start_edge(endpoint, make_policy(tmp_path, "constant"), "--vehicle-id", "v"):
         for _ in range(3):  # A busy machine may stand still for over 2 T.
             arguments = ["replay", str(hand.path), "--listen", endpoint, "--out", str(out)]
-            with BridgeProcess(*arguments) as run:
+            with Process("bridge", *arguments) as run:
                 status = run.wait()
             if status == 0:
                 break

@@ -12,16 +12,9 @@ from bridge import report as reports
 from bridge.progress import ProgressBar
 from edge_runtime.__main__ import main as edge_main
 from edge_runtime.reach import free_endpoint
-from hil_tests.testing.drives import (
-    SHORT_TOY,
-    SLOW_TOY,
-    make_feedback,
-    make_policy,
-    start_edge,
-    start_simulate,
-    wait_until_driving_steadily,
-)
-from hil_tests.testing.edge import make_command
+from hil_tests.testing.drives import SHORT_TOY, SLOW_TOY, make_policy, start_simulate
+from hil_tests.testing.edge import start_edge, wait_until_driving_steadily
+from hil_tests.testing.messages import make_command, make_feedback
 
 RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
 
@@ -112,31 +105,30 @@ def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):
         start_edge(endpoint, policy),
         start_simulate(endpoint, tmp_path / "r.json", SHORT_TOY, *options) as run,
     ):
-        first = run.process.stderr.readline()
-        assert run.process.poll() is None  # It comes while the other is still driven.
+        run.wait_for_line("episode 1 of 2: ")
+        assert not run.has_ended  # It comes while the other is still driven.
         assert run.wait() == 0
-    lines = [first, *run.errors.splitlines()]
+    lines = run.errors.splitlines()
     assert [line[:16] for line in lines] == [f"episode {number} of 2: " for number in (1, 2)]
     (last,) = run.output.splitlines()
     assert last.startswith("2 episodes: ")
 
 
 def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tmp_path):
-    policy, endpoint, log = make_policy(tmp_path, "constant"), free_endpoint(), tmp_path / "log"
+    policy, endpoint = make_policy(tmp_path, "constant"), free_endpoint()
     config = tmp_path / "edge.toml"
     config.write_text("armed_at_start = false\n")
     rearm = f"python -m edge_runtime rearm --connect {endpoint} --vehicle-id hunter01"
     with (
-        log.open("w") as errors,
-        start_edge(endpoint, policy, "--vehicle", "mock", "--config", str(config), stderr=errors),
+        start_edge(endpoint, policy, "--vehicle", "mock", "--config", str(config)) as edge,
         start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime") as run,
     ):
-        told = run.process.stderr.readline()
-        assert told == f"the vehicle stands until it is re-armed: {rearm}\n"
-        assert f"waits_for_rearm command='{rearm}'" in log.read_text()
+        run.wait_for_line("the vehicle stands")
+        assert run.errors == f"the vehicle stands until it is re-armed: {rearm}\n"
+        assert f"waits_for_rearm command='{rearm}'" in edge.errors
         assert edge_main(shlex.split(rearm)[3:]) == 0
-        wait_until_driving_steadily(log)
-        assert log.read_text().count("waits_for_rearm") == 1
+        wait_until_driving_steadily(edge)
+        assert edge.errors.count("waits_for_rearm") == 1
 
 
 T_S, REPORT_S = 0.1, 0.05

@@ -38,9 +38,11 @@ from edge_runtime.link_quality import FIELDS
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection, encode
+from hil_tests.processes import Process, wait_until
 from hil_tests.testing import drives
-from hil_tests.testing.edge import HEALTH, make_command, make_state, wait_until
+from hil_tests.testing.edge import start_edge
 from hil_tests.testing.environments import ToyEnv
+from hil_tests.testing.messages import HEALTH, make_command, make_feedback, make_state
 from hil_tests.testing.policies import TASK
 from hil_tests.testing.viewers import NO_GPU, in_place, listens
 
@@ -248,17 +250,17 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
     words = ("view", "--save", str(recording), "--connect", endpoint)
     with (
-        drives.BridgeProcess(*words) as view,
+        Process("bridge", *words) as view,
         drives.start_simulate(endpoint, tmp_path / "r.json", drives.SLOW_TOY) as run,
     ):
         wait_until(lambda: list(tmp_path.glob(".drive.rrd*")), "the recording to begin")
         if told == "the drive ends":
-            with drives.start_edge(endpoint, drives.make_policy(tmp_path, "constant")):
+            with start_edge(endpoint, drives.make_policy(tmp_path, "constant")):
                 assert run.wait() == 0, run.errors
         else:
             time.sleep(0.3)
             assert not recording.exists()
-            view.process.send_signal(signal.SIGTERM)
+            view.send(signal.SIGTERM)
         assert view.wait(20) == 0, view.errors
     found = verify(recording)
     entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
@@ -321,7 +323,7 @@ LINE = [[0.0, 0.0], [1.0, 1.0]]
 GOOD: dict[str, dict] = {
     "state": msgspec.to_builtins(make_state(3), builtin_types=(bytes,)),
     "command": msgspec.to_builtins(make_command(3)),
-    "feedback": msgspec.to_builtins(drives.make_feedback(3)),
+    "feedback": msgspec.to_builtins(make_feedback(3)),
     "health": msgspec.to_builtins(HEALTH),
     "scene": PLACE | {"roads": [LINE], "path": LINE, "goal": [1.0, 1.0], "vehicles": [CAR],
                           "round_trip_ms": 3.0, "answered_step": 2, "applied": [0.1]},
@@ -410,7 +412,7 @@ def test_rejections_are_counted_by_side_and_reason(log, kept, events):
     sides = [f"rejected/{side}/{of}" for side in ("simulator", "edge") for of in ("all", "stale")]
     assert kept == {path: [0, 2, 5] for path in sides}
     assert events == [f"edge rejected {new} states: stale" for new in (2, 3)]
-    for payload in (b"\xc1", encode(drives.make_feedback(3, speed_mps=0.5))):
+    for payload in (b"\xc1", encode(make_feedback(3, speed_mps=0.5))):
         log.write(messages.Heard("", "feedback", payload, 10**18, len(payload)))
     assert [event.split(": ")[0] for event in events[2:]] == ["unreadable feedback"]
     assert kept["speed/vehicle"] == [0.5]

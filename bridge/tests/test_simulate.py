@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from unittest.mock import Mock
 
 import gymnasium
@@ -25,28 +26,45 @@ from bridge.episode import Actuators, EpisodeRunner, pack
 from bridge.messages import Origin
 from bridge.virtual_link import NO_COMMAND, Decision
 from edge_runtime.manifest import Layout
+from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
+from hil_tests.processes import Process
 from hil_tests.testing.drives import (
     SLOW_TOY,
     TOY,
-    BridgeProcess,
     bridge_status,
-    drive_in_process,
     make_policy,
     read,
     record_drive,
-    refused,
     rerun,
-    start_edge,
     start_simulate,
-    wait_until_driving,
-    wait_until_driving_steadily,
 )
-from hil_tests.testing.edge import make_command
-from hil_tests.testing.odd import odd
+from hil_tests.testing.edge import start_edge, wait_until_driving, wait_until_driving_steadily
+from hil_tests.testing.environments import odd
+from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import PEDAL, STEERING, write_policy, write_rover
+
+
+def refused(run: Process, out: Path, *parts: str) -> None:
+    """Assert that it ends with status 2 and one line, which holds the parts, and writes nothing."""
+    assert run.wait() == 2
+    (line,) = run.errors.splitlines()
+    assert all(part in line for part in parts), line
+    assert not out.exists()
+
+
+def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
+    policy = load_policy(str(policy_path), allow_unsigned=True)
+    environment = gymnasium.make(TOY)
+    seen, info = environment.reset(seed=seed)
+    actions, ended = [], False
+    while not ended:
+        actions.append(policy.act({"frames": seen}))
+        seen, _, terminated, truncated, info = environment.step(actions[-1])
+        ended = terminated or truncated
+    return info["outcome"], np.array(actions)
 
 
 def drove_as_in_process(report, policy):
@@ -59,13 +77,12 @@ def drove_as_in_process(report, policy):
 @pytest.mark.parametrize("clock", ["lockstep", "realtime"])
 def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
     policy, endpoint = make_policy(tmp_path, "constant", 0.1), free_endpoint()
-    out, log = tmp_path / "killed.json", tmp_path / "edge.log"
+    out = tmp_path / "killed.json"
     with start_simulate(endpoint, out, SLOW_TOY, "--clock", clock) as run:
-        with log.open("w") as errors, start_edge(endpoint, policy, stderr=errors) as edge:
+        with start_edge(endpoint, policy) as edge:
             # One that had stopped by itself would not be missed.
-            wait_until_driving_steadily(log)
-            edge.process.send_signal(signal.SIGKILL)
-            edge.process.wait()
+            wait_until_driving_steadily(edge)
+            edge.kill()
         # The brake is due within 3 T; a new edge runtime may be there before.
         time.sleep(0.5)
         # Another board with another policy takes over in the same episode.
@@ -97,7 +114,7 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
     policy = make_policy(tmp_path, "constant")
     with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, SLOW_TOY) as run:
         wait_until_driving(edge)
-        run.process.send_signal(signal.SIGTERM)
+        run.send(signal.SIGTERM)
         assert run.wait(10) == 130
         time.sleep(0.5)
         # The final state came: at rest, not stopped because a link seems to be lost.
@@ -117,7 +134,7 @@ def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):
                 for policy, out in zip(policies, outs, strict=True):
                     where = ("--connect", endpoint, "--vehicle-id", out.stem)
                     drive = ("simulate", "--env", TOY, "--episodes", "2", "--out", str(out))
-                    runs.append(opened.enter_context(BridgeProcess(*drive, *where)))
+                    runs.append(opened.enter_context(Process("bridge", *drive, *where)))
                     opened.enter_context(start_edge(endpoint, policy, *where[2:]))
                 assert [run.wait() for run in runs] == [0, 0]
             reports = list(map(read, outs))
@@ -276,7 +293,7 @@ def test_what_an_environment_raises_is_one_line_with_its_place(monkeypatch):
     made = make_environment(TOY)
     monkeypatch.setattr(made.unwrapped, "_goal_m", None)
     made.reset(seed=0)
-    where = r"failed in step: TypeError: .* \(toy.py, line \d+\)$"
+    where = r"failed in step: TypeError: .* \(environments.py, line \d+\)$"
     with pytest.raises(UserError, match=f"^environment BridgeToy-v0 {where}"):
         made.step(np.zeros(1, np.float32))
 
@@ -490,6 +507,6 @@ def test_another_runtime_in_the_middle_of_a_drive_ends_it(tmp_path):
     with start_simulate(endpoint, out, "left_turn", *options) as run:
         with start_edge(endpoint, own) as edge:
             wait_until_driving(edge)
-            edge.process.kill()
+            edge.kill()
         with start_edge(endpoint, other):
             refused(run, out, "another task", "left_turn: frames uint8")

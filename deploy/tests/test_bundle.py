@@ -43,7 +43,7 @@ from deploy.installer.layout import Layout, unpack_wheel
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
 from edge_runtime.util import UserError
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import exit_status
 from hil_tests.testing.policies import public_pem
 
 MAX_JETPACK5_BYTES = 45_000_000

@@ -17,7 +17,7 @@ from deploy.__main__ import main
 from deploy.certs import _make_authority, _pem, _write_folder, issue, read_authority
 from edge_runtime.tls import load_tls
 from edge_runtime.util import UserError
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import exit_status
 
 PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
 

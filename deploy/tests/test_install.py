@@ -28,7 +28,9 @@ from deploy.installer import systemd
 from deploy.installer.layout import Layout, why_not_whole
 from deploy.installer.verify import UnhealthyError, UserError, read_bundle
 from deploy.tests.boards import HERE, Board, changed_wheel
-from hil_tests.testing.edge import Simulator, make_state, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.edge import Simulator
+from hil_tests.testing.messages import make_state
 
 RUN = "edge_runtime/run.py"
 MOCK = "edge_runtime/vehicles/mock.py"

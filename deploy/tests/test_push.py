@@ -10,7 +10,7 @@ from deploy.__main__ import main
 from deploy.bundle import make_bundle
 from deploy.certs import write_key_pair
 from deploy.tests.boards import HERE
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import exit_status
 
 SSH = """\
 #!{python}

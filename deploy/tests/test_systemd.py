@@ -16,7 +16,7 @@ from onnx import numpy_helper
 from deploy.installer.systemd import MAIN_UNIT, TRIAL_UNIT, Limits, Systemd
 from deploy.installer.verify import UnhealthyError
 from edge_runtime.policy import MAX_POLICY_MIB
-from hil_tests.testing.edge import run_command
+from hil_tests.testing.commands import run_command
 from hil_tests.testing.policies import write_policy
 
 UNITS = Path(__file__).parents[1] / "systemd"

@@ -11,7 +11,8 @@ from typing import Tuple, Type
 
 import msgspec
 import pytest
-from hil_tests.testing.edge import HEALTH, exit_status, run_command
+from hil_tests.testing.commands import exit_status, run_command
+from hil_tests.testing.messages import HEALTH
 from hil_tests.testing.policies import write_policy
 from hypothesis import given
 from hypothesis import strategies as st

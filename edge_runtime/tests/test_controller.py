@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hil_tests.testing.edge import make_state
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, STEERING
 from hypothesis import given
 from hypothesis import strategies as st

@@ -11,7 +11,7 @@ from typing import Any, Optional
 import msgspec
 import numpy as np
 import pytest
-from hil_tests.testing.edge import make_state
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, STEERING
 from hypothesis import settings
 from hypothesis import strategies as st

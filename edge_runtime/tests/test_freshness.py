@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hil_tests.testing.edge import make_state
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 from hil_tests.testing.vehicles import LEFT_TURN, PEDAL
 
 from edge_runtime.reach import free_endpoint

@@ -1,7 +1,7 @@
 from collections import Counter
 
 import pytest
-from hil_tests.testing.edge import make_state
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import T
 from hypothesis import given
 from hypothesis import strategies as st

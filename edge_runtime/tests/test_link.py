@@ -15,7 +15,8 @@ from unittest.mock import MagicMock
 
 import pytest
 import zenoh
-from hil_tests.testing.edge import HEALTH, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.messages import HEALTH
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

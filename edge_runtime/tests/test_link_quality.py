@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 import pytest
-from hil_tests.testing.edge import make_state
+from hil_tests.testing.messages import make_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import List
 
 import pytest
-from hil_tests.testing.edge import EdgeProcess, Simulator, make_state
+from hil_tests.testing.edge import Simulator, run_edge
+from hil_tests.testing.messages import make_state
 
 import edge_runtime
 from edge_runtime.__main__ import script
@@ -130,7 +131,7 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     # The board's Zenoh against the workstation's, over the wire.
     endpoint = free_endpoint()
     flags = (*signed.flags, "--connect", endpoint)
-    with EdgeProcess(*flags, python=python, cwd=tmp_path) as edge:
+    with run_edge(*flags, python=python, cwd=tmp_path) as edge:
         # The edge first, then one simulator after the other: each must see that it is alive.
         for session in ("first", "second"):
             with Simulator(endpoint) as simulator:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 from hil_tests.testing.vehicles import a_manifest
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -5,7 +5,8 @@ import math
 import time
 
 import pytest
-from hil_tests.testing.edge import EdgeProcess, Simulator, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.edge import Simulator, run_edge
 from hil_tests.testing.vehicles import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 
 from edge_runtime.reach import free_endpoint
@@ -178,7 +179,7 @@ def test_it_drives_and_stops_when_the_odometry_falls_silent(make_policy, tmp_pat
         f"vehicle.driver = 'ros2'\n[vehicle.ros2]\nlisten = '{ros_endpoint}'\n{topics}"
     )
     flags = [*make_policy(value=1.0).flags, "--connect", endpoint, "--config", str(settings)]
-    with Simulator(endpoint) as simulator, EdgeProcess(*flags) as edge, RosHunter(
+    with Simulator(endpoint) as simulator, run_edge(*flags) as edge, RosHunter(
         connect=ros_endpoint
     ) as hunter:
         simulator.wait_for_edge()

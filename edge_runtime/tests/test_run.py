@@ -13,16 +13,10 @@ import time
 from typing import Any
 
 import pytest
-from hil_tests.testing.edge import (
-    WHITE,
-    CommandProcess,
-    EdgeProcess,
-    Simulator,
-    frames,
-    make_state,
-    run_command,
-    wait_until,
-)
+from hil_tests.processes import Process, wait_until
+from hil_tests.testing.commands import run_command
+from hil_tests.testing.edge import Simulator, run_edge
+from hil_tests.testing.messages import WHITE, frames, make_state
 from hil_tests.testing.policies import T
 
 import edge_runtime
@@ -41,7 +35,7 @@ def edge_and_simulator(make_policy):
             endpoint = free_endpoint()
             simulator = opened.enter_context(Simulator(endpoint))
             policy = make_policy(kind, **options)
-            edge = opened.enter_context(EdgeProcess(*policy.flags, "--connect", endpoint, *flags))
+            edge = opened.enter_context(run_edge(*policy.flags, "--connect", endpoint, *flags))
             simulator.wait_for_edge()
             return edge, simulator
 
@@ -71,7 +65,7 @@ def command_of_reason(simulator, reason):
 
 def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulator):
     edge, simulator = edge_and_simulator("mean")
-    assert edge.ready_line.startswith("ready ")
+    assert edge.output.startswith("ready ")
     for step in range(50):
         level = step * 5
         command = simulator.ask(make_state(step, observation=frames(level)))
@@ -92,11 +86,10 @@ def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulat
 def test_a_signal_that_would_end_it_in_mid_drive_is_a_stop(edge_and_simulator):
     edge, simulator = edge_and_simulator("constant", "--vehicle", "mock")
     drive(simulator, range(5))
-    edge.process.send_signal(signal.SIGABRT)  # All of them: test_util.py
+    edge.send(signal.SIGABRT)  # All of them: test_util.py
     last = command_of_reason(simulator, "runtime_ended")
     assert (last.mode, last.action) == ("safe_stop", [-1.0])
-    _, log = edge.process.communicate(timeout=20.0)
-    assert (edge.process.returncode, " ended " in log) == (0, True)
+    assert (edge.wait(20.0), " ended " in edge.errors) == (0, True)
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
@@ -110,13 +103,12 @@ def test_a_reader_that_stands_still_holds_neither_the_watchdog_nor_the_end(make_
     endpoint = free_endpoint()
     run = ["run", *make_policy("constant").flags, "--connect", endpoint, "--vehicle", "mock"]
     options: Any = {stream: writer}
-    with Simulator(endpoint) as simulator, CommandProcess("edge_runtime", *run, **options) as edge:
+    with Simulator(endpoint) as simulator, Process("edge_runtime", *run, **options) as edge:
         simulator.wait_for_edge()
         assert drive(simulator, range(15))[0].mode == "drive"
         assert command_of_reason(simulator, "no_fresh_state").mode == "safe_stop"
         assert simulator.query("status")["mode"] == "safe_stop"
-        edge.process.terminate()
-        assert edge.process.wait(20.0) == 0
+        assert edge.end() == 0
     os.close(reader)
     os.close(writer)
 
@@ -151,7 +143,7 @@ def test_a_vehicle_is_left_braked_and_closed_or_the_log_says_that_it_hangs(
     (tmp_path / "busy_vehicle.py").write_text(BUSY)
     flags, endpoint = make_policy("constant").flags, free_endpoint()
     arguments = [*flags, "--connect", endpoint, "--vehicle", "busy_vehicle:Busy"]
-    with Simulator(endpoint) as simulator, EdgeProcess(*arguments, cwd=tmp_path) as edge:
+    with Simulator(endpoint) as simulator, run_edge(*arguments, cwd=tmp_path) as edge:
         simulator.wait_for_edge()
         drive(simulator, range(5))
         (tmp_path / "busy").touch()
@@ -191,9 +183,9 @@ def test_a_driver_that_hangs_before_the_drive_or_leaves_a_thread_does_not_hold_t
     (tmp_path / where).touch()
     endpoint, flags = free_endpoint(), make_policy("constant").flags
     run = ["run", *flags, "--connect", endpoint, "--vehicle", "held_vehicle:Held"]
-    with CommandProcess("edge_runtime", *run, cwd=tmp_path) as edge:
+    with Process("edge_runtime", *run, cwd=tmp_path) as edge:
         if where == "thread":
-            assert edge.process.stdout.readline().startswith("ready ")
+            edge.wait_for_line("ready ")
         else:
             wait_until((tmp_path / "here").exists, "the driver to hang")
         assert edge.end() == status
@@ -316,13 +308,11 @@ def test_a_second_runtime_with_the_same_vehicle_id_does_not_start(edge_and_simul
 def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):
     """Both started before the simulator, so that neither could know of the other."""
     endpoint, flags = free_endpoint(), make_policy().flags
-    edges = [EdgeProcess(*flags, "--connect", endpoint) for _ in range(2)]
+    edges = [run_edge(*flags, "--connect", endpoint) for _ in range(2)]
     with edges[0], edges[1], Simulator(endpoint) as simulator:
-        ended = wait_until(
-            lambda: [edge for edge in edges if edge.process.poll() is not None], "one of them ends"
-        )
-        assert [edge.process.returncode for edge in ended] == [2]
-        *log, last_line = ended[0].process.stderr.read().splitlines()
+        ended = wait_until(lambda: [edge for edge in edges if edge.has_ended], "one of them ends")
+        assert [edge.wait() for edge in ended] == [2]
+        *log, last_line = ended[0].errors.splitlines()
         assert last_line.startswith("error: another edge runtime")
         # The elder one sees it twice only where the younger one lives so long: see test_link.py.
         assert sum(" another_edge " in line for line in log) == 1
@@ -335,8 +325,9 @@ def test_it_says_that_the_simulator_is_there_for_another_vehicle(make_policy):
     endpoint = free_endpoint()
     words = f"{endpoint} is there, and has sent no state for vehicle id hunter01"
     flags = [*make_policy().flags, "--connect", endpoint]
-    with Simulator(endpoint, "hunter02"), EdgeProcess(*flags) as edge:
-        assert words in next(line for line in edge.process.stderr if " waiting " in line)
+    with Simulator(endpoint, "hunter02"), run_edge(*flags) as edge:
+        edge.wait_for_line(" waiting ")
+        assert words in next(line for line in edge.errors.splitlines() if " waiting " in line)
         assert edge.end() == 0
 
 

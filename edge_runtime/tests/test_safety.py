@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from hil_tests.testing.edge import render_table
+from hil_tests.testing.commands import render_table
 from hil_tests.testing.policies import T
 
 import edge_runtime

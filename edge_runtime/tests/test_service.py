@@ -17,7 +17,9 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from hil_tests.testing.edge import EdgeProcess, make_state, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.edge import run_edge
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
 
 from edge_runtime import log, loop, realtime
@@ -148,14 +150,14 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     endpoint = free_endpoint()
     signed = make_policy()
     flags = [*signed.flags, "--connect", endpoint, "--config", str(settings)]
-    with EdgeProcess(*flags, environment=environment) as edge:
-        assert edge.ready_line.startswith("ready ")
-        assert edge.ready_line.rstrip().endswith(f" verified_by={signed.public_key}")
+    with run_edge(*flags, environment=environment) as edge:
+        assert edge.output.startswith("ready ")
+        assert edge.output.rstrip().endswith(f" verified_by={signed.public_key}")
         assert systemd.until("READY") == "READY=1\nSTATUS=standby"
         assert [systemd.next() for _ in range(3)] == ["WATCHDOG=1"] * 3
-        edge.process.send_signal(signal.SIGSTOP)
+        edge.send(signal.SIGSTOP)
         assert systemd.is_told_nothing(0.6)
-        edge.process.send_signal(signal.SIGCONT)
+        edge.send(signal.SIGCONT)
         assert systemd.next() == "WATCHDOG=1"
         assert edge.end() == 0
         assert systemd.until("STOPPING") == "STOPPING=1"

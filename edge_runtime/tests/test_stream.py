@@ -5,7 +5,7 @@ import math
 import time
 
 import pytest
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 
 from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.stream import Stream

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from hil_tests.testing.edge import render_table
+from hil_tests.testing.commands import render_table
 from hil_tests.testing.vehicles import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from hypothesis import example, given
 from hypothesis import strategies as st

@@ -7,7 +7,8 @@ import time
 import msgspec
 import numpy as np
 import pytest
-from hil_tests.testing.edge import make_command, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import T
 from hil_tests.testing.vehicles import CAR, CARS, PEDAL, a_manifest
 from hypothesis import given, settings

@@ -8,7 +8,10 @@ from typing import Any, cast
 
 import msgspec
 import pytest
-from hil_tests.testing.edge import Simulator, make_state, run_command, wait_until
+from hil_tests.processes import wait_until
+from hil_tests.testing.commands import run_command
+from hil_tests.testing.edge import Simulator
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.vehicles import CAR, a_manifest
 
 import edge_runtime

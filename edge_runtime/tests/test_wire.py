@@ -5,7 +5,7 @@ from typing import Any, Dict, List, Optional, Union, get_type_hints
 import msgspec
 import numpy as np
 import pytest
-from hil_tests.testing.edge import HEALTH, make_command, make_state
+from hil_tests.testing.messages import HEALTH, make_command, make_state
 from hil_tests.testing.policies import SHAPE, SIZE, TASK
 from hypothesis import given
 from hypothesis import strategies as st

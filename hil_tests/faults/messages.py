@@ -15,7 +15,7 @@ from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
-from hil_tests.faults.rig import Rig, make_state
+from hil_tests.faults.rig import Rig, noisy_state
 from hil_tests.faults.rows import GAP, Try, drives_on, fault
 from hil_tests.processes import wait_until
 
@@ -45,10 +45,10 @@ def bad_states(rig: Rig, number: int) -> Try:
             # Two states that have overtaken one another, and one that says it is from the future.
             rig.sender.step += 3
             step = rig.sender.step
-            rig.sender.send(make_state(step - 1, rig.task))
-            rig.probe.put("state", encode(make_state(step - 2, rig.task)))
+            rig.sender.send(noisy_state(step - 1, rig.task))
+            rig.probe.put("state", encode(noisy_state(step - 2, rig.task)))
             sent["stale"] += 1
-            rig.sender.send(make_state(step, rig.task, sent_ns=time.time_ns() + _HOUR_NS))
+            rig.sender.send(noisy_state(step, rig.task, sent_ns=time.time_ns() + _HOUR_NS))
         time.sleep(rig.period_s / 2)
     return Try(rejected=sent)
 
@@ -92,7 +92,9 @@ def second_simulator(rig: Rig, number: int) -> Try:
     for step in range(steps):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
         rig.timeline.states[("second", number, step)] = time.monotonic()
-        rig.probe.put("state", encode(make_state(step, rig.task, session="second", episode=number)))
+        rig.probe.put(
+            "state", encode(noisy_state(step, rig.task, session="second", episode=number))
+        )
         time.sleep(rig.period_s)
     return Try(rejected={"foreign_session": steps})
 
@@ -113,7 +115,7 @@ def second_edge(rig: Rig, number: int) -> Try:
 @drives_on(_COUNTED, counted="edge")
 def garbage_states(rig: Rig, number: int) -> Try:
     """10,000 random and mutated states."""
-    return _put_garbage(rig, "state", make_state(1, rig.task, session=_FOREIGN), number)
+    return _put_garbage(rig, "state", noisy_state(1, rig.task, session=_FOREIGN), number)
 
 
 @drives_on(_COUNTED, counted="simulator", flows=False)
@@ -169,7 +171,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
     """(reason, payload) of what must not reach the policy, around the newest step."""
-    state, (name, *_) = make_state(step + 1, task), task.observation
+    state, (name, *_) = noisy_state(step + 1, task), task.observation
     large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
     valid = encode(state)
     yield "malformed", valid[: len(valid) // 2]
@@ -178,8 +180,8 @@ def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
     yield "schema", with_fields(valid, schema=1)
     yield "observation", with_fields(valid, observation=small)
     yield "not_finite", with_fields(valid, speed_mps=float("nan"))
-    yield "duplicate", encode(make_state(step, task))
-    yield "stale", encode(make_state(step - 1, task))
+    yield "duplicate", encode(noisy_state(step, task))
+    yield "stale", encode(noisy_state(step - 1, task))
     # From another time of day is no reason: the next one is good whatever its clock says.
 
 

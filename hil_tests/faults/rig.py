@@ -38,6 +38,7 @@ from hil_tests.faults.observe import (
     longest_gap_s,
 )
 from hil_tests.processes import Process, wait_until
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import TASK
 
 E = TypeVar("E")
@@ -336,14 +337,14 @@ class Sender:
         """Send the next step now."""
         with self.lock:
             self.step += 1
-            self.send(make_state(self.step, self._task))
+            self.send(noisy_state(self.step, self._task))
 
     def end_episode(self) -> None:
         """Send a final state, and no other until ``running`` is set."""
         self.running.clear()
         with self.lock:
             self.step += 1
-            self.send(make_state(self.step, self._task, final=True))
+            self.send(noisy_state(self.step, self._task, final=True))
 
     def stop(self) -> None:
         """End the thread."""
@@ -358,15 +359,14 @@ class Sender:
                 self.send_next()
 
 
-def make_state(step: int, task: Task = TASK, **changes: object) -> State:
-    """A valid state of the task, which sees noise."""
+def noisy_state(step: int, task: Task = TASK, **changes: Any) -> State:
+    """Make a valid state of the task, which sees noise."""
     seen = noise(task, np.random.default_rng(step)).items()
-    state = State(
-        session=SESSION, episode=0, step=step, sim_time_s=round(step * task.control_period_s, 6),
-        sent_ns=time.time_ns(), observation={name: value.tobytes() for name, value in seen},
-        speed_mps=3.0, final=False,
-    )  # fmt: skip
-    return msgspec.structs.replace(state, **changes)
+    fields: dict[str, Any] = {
+        "session": SESSION, "sim_time_s": round(step * task.control_period_s, 6), "speed_mps": 3.0,
+        "observation": {name: value.tobytes() for name, value in seen},
+    }  # fmt: skip
+    return make_state(step, **{**fields, **changes})
 
 
 class Truth(NamedTuple):

@@ -1,0 +1,1 @@
+"""What the tests of all folders share: policy files, messages, drives, environments and people."""

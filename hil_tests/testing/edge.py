@@ -1,111 +1,52 @@
-"""Real processes and real Zenoh sessions for the tests: an edge runtime and a simulator's end."""
+"""The edge runtime as a process, and the simulator's end of the wire in the test."""
 
 from __future__ import annotations
 
 import itertools
-import os
 import queue
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from edge_runtime import wire
-from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
-from hil_tests.testing.policies import SIZE, T
-
-# This machine may be busy: waits are long, and only what must never happen has a short limit.
-PATIENCE_S = 20.0
-BLACK, WHITE = 0, 255
+from hil_tests.processes import PATIENCE_S, Process, wait_until
+from hil_tests.testing.messages import make_state
+from hil_tests.testing.policies import T
 
 
-def frames(level: int) -> dict[str, bytes]:
-    """The observation of pictures that are grey throughout."""
-    return {"frames": bytes([level]) * SIZE}
+def run_edge(*arguments: str, **options: Any) -> Process:
+    """Start ``python -m edge_runtime run``, and wait until it is ready."""
+    return Process("edge_runtime", "run", *arguments, ready="ready ", **options)
 
 
-def make_state(step: int, **changes: Any) -> State:
-    """A valid black state; `changes` replace its fields."""
-    fields: dict[str, Any] = {
-        "session": "simulator-a", "episode": 0, "step": step,
-        "sim_time_s": step * 0.1, "sent_ns": time.time_ns(),
-        "observation": frames(BLACK), "speed_mps": 1.0, "final": False,
-    }  # fmt: skip
-    return State(**{**fields, **changes})
+def start_edge(endpoint: str, policy: object, *arguments: str) -> Process:
+    """Start an edge runtime with an unsigned test policy, and wait until it is ready."""
+    trust = ("--policy", str(policy), "--allow-unsigned")
+    return run_edge(*trust, "--connect", endpoint, *arguments)
 
 
-def make_command(step: int = 0, **changes: Any) -> Command:
-    """A valid command to drive; `changes` replace its fields."""
-    fields: dict[str, Any] = {
-        "session": "here", "episode": 0, "step": step, "mode": "drive", "action": [0.5],
-        "policy_id": "p", "received_ns": 1, "inference_ns": 1, "sent_ns": 1,
-    }  # fmt: skip
-    return Command(**{**fields, **changes})
+def wait_until_driving(edge: Process) -> None:
+    edge.wait_for_line("now=drive")
 
 
-HEALTH = Health(
-    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
-    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
-    inference_ms={}, uptime_s=0.0, sent_ns=0, command_ms={"p50": 1.5}, temperature_c=40.0,
-    load_1min=0.5, rss_mb=90.0, rivals=1,
-)  # fmt: skip
+def wait_until_driving_steadily(edge: Process, steady_s: float = 0.4) -> None:
+    """Wait until the edge runtime has driven that long without a stop."""
 
+    def steady() -> bool:
+        before = edge.errors
+        if not before.rpartition("now=")[2].startswith("drive"):
+            return False
+        time.sleep(steady_s)
+        return edge.errors == before
 
-def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
-    """Poll until the condition is true and return its value; fail with `what` otherwise."""
-    end_s = time.monotonic() + timeout_s
-    while time.monotonic() < end_s:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {timeout_s} s: {what}")
-
-
-class CommandProcess:
-    """``python -m`` with these arguments; killed at the end of the block if need be."""
-
-    def __init__(
-        self, *arguments: str, python: str = sys.executable, environment: Any = (), **options: Any
-    ) -> None:
-        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        words, variables = [python, "-m", *arguments], {**os.environ, **dict(environment)}
-        self.process: Any = subprocess.Popen(words, env=variables, **{**pipes, **options})
-
-    def wait(self, timeout_s: float = 60.0) -> int:
-        """The exit status; `output` and `errors` hold what it printed."""
-        self.output, self.errors = self.process.communicate(timeout=timeout_s)
-        return self.process.returncode
-
-    def end(self) -> int:
-        """SIGTERM, then the exit status."""
-        self.process.terminate()
-        return self.wait(PATIENCE_S)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.communicate()
-
-
-class EdgeProcess(CommandProcess):
-    """An edge runtime that has printed its first line."""
-
-    def __init__(self, *arguments: str, **options: Any) -> None:
-        super().__init__("edge_runtime", "run", *arguments, **options)
-        self.ready_line = self.process.stdout.readline().strip()
+    wait_until(steady, "a steady drive")
 
 
 class Simulator:
@@ -189,26 +130,3 @@ class Simulator:
 
     def _note_alive(self, sample: Any) -> None:
         (self.alive.set if str(sample.kind).endswith("PUT") else self.alive.clear)()
-
-
-def run_command(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "edge_runtime", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=cwd, check=False)
-
-
-def exit_status(main: Callable[[list[str]], int], arguments: list[str]) -> int:
-    """The status with which the command ends, also where argparse ends it."""
-    try:
-        return run_cli(main, arguments)
-    except SystemExit as end:
-        return int(end.code or 0)
-
-
-def render_table(events, states, after):
-    """A table of transitions as README.md shows it: a row for each event, a column a state."""
-    rows = [
-        ["event", *(f"in {state.value}" for state in states)],
-        *([event.value, *(after(state, event).value for state in states)] for event in events),
-    ]
-    first, *others = (f"| {' | '.join(row)} |" for row in rows)
-    return "\n".join((first, "|---" * len(rows[0]) + "|", *others))

@@ -1,11 +1,17 @@
-"""A car on a straight road. Importing this registers it, also in another process (--env)."""
+"""Environments for tests. Importing this registers them, also in another process (--env).
 
+`ToyEnv` is a car on a straight road, `Plain` and what follows have one oddity each, and `Rover` is
+another kind of robot.
+"""
+
+import os
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.spaces import Box, Dict
 
 GOAL_M = 14.0
 PERIOD_S = 0.1
@@ -81,3 +87,212 @@ SHORT_PARKING = "BridgeParking-v0"  # One of highway-env's, which alone has 100 
 if SHORT_PARKING not in gymnasium.registry:
     parking, less = "highway_env.envs.parking_env:ParkingEnv", {"config": {"duration": 15}}
     gymnasium.register(SHORT_PARKING, parking, kwargs=less)
+
+
+class Plain(gymnasium.Env[Any, Any]):
+    """Counts its steps, up to 20, and says nothing of itself."""
+
+    metadata = {}  # noqa: RUF012
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    observation_space: Any = Box(-1e7, 1e7, (3,), np.float32)
+
+    def scene(self) -> Any:
+        return {}
+
+    def seen(self) -> Any:
+        return np.full(3, self.steps / 10, np.float32)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.seed, self.steps = seed, 0
+        return self.seen(), {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self.seen(), float(-abs(action[0])), False, False, {}
+
+
+class Guessed(Plain):
+    metadata = {"render_fps": 20}  # noqa: RUF012
+
+
+class HasDt(Guessed):
+    dt = 0.05
+
+
+class HasFrequency(HasDt):
+    config: ClassVar[dict[str, Any]] = {"policy_frequency": 5}
+
+
+class Says(HasFrequency):
+    control_period_s = 0.25
+
+
+class NoRenderMode(Plain):
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        pass
+
+
+class Single(Plain):
+    """Only one may live in a process."""
+
+    control_period_s, alive = 0.1, False
+
+    def __init__(self) -> None:
+        if Single.alive:
+            raise RuntimeError("another instance of this simulator is alive in this process")
+        Single.alive = True
+
+    def close(self) -> None:
+        Single.alive = False
+
+
+class WritesAction(Plain):
+    control_period_s = 0.1
+
+    def step(self, action: Any) -> Any:
+        action *= 0.5
+        action += 0.25
+        return super().step(action)
+
+
+class FloatPicture(Plain):
+    control_period_s = 0.1
+    observation_space = Box(0, 255, (1, 16, 16), np.uint8)
+    shown: ClassVar[Any] = np.full((1, 16, 16), 0.9, np.float32)
+
+    def seen(self) -> Any:
+        return self.shown
+
+
+class Wanders(Single):
+    """Changes the working directory in every call."""
+
+    def __init__(self) -> None:
+        os.chdir("/tmp")
+
+    def step(self, action: Any) -> Any:
+        os.chdir("/")
+        return super().step(action)
+
+
+class Huge(Plain):
+    control_period_s = 0.1
+
+    def seen(self) -> Any:
+        return np.full(3, 1e6, np.float32)
+
+
+class Tells(Plain):
+    """Tells of its goals; every third seed comes to none."""
+
+    control_period_s = 0.1
+
+    def step(self, action: Any) -> Any:
+        *seen, info = super().step(action)
+        if self.steps == 10 and (self.seed or 0) % 3:
+            seen[2], info = True, {"outcome": "goal", "lateral_acceleration_mps2": -2.0}
+        return *seen, info
+
+
+class Offers(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """All that an environment may offer, where people put it."""
+
+    control_period_s, action_names, observation_name = 0.2, ("pedal",), "numbers"
+    key_rate_per_s, brake_action = 2.0, (-1.0,)
+    keys: ClassVar[dict[str, Any]] = {"w": (1.0,)}
+
+    def __init__(self) -> None:
+        super().__init__(WritesAction())
+        self.pressed: list[bool] = []
+
+    def press_brake(self, pressed: bool) -> None:
+        self.pressed.append(pressed)
+
+    def scene(self) -> dict[str, Any]:
+        return {"road_width_m": 4.0}
+
+    def expert(self) -> Any:
+        return self
+
+    def act(self) -> Any:
+        return [0.5]
+
+    def wants_control(self, action: Any) -> None:
+        return None
+
+
+for kind in (
+    Plain, Guessed, HasDt, HasFrequency, Says, NoRenderMode, Single, WritesAction, FloatPicture,
+    Wanders, Huge, Tells, Offers,
+):  # fmt: skip
+    gymnasium.register(f"odd/{kind.__name__}-v0", kind, max_episode_steps=20)  # type: ignore[arg-type]
+
+
+def odd(name: str) -> str:
+    """How it is asked for."""
+    return f"{__name__}:odd/{name}-v0"
+
+
+ROVER = f"{__name__}:test/Rover-v0"
+CAMERA = Box(0, 255, (12, 20, 3), np.uint8)
+
+
+class Rover(gymnasium.Env):
+    """Two wheels in metres a second; a camera, and numbers of which one has no bound."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    observation_space = Dict(
+        {"camera": CAMERA, "far": Box(-np.inf, np.inf, (1,)), "wheels": Box(-1, 3, (2,))}
+    )
+    action_space = Box(np.array([-1, 0], np.float32), np.array([3, 1], np.float32))
+    action_names = ("left", "right")
+    keys: ClassVar = {"ArrowUp": (3.0, 1.0), "KeyA": (-1.0, 0.0)}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        self.done: Any = np.zeros(2)
+
+    def _seen(self):
+        camera = self.np_random.integers(0, 255, CAMERA.shape).astype(np.uint8)
+        return {
+            "camera": camera,
+            "far": np.full(1, 7.5, np.float32),
+            "wheels": np.asarray(self.done, np.float32),
+        }
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._seen(), {}
+
+    def step(self, action):
+        self.done = action
+        return self._seen(), float(action[0]), False, False, {"is_success": action[0] > 2.9}
+
+    def render(self):
+        return np.zeros((8, 8, 3), np.uint8)
+
+    def expert(self):
+        return Careful(self)
+
+
+class Careful:
+    def __init__(self, env):
+        self.env = env
+
+    def act(self):
+        return np.array([3.0, 0.5])
+
+    def wants_control(self, policy_action):
+        return "slow" if policy_action[0] < 1.0 else None
+
+
+class Dark(Rover):
+    metadata = {}  # noqa: RUF012
+    render = gymnasium.Env.render  # raises NotImplementedError
+
+
+for name in ("Rover", "Dark"):
+    gymnasium.register(f"test/{name}-v0", f"{__name__}:{name}", max_episode_steps=12)

@@ -21,11 +21,11 @@ from hil_tests.processes import (
     trusting,
     wait_until,
 )  # fmt: skip
+from hil_tests.testing.drives import SHORT_TOY
 
 DELAY = sweep.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = sweep.Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
 JITTER = sweep.Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms", "{}")
-SHORT_TOY = "hil_tests.testing.environments:BridgeToyShort-v0"
 
 
 def rows_of(axis, *success):

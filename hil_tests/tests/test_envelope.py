@@ -28,7 +28,7 @@ from hil_tests.envelope import (
     find_region,
     network,
 )  # fmt: skip
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import exit_status
 from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes

@@ -15,7 +15,7 @@ from edge_runtime.util import UserError
 from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
-from hil_tests.faults.rig import ChassisProcess, Rig, Truth, make_state
+from hil_tests.faults.rig import ChassisProcess, Rig, Truth, noisy_state
 from hil_tests.faults.rows import ROWS, Row, Try
 from hil_tests.faults.run import Outcome, _try, report_row, run_faults, run_row
 from hil_tests.mock_hunter.chassis import FAULTS
@@ -64,7 +64,7 @@ def test_safe_stops_at_the_pace_of_drives_are_no_drive():
 
 
 def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
-    valid = wire.encode(make_state(3))
+    valid = wire.encode(noisy_state(3))
     payloads = list(mutated(valid, 3000, seed=1))
     assert payloads == list(mutated(valid, 3000, seed=1))
     assert payloads != list(mutated(valid, 3000, seed=2))
@@ -73,7 +73,7 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
     # The sender's pictures never trip a faulty policy.
-    assert np.frombuffer(make_state(1).observation["frames"], np.uint8).max() < 200
+    assert np.frombuffer(noisy_state(1).observation["frames"], np.uint8).max() < 200
 
 
 def test_a_rig_that_cannot_start_leaves_no_process(tmp_path, monkeypatch):

@@ -28,9 +28,11 @@ from edge_runtime.reach import free_endpoint, look
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from hil_tests.processes import Process
-from hil_tests.testing.drives import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
-from hil_tests.testing.edge import EdgeProcess, make_state, run_command, wait_until
+from hil_tests.processes import Process, wait_until
+from hil_tests.testing.commands import run_command
+from hil_tests.testing.drives import SLOW_TOY, make_policy, read
+from hil_tests.testing.edge import run_edge, wait_until_driving
+from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import T
 
 SETTLE_S = 0.4
@@ -145,8 +147,9 @@ def test_our_own_line_says_why(parties, endpoint, mode):
 
 def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, tmp_path):
     plain = endpoint.replace("tls/", "tcp/")
-    with EdgeProcess(*edge_flags(plain, tmp_path)) as edge:
-        line = next(line for line in edge.process.stderr if " waiting " in line)
+    with run_edge(*edge_flags(plain, tmp_path)) as edge:
+        edge.wait_for_line(" waiting ")
+        line = next(line for line in edge.errors.splitlines() if " waiting " in line)
         assert f"{plain} listens with TLS and wants --tls" in line
         assert edge.end() == 0
     place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
@@ -255,7 +258,7 @@ def test_a_certificate_that_really_expires_stops_the_vehicle(parties, tmp_path):
     """This listener does not end by itself. Zenoh closes the link, and mostly has it again."""
     place = free_endpoint("tls")
     flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
-    with EdgeProcess(*flags, "--vehicle", "mock") as edge:
+    with run_edge(*flags, "--vehicle", "mock") as edge:
         files = short_lived(parties, tmp_path / "simulator-hunter01", 6.0)
         ends_s = load_tls(files).expires.timestamp()
         with simulating(place, files) as commands:
@@ -279,7 +282,7 @@ def test_an_edge_ends_with_its_certificate(parties, tmp_path, vehicle):
         contextlib.closing(SimulatorPort(ours, "hunter01")) as port,
     ):
         short_lived(parties, files, 9.0)
-        with EdgeProcess(*flags, "--vehicle", vehicle) as edge:
+        with run_edge(*flags, "--vehicle", vehicle) as edge:
             drive(port, answered, 0, hears=True)
             assert edge.wait() == 2
         assert answered
@@ -296,12 +299,20 @@ def test_simulator_router_and_recorder_end_with_their_certificates(parties, tmp_
     files = [short_lived(parties, tmp_path / n, 9.0) for n in ("simulator-hunter01", "viewer")]
     simulator, viewer = (["--connect", place, "--tls", str(folder)] for folder in files)
     with (
-        BridgeProcess("router", "--listen", place, "--tls", str(router)) as hub,
-        BridgeProcess(
-            "simulate", "--env", SLOW_TOY, "--episodes", "999", *simulator, "--clock", "realtime"
+        Process("bridge", "router", "--listen", place, "--tls", str(router)) as hub,
+        Process(
+            "bridge",
+            "simulate",
+            "--env",
+            SLOW_TOY,
+            "--episodes",
+            "999",
+            *simulator,
+            "--clock",
+            "realtime",
         ) as run,
-        EdgeProcess(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge,
-        BridgeProcess("record", "--out", str(out), *viewer) as recorder,
+        run_edge(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge,
+        Process("bridge", "record", "--out", str(out), *viewer) as recorder,
     ):
         for process, folder in zip((run, recorder, hub), (*files, router), strict=True):
             assert process.wait() == 2
@@ -331,8 +342,8 @@ def start_router(endpoint, parties):
 def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, tmp_path):
     place = free_endpoint("tls")
     answered: list[bytes] = []
-    with EdgeProcess(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge:
-        assert edge.ready_line.startswith("ready")
+    with run_edge(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge:
+        assert edge.output.startswith("ready")
         router = start_router(place, parties)
         with session(place, parties / "simulator-hunter01") as simulator:
             port = SimulatorPort(simulator, "hunter01")
@@ -368,8 +379,8 @@ def drive_among(intruders, endpoint, flags, folder):
     out = folder / "r.json"
     simulate = ["simulate", "--env", SLOW_TOY, "--episodes", "3", "--listen", endpoint]
     with (
-        BridgeProcess(*simulate, "--out", str(out), *flags("simulator-hunter01")) as run,
-        EdgeProcess(*edge_flags(endpoint, folder), *flags("edge-hunter01")) as edge,
+        Process("bridge", *simulate, "--out", str(out), *flags("simulator-hunter01")) as run,
+        run_edge(*edge_flags(endpoint, folder), *flags("edge-hunter01")) as edge,
     ):
         wait_until_driving(edge)
         with contextlib.ExitStack() as opened:
@@ -460,12 +471,12 @@ def test_a_forged_token_of_another_vehicle_ends_no_edge(parties, tmp_path, is_th
     endpoint, anything_goes = free_endpoint("tls"), {"enabled": False}
     flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
     with contextlib.ExitStack() as opened:
-        edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
+        edge = None if is_there_first else opened.enter_context(run_edge(*flags))
         posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
         liveliness = opened.enter_context(posing).liveliness()
         for end in ("", "/0-elder"):
             opened.enter_context(liveliness.declare_token(f"phil/hunter01/alive{end}"))
-        edge = edge or opened.enter_context(EdgeProcess(*flags))
+        edge = edge or opened.enter_context(run_edge(*flags))
         time.sleep(4 * SETTLE_S)  # it looks twice within a second of the link
         assert edge.end() == 0
     assert "another" not in edge.errors
@@ -476,7 +487,7 @@ def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path, who):
     endpoint = free_endpoint("tls")
     flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
     rules = rules_for_listener(["hunter01"])
-    with listener(endpoint, parties / who, rules), EdgeProcess(*flags) as edge:
+    with listener(endpoint, parties / who, rules), run_edge(*flags) as edge:
         second = run_command("run", *flags)
         assert second.returncode == 2
         assert "another edge runtime is connected" in second.stderr

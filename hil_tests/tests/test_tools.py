@@ -23,7 +23,7 @@ from hil_tests.__main__ import main
 from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.sweep import simulate
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import exit_status
 
 ROOT = Path(__file__).parents[2]
 BY_NAME = {check.name: check for check in doctor.CHECKS}

@@ -7,14 +7,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
 import onnx
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box
 
 from bridge import environments as bridge
 from bridge.fork import RecordedEpisode
@@ -22,7 +22,7 @@ from bridge.messages import Origin
 from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.testing.odd import odd
+from hil_tests.testing.environments import CAMERA, ROVER, Rover, odd
 from hil_tests.testing.people import QUICK, Puppet
 from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
@@ -51,67 +51,6 @@ from trainer.person.session import Sitting, drive
 from trainer.person.web import encode_view
 from trainer.training.delayed import VehicleEnd
 from trainer.view import Shown, Steps
-
-ROVER = f"{__name__}:test/Rover-v0"
-CAMERA = Box(0, 255, (12, 20, 3), np.uint8)
-
-
-class Rover(gymnasium.Env):
-    """Two wheels in metres a second; a camera, and numbers of which one has no bound."""
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
-    observation_space = Dict(
-        {"camera": CAMERA, "far": Box(-np.inf, np.inf, (1,)), "wheels": Box(-1, 3, (2,))}
-    )
-    action_space = Box(np.array([-1, 0], np.float32), np.array([3, 1], np.float32))
-    action_names = ("left", "right")
-    keys: ClassVar = {"ArrowUp": (3.0, 1.0), "KeyA": (-1.0, 0.0)}
-
-    def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = render_mode
-        self.done: Any = np.zeros(2)
-
-    def _seen(self):
-        camera = self.np_random.integers(0, 255, CAMERA.shape).astype(np.uint8)
-        return {
-            "camera": camera,
-            "far": np.full(1, 7.5, np.float32),
-            "wheels": np.asarray(self.done, np.float32),
-        }
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self._seen(), {}
-
-    def step(self, action):
-        self.done = action
-        return self._seen(), float(action[0]), False, False, {"is_success": action[0] > 2.9}
-
-    def render(self):
-        return np.zeros((8, 8, 3), np.uint8)
-
-    def expert(self):
-        return Careful(self)
-
-
-class Careful:
-    def __init__(self, env):
-        self.env = env
-
-    def act(self):
-        return np.array([3.0, 0.5])
-
-    def wants_control(self, policy_action):
-        return "slow" if policy_action[0] < 1.0 else None
-
-
-class Dark(Rover):
-    metadata = {}  # noqa: RUF012
-    render = gymnasium.Env.render  # raises NotImplementedError
-
-
-for kind in ("Rover", "Dark"):
-    gymnasium.register(f"test/{kind}-v0", f"{__name__}:{kind}", max_episode_steps=12)
 
 
 @pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
@@ -267,7 +206,7 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     assert made.max_difference < 1e-5
     policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
     assert list(policy.manifest.observation) == ["camera", "far", "wheels"]
-    with pytest.raises(UserError, match="is typed: give --scenario trainer"):
+    with pytest.raises(UserError, match="is typed: give --scenario hil_tests"):
         evaluate(tmp_path / "p.onnx")
     filed = evaluate(tmp_path / "p.onnx", ROVER, runs=2)
     assert filed.mean_return == pytest.approx(alone.mean_return, abs=1e-3)
@@ -454,7 +393,7 @@ def test_a_stop_of_no_environments_own_begins_each_episode_with_hands_off():
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     env = make_environment(ROVER)
     env.reset(seed=0)
-    for expert in (expert_of(env), expert_of(env, f"{__name__}:Careful")):
+    for expert in (expert_of(env), expert_of(env, "hil_tests.testing.environments:Careful")):
         assert expert.act().tolist() == [1.0, 0.0]
         assert expert.wants_control(np.array([-1.0, 0.0], np.float32)) == "slow"
         assert expert.may_return()

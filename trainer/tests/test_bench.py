@@ -8,10 +8,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from hil_tests.testing.commands import call
 from trainer import bench
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.scenarios import SCENARIOS
-from trainer.tests.test_commands import call
 
 TINY = bench.Effort(
     batch_size=4, rounds=2, updates_per_round=1, steps_per_round=10, training_episodes=1

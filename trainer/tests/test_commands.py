@@ -12,9 +12,8 @@ import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from hil_tests.testing.edge import exit_status
+from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.policies import public_pem
-from trainer.__main__ import main
 from trainer.options import add_time_limit, deadline_s
 from trainer.training.command import SETTINGS
 from trainer.training.config import RunConfig
@@ -23,21 +22,6 @@ from trainer.util import save_torch
 
 POLICY = str(Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx")
 CONGESTION = POLICY.replace("left_turn", "congestion")
-
-
-def call(capsys, *arguments: str) -> tuple[int, str, str]:
-    """Run ``python -m trainer`` in this process: exit status, stdout, stderr."""
-    status = exit_status(main, list(arguments))
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
-
-
-def refusal(capsys, *arguments: str) -> str:
-    """The one line with which a command ends that is given bad input."""
-    status, out, err = call(capsys, *arguments)
-    assert (status, out, len(err.strip().splitlines())) == (2, "", 1)
-    assert "Traceback" not in err
-    return err
 
 
 WRONG = [

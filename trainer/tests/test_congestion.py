@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from hil_tests.testing.humans import drive
+from hil_tests.testing.people import drive
 from trainer.environments import make_environment
 from trainer.human.congestion import CongestionHuman
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hil_tests.testing.commands import call
 from trainer.experiments import claims, data, report
 from trainer.experiments.guidance import (
     best_by_rule,
@@ -18,7 +19,6 @@ from trainer.experiments.guidance import (
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import _cost, write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
-from trainer.tests.test_commands import call
 
 SEEDS = 3
 CONSTANT = data.Line("constant")

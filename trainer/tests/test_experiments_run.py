@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from edge_runtime.util import UserError
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments import guidance

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from edge_runtime.util import UserError
-from hil_tests.testing.humans import BRAKE, FULL, drive
+from hil_tests.testing.people import BRAKE, FULL, drive
 from trainer.drivers import constant_driver, load_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.config import HumanModelConfig

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from hil_tests.testing.humans import BRAKE, FULL, NOTHING, drive, episode
+from hil_tests.testing.people import BRAKE, FULL, NOTHING, drive, episode
 from trainer.drivers import constant_driver
 from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide, steps_held

@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from edge_runtime.util import UserError
+from hil_tests.testing.commands import call, refusal
 from trainer.__main__ import main
 from trainer.pictures import moving_average
-from trainer.tests.test_commands import call, refusal
 from trainer.training.metrics import (
     ALWAYS,
     NAMES,

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
+from hil_tests.testing.commands import refusal
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.human.guide import Intervention
 from trainer.learner import equations
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import Losses
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.tests.test_commands import refusal
 from trainer.training.config import RunConfig
 from trainer.training.delayed import DelayedPolicy
 from trainer.training.metrics import MetricsWriter

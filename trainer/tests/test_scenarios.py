@@ -14,7 +14,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from bridge.environments import CONDITIONS as SERVED
 from bridge.environments import describe
 from edge_runtime.manifest import Car
-from hil_tests.testing.humans import episode
+from hil_tests.testing.people import episode
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.human.guide import HumanGuide, steps_held

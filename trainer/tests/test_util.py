@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from edge_runtime.util import UserError
+from hil_tests.testing.commands import refusal
 from trainer import util
 from trainer.learner.config import LearnerConfig
-from trainer.tests.test_commands import refusal
 
 
 @pytest.mark.parametrize("command", ["train", "human"])

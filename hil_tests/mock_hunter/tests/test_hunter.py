@@ -33,7 +33,7 @@ from hil_tests.mock_hunter.hunter import (
 )
 from hil_tests.mock_hunter.process import Server, read_orders
 from hil_tests.processes import wait_until
-from hil_tests.testing.edge import render_table
+from hil_tests.testing.commands import render_table
 from hil_tests.testing.vehicles import CARS, STREAM_S, Rig
 
 TIMEOUT_S = 0.5

@@ -22,10 +22,10 @@ from hil_tests.testing.browser import (
     until,
     view_of_step,
 )
+from hil_tests.testing.environments import ROVER
 from hil_tests.testing.people import LET_GO
 from trainer.person.coach import Coaching, Episode, advise
 from trainer.person.web import VIEWS_UNDERWAY, Cockpit
-from trainer.tests.test_any_environment import ROVER
 
 pytestmark = pytest.mark.usefixtures("opened")
 

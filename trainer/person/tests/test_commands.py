@@ -9,20 +9,12 @@ import numpy as np
 import pytest
 
 from bridge.report import STOPPED
-from hil_tests.testing.people import (
-    LET_GO,
-    QUIT,
-    Discarding,
-    Puppet,
-    hold,
-    record,
-    recorded_step,
-)
+from hil_tests.testing.commands import call, refusal
+from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, record, recorded_step
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver
 from trainer.environments import make_environment
 from trainer.person.interface import Reading
 from trainer.person.recording import find_recordings, packed, read_steps
-from trainer.tests.test_commands import call, refusal
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import load_torch

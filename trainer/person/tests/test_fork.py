@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bridge.fork import RecordedEpisode, read_episode
+from hil_tests.testing.commands import call
 from hil_tests.testing.drives import record_in_process
 from hil_tests.testing.people import LET_GO, QUIT, Puppet, hold
 from hil_tests.testing.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
-from trainer.tests.test_commands import call
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]
 FORK = ["drive", "--human", "web", "--from", "drive.mcap", "--at", "0.95s"]

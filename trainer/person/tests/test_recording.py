@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import replace
 
 from edge_runtime.util import UserError
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 from hil_tests.testing.people import record, recorded_step
 from trainer.learner.replay import ReplayBuffer
 from trainer.person import recording

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from hil_tests.testing.edge import wait_until
+from hil_tests.processes import wait_until
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person.run import BehindTheScenes, Check, PersonRun, UnhurriedLearning
