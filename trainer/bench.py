@@ -26,7 +26,7 @@ from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import bfloat16_is_faster
-from trainer.learner.replay import ReplayBuffer
+from trainer.learner.replay import ReplayBuffer, Transition
 from trainer.learner.td3 import TD3Learner
 from trainer.options import set_threads
 from trainer.policy_file import real_observations
@@ -241,9 +241,8 @@ def gather(size: int, seed: int = 0) -> Experience:
 def filled(experience: Experience) -> ReplayBuffer:
     """A buffer of ours that holds all of it."""
     replay = ReplayBuffer(len(experience))
-    replay.start_episode(experience[0][0])
-    for _, action, reward, after, human in experience:
-        replay.add(action, float(reward), after, False, bool(human))
+    for before, action, reward, after, human in experience:
+        replay.add(Transition(before, action, float(reward), after, False, human=bool(human)))
     return replay
 
 

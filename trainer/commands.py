@@ -96,7 +96,7 @@ class _Set(argparse.Action):
 
 
 @command(
-    "trainer.person.session:run",
+    "trainer.person.drive:run",
     "python -m trainer drive --out runs/drives",
     "python -m trainer drive --policy runs/phil_1 --out runs/drives",
     "python -m trainer drive --from drive.mcap --at 3s --out runs/drives",

@@ -21,10 +21,11 @@ from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer.drivers import ActTogether, load_driver, located
 from trainer.environments import CONDITIONS, make_environment, scenario_of
-from trainer.human.guide import Action, Driver
+from trainer.human.guide import Driver
+from trainer.learner.replay import Action
 from trainer.options import limited_threads
 from trainer.training.config import period_of
-from trainer.training.delayed import VehicleEnd
+from trainer.training.delayed import DelayedVehicle
 
 NO_NETWORK = LatencySpec()
 
@@ -212,16 +213,15 @@ def drive_episodes(
     Its noise is added here; its scene is the environment's own (``environments.make_environment``).
     ``latency`` is the network between driver and vehicle, in virtual time.
     """
-    results = []
+    results, act = [], driver.act
+    if latency != NO_NETWORK:
+        env = DelayedVehicle(env, latency)
+        act = env.behind(driver.act)
     for seed in seeds:
         drive = Drive(env, seed, CONDITIONS[condition].noise_std)
         driver.reset()
-        network = None
-        if latency != NO_NETWORK:
-            network = VehicleEnd(env, latency, seed, drive.observation)
         while not drive.over:
-            seen = drive.observation
-            drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
+            drive.step(act(drive.observation))
         results.append(drive.result)
         on_episode(drive.result)
     return results

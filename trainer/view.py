@@ -44,12 +44,13 @@ from bridge.rerun.draw import Plot
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.util import UserError, counted
 from trainer.environments import make_environment
-from trainer.human.guide import REASONS, Reason
+from trainer.human.guide import REASONS, Intervention, Reason
 from trainer.learner.networks import FRAMES_SPACE
+from trainer.learner.replay import Transition
 from trainer.person.interface import Amount, amount, vector
-from trainer.person.recording import Step, find_recordings, read_steps
+from trainer.person.recording import RecordedStep, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
-from trainer.training.run import Seen, TrainingRun
+from trainer.training.run import TrainingRun
 
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
@@ -170,11 +171,11 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
     with sigterm_as_interrupt():  # Here, as signals are the main thread's.
         background = Background(opened)
         watcher = Watcher(run, background.put)
-        run.on_step = watcher.on_step
+        run.recorders.append(watcher)
         try:
             yield watcher.on_episode
         finally:
-            run.on_step = None
+            run.recorders.remove(watcher)
             watcher.hand_over()
             background.close()
             if background.dropped:
@@ -190,14 +191,16 @@ class Watcher:
         self._step = run.steps
         self._entries: list[StepEntry] = []
 
-    def on_step(self, seen: Seen) -> None:
+    def record(
+        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
+    ) -> None:
         """Take a control period."""
-        reason = None if seen.intervention is None else seen.intervention.reason
-        actions = amount(seen.policy_action), amount(seen.action)
-        self._entries.append(StepEntry(self._step, *actions, seen.speed_mps, reason))
+        reason = None if intervention is None else intervention.reason
+        actions = amount(transition.overruled), amount(transition.action)
+        self._entries.append(StepEntry(self._step, *actions, float(info["speed_mps"]), reason))
         self._step += 1
         if self._pace.due(time.monotonic()):
-            self.hand_over(seen.observation, _shown(self._run.env))
+            self.hand_over(transition.observation, _shown(self._run.env))
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
         """Take an episode's end."""
@@ -264,7 +267,7 @@ class Shown:
             for _, steps in groupby(read_steps(path), key=lambda step: step.episode):
                 yield from self._episode(list(steps))
 
-    def _episode(self, episode: list[Step]) -> Iterator[Entry]:
+    def _episode(self, episode: list[RecordedStep]) -> Iterator[Entry]:
         road = self._drive_again(episode)
         for number, step in enumerate(episode):
             policy = math.nan if step.policy_action is None else step.policy_action
@@ -289,7 +292,7 @@ class Shown:
         self.without_road += not road
         self.episodes += 1
 
-    def _drive_again(self, episode: list[Step]) -> list[Any]:
+    def _drive_again(self, episode: list[RecordedStep]) -> list[Any]:
         """The scene at each step, by the same seed and the same actions; empty where it differs."""
         first, scenes = episode[0], []
         module = first.scenario.rpartition(":")[0]

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from trainer.environments import make_environment
 from trainer.person.interface import Reading, View, Wish
-from trainer.person.recording import Recorder, Step, packed
+from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.person.session import Sitting
 
 LET_GO = Reading()
@@ -67,10 +67,10 @@ QUIT = wish("quit")
 
 
 def make_sitting(directory: Path, person: Puppet, alone: bool = False) -> Sitting:
-    return Sitting(person, Recorder(directory), make_environment("left_turn"), alone, QUICK)
+    return Sitting(person, make_environment("left_turn"), Recorder(directory), alone, QUICK)
 
 
-def record(directory: Path, steps: Iterable[Step]) -> Path:
+def record(directory: Path, steps: Iterable[RecordedStep]) -> Path:
     recorder = Recorder(directory)
     for step in steps:
         recorder.write(step)
@@ -85,9 +85,9 @@ def pictures(value: int) -> bytes:
     return packed(np.stack(frames))
 
 
-def recorded_step(sitting: int, index: int, **changes: Any) -> Step:
-    """Step ``index`` of an episode that began with the sitting."""
-    step = Step(
+def recorded_step(sitting: int, index: int, **changes: Any) -> RecordedStep:
+    """RecordedStep ``index`` of an episode that began with the sitting."""
+    step = RecordedStep(
         sitting=sitting, index=index, scenario="left_turn", seed=1, episode=0, step=index,
         time_ns=10**9 + index * 10**8, time_s=0.1 * index,
         seen=pictures(index), seen_next=pictures(index + 1),

@@ -1,21 +1,21 @@
 """The human beside the policy: watches each action, takes over, and hands control back."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Action = NDArray[np.float32]
-Observation = NDArray[Any]
-"""The two frames, or another environment's: of several entries a structured array."""
+from trainer.learner.replay import Action, Observation, Transition
+
 Reason = str  # Why the human takes over
-STUCK, ASKED = "stuck", "asked"
-REASONS: tuple[Reason, ...] = ("collision", "lane", STUCK, "heading", "offset", "person", ASKED)
+STUCK, ASKED, BY_PERSON = "stuck", "asked", "person"
+REASONS: tuple[Reason, ...] = ("collision", "lane", STUCK, "heading", "offset", BY_PERSON, ASKED)
 """In this order: a crash can hardly be avoided; the car stops in the traffic's lane; it waits for
 nothing; it turns aside; it is aside; a person took over; the robot asked for help. Another
 environment's expert may have others."""
+HOLD_S = 1.5
 
 
 class Driver(Protocol):
@@ -26,7 +26,7 @@ class Driver(Protocol):
         return
 
     def act(self, observation: Observation) -> Action:
-        """The action, float32 [n], for an observation."""
+        """Return the action for an observation."""
         ...
 
 
@@ -38,11 +38,11 @@ class Trigger(Protocol):
         return
 
     def wants_control(self, action: Action) -> Reason | None:
-        """Why a person would take over from ``action`` now, or None. Once a control period."""
+        """Return why a person would take over from ``action`` now, or None. Once a step."""
         ...
 
     def may_return(self) -> bool:
-        """Whether a person would give the wheel back here: by default anywhere."""
+        """Return whether a person would give the wheel back here: by default anywhere."""
         return True
 
 
@@ -50,7 +50,7 @@ class Expert(Trigger, Protocol):
     """The scripted human of an environment: drives from the true state, and says when."""
 
     def act(self, observation: Any = None) -> Action:
-        """The expert's action, float32 [n]."""
+        """Return the expert's action."""
         ...
 
 
@@ -63,52 +63,95 @@ class Intervention:
     first: bool  # Whether the human took over at this step (eq. 17's intervention time)
 
 
-class Guide(Protocol):
-    """What watches the policy: a person, or the expert or model that stands for one."""
+Stepped = tuple[Observation, float, bool, bool, dict[str, Any]]
+"""What ``env.step`` gives: observation, reward, terminated, truncated, info."""
+
+
+def make_transition(
+    observation: Observation,
+    policy_action: Action | None,
+    action: Action,
+    intervention: Intervention | None,
+    stepped: Stepped,
+    penalised: bool = False,
+    foreseen: Sequence[Observation] = (),
+) -> Transition:
+    """Make the transition of a control period, whether driven now or read from a recording."""
+    next_observation, reward, terminated, truncated, _ = stepped
+    return Transition(
+        observation=observation,
+        action=action,
+        reward=reward,
+        next_observation=next_observation,
+        terminal=terminated,
+        truncated=truncated,
+        human=intervention is not None,
+        overruled=policy_action,
+        penalised=penalised,
+        foreseen=tuple(foreseen),
+    )
+
+
+class GuideGone(Exception):  # noqa: N818 (no error: it was asked for)
+    """A person has quit before an episode began."""
+
+
+class Guide:
+    """Watches the policy and may take over. This one lets everything pass; others override it."""
+
+    stop = False  # A person wants no further episode
 
     def reset(self) -> None:
         """Start an episode with the policy in control."""
 
-    def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
-        """What the human does about ``policy_action``: None lets it pass. Once a step."""
-        ...
+    def watch(
+        self, observation: Observation, policy_action: Action, doubt: float = 0.0
+    ) -> Intervention | None:
+        """Return what the human does instead of ``policy_action``; None lets it pass. Once a step.
+
+        ``doubt``: how much the critics differ about the action, for a robot that asks.
+        """
+        return None
+
+    def end_episode(self, outcome: str) -> str:
+        """Return the outcome of the episode that has ended; a person may discard it."""
+        return outcome
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
 
 
-class Asking(Trigger):
-    """The robot asks for help where its critics differ most, and the human need not watch.
+class Asking:
+    """Lets the robot ask for help where its critics differ most; the human need not watch.
 
-    That is where their doubt is among the ``share`` of the highest of late: a budget of help, as
-    in ThriftyDAgger (2109.08273). Until it knows what is high the human watches.
+    It asks where the doubt is among the ``share`` of the highest of late: a budget of help, as in
+    ThriftyDAgger (2109.08273). Until it knows which doubts are high, the human watches.
     """
 
     MEMORY = 500  # Control periods
 
-    def __init__(self, human: Trigger, share: float) -> None:
-        self.human, self.share = human, share
+    def __init__(self, share: float) -> None:
+        self.share = share
         self.doubts: deque[float] = deque(maxlen=self.MEMORY)
 
-    def may_return(self) -> bool:
-        """Whether the human would give control back here."""
-        return self.human.may_return()
-
-    def reset(self) -> None:
-        """Forget the last episode, but no doubt."""
-        self.human.reset()
-
-    def wants_control(self, action: Action) -> Reason | None:
-        """Whether the last of ``doubts``, which is that about ``action``, is a high one."""
-        watched = self.human.wants_control(action)
+    def ask(self, doubt: float, watched: Reason | None) -> Reason | None:
+        """Note a step's doubt; return the reason to take over in it, if any."""
+        self.doubts.append(doubt)
         if len(self.doubts) < self.MEMORY:
             return watched
-        return ASKED if self.doubts[-1] > np.quantile(self.doubts, 1.0 - self.share) else None
+        return ASKED if doubt > np.quantile(self.doubts, 1.0 - self.share) else None
 
 
 class Attention:
     """The attention of a human who comes late, or overlooks a reason and then is blind for a while.
 
-    ``late_steps`` are the least and the longest delay, in control periods, of which each is drawn
-    anew; ``missed_share`` is how often it notices nothing. A late human takes over from what the
-    policy does by then, and that is what has the penalty.
+    ``late_steps`` are the least and the longest delay in control periods; each take-over's is drawn
+    anew. ``missed_share`` is how often the human notices nothing. A late human takes over from what
+    the policy does by then, and that is what has the penalty.
     """
 
     BLIND_STEPS = 15
@@ -125,7 +168,7 @@ class Attention:
         self._steps_left = 0
 
     def notices(self, reason: Reason | None) -> Reason | None:
-        """The reason, once the delay has passed; a take-over that has begun is not given up."""
+        """Return the reason once the delay has passed; a begun take-over is not given up."""
         if self._steps_left == 0:
             if reason is None:
                 return None
@@ -137,16 +180,31 @@ class Attention:
         return self._reason if self._steps_left == 0 else None
 
 
-HOLD_S = 1.5
+class PoorHands:
+    """Makes a share of a human's actions wrong: ``biased``, always the same, or drawn each time."""
+
+    def __init__(self, share: float, biased: float | None, random: np.random.Generator) -> None:
+        self.share, self.biased, self.random = share, biased, random
+
+    def spoil(self, action: Action) -> Action:
+        """Return the action, or a wrong one in its place."""
+        if self.random.random() >= self.share:
+            return action
+        wrong = (
+            self.random.uniform(-1.0, 1.0, action.shape)
+            if self.biased is None
+            else np.full(action.shape, self.biased)
+        )
+        return wrong.astype(np.float32)
 
 
 def steps_held(period_s: float) -> int:
-    """For how many control periods a human holds the wheel."""
+    """Return for how many control periods a human holds the wheel."""
     return round(HOLD_S / period_s)
 
 
-class HumanGuide:
-    """Turns trigger and driver into interventions.
+class HumanGuide(Guide):
+    """Turns the trigger of a scripted human and a driver into interventions.
 
     The human stays in control for ``hold_steps`` from the last reason for it. A second and a half:
     a person first brings the car out of what made them take over. Where the robot asks, it is a
@@ -159,9 +217,13 @@ class HumanGuide:
         trigger: Trigger,
         hold_steps: int,
         attention: Attention | None = None,
+        asking: Asking | None = None,
+        hands: PoorHands | None = None,
+        random: np.random.Generator | None = None,
     ) -> None:
+        """``random`` is the stream that attention and hands draw from, kept in a checkpoint."""
         self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
-        self.attention = attention
+        self.attention, self.asking, self.hands, self.random = attention, asking, hands, random
         self.reset()
 
     def reset(self) -> None:
@@ -173,10 +235,13 @@ class HumanGuide:
         self._steps_left = 0
         self._reason: Reason | None = None
 
-    def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
-        """What the human does about ``policy_action``: None lets it pass. Once a step."""
-        trigger = self.trigger.wants_control(policy_action)
-        before = self._reason
+    def watch(
+        self, observation: Observation, policy_action: Action, doubt: float = 0.0
+    ) -> Intervention | None:
+        """Return what the human does instead of ``policy_action``, if anything."""
+        trigger, before = self.trigger.wants_control(policy_action), self._reason
+        if self.asking:
+            trigger = self.asking.ask(doubt, trigger)
         if before is None and self.attention:
             trigger = self.attention.notices(trigger)
         if trigger is not None:
@@ -191,4 +256,19 @@ class HumanGuide:
             self.driver.reset()
             self._reason = trigger
         assert self._reason is not None
-        return Intervention(self.driver.act(observation), self._reason, first=before is None)
+        action = self.driver.act(observation)
+        action = self.hands.spoil(action) if self.hands else action
+        return Intervention(action, self._reason, first=before is None)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the random stream and the robot's doubts."""
+        doubts: Sequence[float] = self.asking.doubts if self.asking else ()
+        random = self.random.bit_generator.state if self.random else None
+        return {"guidance": random, "doubts": list(doubts)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        if self.random:
+            self.random.bit_generator.state = state["guidance"]
+        if self.asking:
+            self.asking.doubts.extend(state["doubts"])

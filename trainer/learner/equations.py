@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import softplus
 
-Action = NDArray[np.float32]
+from trainer.learner.replay import Action
 
 
 def masked_action(policy_action: Action, human_action: Action | None) -> Action:

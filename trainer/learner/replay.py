@@ -7,13 +7,16 @@ other observations it points at two.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+Action = NDArray[np.float32]  # In [-1, 1], [action size]
+Observation = NDArray[Any]
+"""The two frames, or another environment's: of several entries a structured array."""
 Indices = NDArray[np.int64]
 
 
@@ -34,6 +37,24 @@ COLUMNS = (
 )  # fmt: skip
 """What is kept of a transition beside its pictures."""
 AHEAD = "foreseen_"  # Prefix of the foreseen buffer's keys in a checkpoint
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One control period, as it happened at the vehicle: what replay and recordings take."""
+
+    observation: Observation  # s
+    action: Action  # a, the action that was carried out
+    reward: float  # The environment's; a learner shapes it (eq. 17)
+    next_observation: Observation  # s'
+    terminal: bool  # Whether s' ends the episode for good; a timeout does not
+    truncated: bool = False  # Whether the episode ends here although s' is not terminal
+    human: bool = False  # Delta: whether the human acted
+    overruled: Action | None = None
+    """The policy's action, which the human overruled where the human acted; None: ``action``."""
+    penalised: bool = False  # Whether an intervention begins that costs the policy (eq. 17)
+    foreseen: tuple[Observation, ...] = ()
+    """The observation, and those that the overruled action would have led to."""
 
 
 @dataclass(frozen=True)
@@ -141,61 +162,48 @@ class ReplayBuffer:
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
-    def start_episode(self, frames: NDArray[Any]) -> None:
-        """Take the first observation of an episode; a picture seen twice once only."""
-        if not self._stacked:
-            self._current = (self._add_picture(frames),)
-            return
-        older = newer = self._add_picture(frames[0])
-        if not np.array_equal(frames[0], frames[1]):
-            newer = self._add_picture(frames[1])
-        self._current = (older, newer)
+    def end_episode(self) -> None:
+        """Let the next transition begin an episode: it does not follow the one before."""
+        self._current = None
 
-    def add(
-        self,
-        action: NDArray[np.float32],
-        reward: float,
-        next_frames: NDArray[Any],
-        terminal: bool,
-        human: bool,
-        overruled: NDArray[np.float32] | None = None,
-        penalised: bool = False,
-        foreseen: Sequence[NDArray[Any]] = (),
-    ) -> None:
-        """Store a transition with the highest priority in its buffer (algorithm 1).
-
-        Args:
-            action: what was carried out.
-            reward: after shaping.
-            next_frames: the observation that it led to.
-            terminal: whether that ends the episode for good.
-            human: whether the human acted.
-            overruled: the policy's action in its place, if so.
-            penalised: whether that action is penalised.
-            foreseen: the observation before, and what the policy's action would have led to.
-        """
-        assert self._current is not None  # An episode has begun.
+    def add(self, transition: Transition) -> None:
+        """Store a transition with the highest priority in its buffer (algorithm 1)."""
+        if self._current is None:
+            self._current = self._begin(transition.observation)
         others = self._priorities[: self._used]
         if self._apart:  # It enters one of two buffers, each with priorities of its own
-            others = others[self._human[: self._used] == human]
+            others = others[self._human[: self._used] == transition.human]
         priority = float(others.max(initial=0.0)) or 1.0
-        newest = self._add_picture(next_frames[1] if self._stacked else next_frames)
+        after = transition.next_observation
+        newest = self._add_picture(after[1] if self._stacked else after)
         slot = self.added % self.capacity
         self._frame_ids[slot] = *self._current, newest
         self._current = (*self._current[1:], newest)
         self.added += 1
         self._oldest = max(self._oldest, self.added - self.capacity)
-        self._actions[slot] = action
-        self._rewards[slot] = reward
-        self._terminals[slot] = terminal
-        self._human[slot] = human
-        self._overruled[slot] = action if overruled is None else overruled
-        self._penalised[slot] = penalised
+        overruled = transition.overruled
+        self._actions[slot] = transition.action
+        self._rewards[slot] = transition.reward
+        self._terminals[slot] = transition.terminal
+        self._human[slot] = transition.human
+        self._overruled[slot] = transition.action if overruled is None else overruled
+        self._penalised[slot] = transition.penalised
         self.update_priorities(np.array([slot]), np.array([priority]))
-        if self._foreseen is not None and foreseen:
-            self._foreseen.start_episode(foreseen[0])
-            for frames in foreseen[1:]:
-                self._foreseen.add(action, 0.0, frames, True, True, overruled)
+        if self._foreseen is not None and transition.foreseen:
+            self._foreseen.end_episode()
+            for before, after in pairwise(transition.foreseen):
+                ahead = replace(transition, observation=before, next_observation=after, reward=0.0,
+                                terminal=True, human=True, penalised=False)  # fmt: skip
+                self._foreseen.add(ahead)
+
+    def _begin(self, frames: Observation) -> tuple[int, ...]:
+        """Store the first observation of an episode; a picture seen twice once only."""
+        if not self._stacked:
+            return (self._add_picture(frames),)
+        older = newer = self._add_picture(frames[0])
+        if not np.array_equal(frames[0], frames[1]):
+            newer = self._add_picture(frames[1])
+        return older, newer
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
         """Draw a minibatch by priority."""
@@ -243,7 +251,7 @@ class ReplayBuffer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
+        """Take up what ``state_dict`` gave; the next transition begins an episode."""
         self.added, self._oldest = state["added"], state["oldest"]
         self._frames_added = state["frames_added"]
         self._frame_ids[: self._used] = state["frame_ids"]

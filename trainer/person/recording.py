@@ -1,15 +1,15 @@
 """A sitting's recording: every step, kept from the moment it is taken.
 
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on; its messages are whole transitions
-(``Step``) in MessagePack. Each step is a chunk of its own, handed to the operating system at once.
-So whatever ends the process, at most one step is lost: the one that was being taken, or an
+(``RecordedStep``) in MessagePack. Each step is a chunk of its own, handed to the operating system
+at once. So whatever ends the process, at most one step is lost: the one that was being taken, or an
 episode's last, which says whether the person discarded it. 30 minutes are about 14 MB. Nothing is
 ever overwritten: sittings add up.
 """
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
@@ -24,18 +24,15 @@ from bridge.record import close_torn, new_recording_at
 from bridge.recording import Recording
 from bridge.report import DISCARDED
 from edge_runtime.util import UserError
-from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
-from trainer.learner.replay import ReplayBuffer
 from trainer.person.interface import Amount, Control, vector
-from trainer.training.learning import LearningThread
 
 TOPIC = "person/step"
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
 
-class Step(msgspec.Struct, frozen=True):
+class RecordedStep(msgspec.Struct, frozen=True):
     """One control period, whole: a transition, and what each did in it."""
 
     sitting: int
@@ -59,6 +56,8 @@ class Step(msgspec.Struct, frozen=True):
     truncated: bool
     speed_mps: float
     outcome: str = ""  # How the episode ended here, if it did
+    ahead: tuple[bytes, ...] = ()
+    """What the policy's action would have led to, where the algorithm foresees; as ``seen``."""
 
     @property
     def observation(self) -> NDArray[Any]:
@@ -70,9 +69,14 @@ class Step(msgspec.Struct, frozen=True):
         """s', likewise."""
         return _unpacked(self.seen_next)
 
+    @property
+    def foreseen(self) -> tuple[NDArray[Any], ...]:
+        """As a transition's: the observation, and what the policy's action would have led to."""
+        return tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
+
 
 def packed(array: NDArray[Any]) -> bytes:
-    """An array as an .npy file, as a ``Step`` has it."""
+    """An array as an .npy file, as a recorded step has it."""
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=False)
     return stream.getvalue()
@@ -93,9 +97,24 @@ class Recorder:
         self._file, self._mcap = new_recording_at(self.path)
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
         self._closed = self._torn = False
+        self._last: RecordedStep | None = None
 
-    def write(self, step: Step) -> None:
-        """Keep a step; from here on no kill takes it away. UserError on a full disk."""
+    def add(self, step: RecordedStep) -> None:
+        """Keep a step; an episode's last one waits until it is known whether it is discarded."""
+        if step.terminated or step.truncated:
+            self._last = step
+        else:
+            self.write(step)
+
+    def end_episode(self, discarded: bool) -> None:
+        """Keep the last step of an episode; a second call does nothing."""
+        step, self._last = self._last, None
+        if step is not None:
+            outcome = DISCARDED if discarded else step.outcome
+            self.write(msgspec.structs.replace(step, outcome=outcome))
+
+    def write(self, step: RecordedStep) -> None:
+        """Write a step; from here on no kill takes it away. UserError on a full disk."""
         data, index = msgspec.msgpack.encode(step), self.index
         self.index += 1
         with self._one_line():
@@ -106,6 +125,7 @@ class Recorder:
         """Write the index and close the file; a sitting without steps leaves none behind."""
         if self._closed:
             return
+        self.end_episode(discarded=False)
         self._closed = True
         try:
             if not self._torn:  # An index would tell of a step that the disk did not take.
@@ -152,7 +172,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     return found
 
 
-def read_steps(path: Path) -> Iterator[Step]:
+def read_steps(path: Path) -> Iterator[RecordedStep]:
     """The steps of a recording, up to its end or to where a kill has cut it off.
 
     Of a damaged one, an episode that the damage has torn is left out: its steps do not follow one
@@ -173,7 +193,7 @@ def read_steps(path: Path) -> Iterator[Step]:
     recording.say_trouble(f", {given} of {steps} steps" if recording.is_damaged else "")
 
 
-def _steps(recording: Recording) -> Iterator[Step]:
+def _steps(recording: Recording) -> Iterator[RecordedStep]:
     """Every step that can be read."""
     path = recording.path
     for channel, message in recording.messages():
@@ -181,12 +201,12 @@ def _steps(recording: Recording) -> Iterator[Step]:
             hint = f"`python -m bridge view {path}` shows one of the wire"
             raise UserError(f"{path}, with {channel.topic}, is no recording of a sitting; {hint}")
         try:
-            yield msgspec.msgpack.decode(message.data, type=Step)
+            yield msgspec.msgpack.decode(message.data, type=RecordedStep)
         except msgspec.DecodeError as error:  # The chunk's checksum is right: no kill does that.
             raise UserError(f"{path} was recorded by another version: {error}") from None
 
 
-def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
+def read_episodes(steps: Iterable[RecordedStep]) -> Iterator[list[RecordedStep]]:
     """Recorded steps by the episode, without the episodes that the person discarded."""
     for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
         episode = list(drive)
@@ -194,47 +214,10 @@ def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
             yield episode
 
 
-def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Step]:
+def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[RecordedStep]:
     """The recorded steps from ``position``, a sitting and an index, on, over all sittings."""
     for path in _begun(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
-
-
-def store_again(
-    store: LearningThread | ReplayBuffer,
-    steps: Iterable[Step],
-    shape: Callable[[float, Intervention | None], float],
-    penalises: Callable[[Intervention | None], bool],
-    ticks_late: int = 0,
-) -> tuple[int, int]:
-    """Put recorded steps into the replay buffer as the run had put them there.
-
-    Episodes that the person discarded are left out. ``shape`` makes the reward to store (eq. 17)
-    of the environment's and what the person did; ``penalises`` tells whether that costs the policy
-    the penalty. Behind a network an action answers an observation that is ``ticks_late`` ticks old.
-
-    Returns how many steps were stored, and how many of them are the person's.
-    """
-    stored = human = 0
-    for episode in read_episodes(steps):
-        for known, step in zip(episode, episode[ticks_late:], strict=False):
-            if step is episode[ticks_late]:
-                store.start_episode(known.observation)
-            action = vector(step.action)
-            policy = step.action if step.policy_action is None else step.policy_action
-            by_person = Intervention(action, "person", step.first) if step.human else None
-            store.add(
-                action,
-                shape(step.reward, by_person),
-                known.next_observation,
-                step.terminated,
-                step.human,
-                overruled=vector(policy),
-                penalised=penalises(by_person),
-            )
-            stored += 1
-            human += step.human
-    return stored, human
 
 
 def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:

@@ -1,47 +1,20 @@
-"""One sitting: a person, a pace and a recording around an environment; and the command ``drive``.
+"""A sitting: a person at the wheel beside a loop, which is paced, shown and recorded for them.
 
-In ``drive`` a policy or the person drives, every step is recorded, and nothing is learned.
+`Sitting` is the loop's guide, `PacedEnvironment` what it drives, `SittingRecorder` its recorder.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import time
-from collections import Counter
-from collections.abc import Callable
-from contextlib import closing
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-from msgspec import structs
-
-from bridge.fork import ForkedEnvironment, find_fork
 from bridge.report import DISCARDED, RESTARTED, STOPPED, failed, settled
-from edge_runtime.cli import quit_on_signals
-from edge_runtime.files import check_writable
-from edge_runtime.util import UserError, counted
-from trainer.drivers import load_driver, located
-from trainer.environments import Adapted, make_environment, scenario_of
-from trainer.evaluation import trained_in
-from trainer.human.guide import Action, Driver, Observation
-from trainer.options import set_threads
+from edge_runtime.util import counted
+from trainer.human.guide import BY_PERSON, Guide, GuideGone, Intervention
+from trainer.learner.replay import Action, Observation, Transition
 from trainer.person.coach import Coach, Episode
-from trainer.person.controls import controls_of
-from trainer.person.interface import (
-    Amount,
-    Person,
-    Reading,
-    View,
-    amount,
-    open_person,
-    vector,
-)
-from trainer.person.recording import Recorder, Step, packed
-from trainer.person.takeover import Applied, Intent, TakeOver
-from trainer.scenarios import SCENARIOS
-from trainer.util import Purpose, episode_seed
+from trainer.person.interface import Amount, Control, Person, Reading, View, amount, vector
+from trainer.person.recording import RecordedStep, Recorder, packed
+from trainer.person.takeover import Intent, TakeOver
 
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
@@ -49,329 +22,6 @@ BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": No
 LATE_S = 0.02
 """A control period that begins later than this counts as late: a fifth of a period, about what a
 person notices."""
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Drive until the person quits; returns the exit status."""
-    set_threads(arguments.threads)
-    arguments.policy = arguments.policy and located(arguments.policy)
-    env, seed_of = _environment(arguments)
-    arguments.scenario = env.scenario  # By it the cockpit knows its keys.
-    policy = None
-    if arguments.policy is not None:
-        policy, _ = load_driver(arguments.policy, env, arguments.public_key)
-    out = Path(arguments.out)
-    check_writable(out / "sitting")  # Before a browser opens.
-    with closing(env), closing(open_person(arguments)) as person:
-        recorder = Recorder(out)
-        made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
-        with closing(made) as sitting, quit_on_signals(sitting.quit):
-            outcomes = drive(sitting, policy, seed_of, arguments.episodes)
-    print(f"outcomes: {_listed(outcomes) or 'none'}; {sitting.summary()}")
-    return 0
-
-
-SeedOf = Callable[[int], int]  # Of an episode, given its number over all sittings
-
-
-def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
-    """What is driven: episodes that are others in every sitting, or one recorded drive's."""
-    if asked.recording is None:
-        if asked.at or asked.episode is not None or asked.vehicle_id:
-            raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
-        seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        period_s = None
-        if asked.policy is not None:
-            _, period_s = trained_in(asked.policy, asked.public_key)
-        scenario = asked.scenario or "left_turn"
-        controls_of(scenario)  # Now: of some simulators only one may live, and this closes its own.
-        return make_environment(scenario, period_s=period_s), seed_of
-    recorded, step = find_fork(asked.recording, asked)
-    own = recorded.environment(asked.scenario, "--scenario")
-    name = scenario_of(asked.scenario or recorded.origin.environment)
-    is_ours = name in SCENARIOS
-    env: Any = ForkedEnvironment(own.unwrapped if is_ours else own, recorded, step)
-    env.control_period_s = recorded.task.control_period_s
-    return (env if is_ours else Adapted(env, name)), lambda number: recorded.origin.seed
-
-
-def drive(
-    sitting: Sitting, policy: Driver | None, seed_of: SeedOf, episodes: int | None
-) -> Counter[str]:
-    """Drive until the person quits, or so many episodes (None: no end); how often one ended how.
-
-    The policy drives until the person takes over; without one, the person drives alone.
-    """
-    outcomes = Counter[str]()
-    number = sitting.recorder.sitting
-    while not sitting.stop and outcomes.total() != episodes:
-        seed = seed_of((number << 32) + sitting.episode)
-        try:
-            observation, _ = sitting.reset(seed)
-        except SittingOver:
-            break
-        if policy is not None:
-            policy.reset()
-        ended = False
-        while not ended:
-            policy_action = None if policy is None else amount(policy.act(observation))
-            applied = sitting.decide(observation, policy_action)
-            action = vector(applied.action)
-            observation, _, terminated, truncated, info = sitting.step(action)
-            ended = terminated or truncated
-        outcomes[sitting.rest(info["outcome"])] += 1
-        sitting.episode += 1
-        sitting.progress = _listed(outcomes)
-    return outcomes
-
-
-def _listed(outcomes: Counter[str]) -> str:
-    return ", ".join(f"{count} {word}" for word, count in outcomes.items())
-
-
-class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
-    """The person has quit between two episodes."""
-
-
-class Sitting:
-    """A scenario's environment with a person at the wheel, from the cockpit's opening to its end.
-
-    The loop calls ``reset``, then ``decide`` before and ``step`` for each control period, and
-    ``rest`` after an episode. All else is the environment's own. ``alone``: nobody but the person
-    drives; ``speed``: simulated seconds in one of the person's.
-    """
-
-    def __init__(
-        self, person: Person, recorder: Recorder, env: Any, alone: bool = False, speed: float = 1.0
-    ) -> None:
-        self.env = env
-        self.person, self.recorder, self.alone = person, recorder, alone
-        self.pacer = Pacer(env.control_period_s / speed)
-        self.stop = False  # The sitting is to end: asked for by the person, or by a signal
-        self.closed = False
-        self.episode = 0  # The number of the episode, or of the next one; the loop counts
-        self.progress = ""
-        self.episodes = self.interventions = self.human_steps = self.discarded = 0
-        """Discarded episodes are counted in `discarded` alone."""
-        self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
-        """What the person has given so far, seconds of simulated time, in discarded episodes, too,
-        and the episodes that missed the goal. A run that goes on adds what it had."""
-        self.ended: list[str] = []  # How each episode ended
-        self.coach = Coach()
-        self._taken_over_at = math.nan  # The step at which the last take-over began
-        self._paused = False
-        self._last_step: Step | None = None
-        """Of an episode that has ended, until it is known whether the person discards it."""
-        self._frames: Observation | None = None
-        """What the policy sees; None before the first episode, when there is nothing to show."""
-        self._policy_action: Amount | None = None
-        self._layout = env.layout
-        self._rest = amount(env.rest_action)
-        self._info: dict[str, Any] = {}
-        self._forget(0)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.env, name)
-
-    def reset(self, seed: int) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode as soon as the person is there; SittingOver where the person quits."""
-        self._frames, self._info = self.env.reset(seed=seed)
-        self._forget(seed)
-        while not self.person.present and not self.stop:
-            self._idle("waiting for the person's device")
-        if self.stop:
-            raise SittingOver
-        self._restart = self._discard = False
-        self.pacer.restart()
-        return self._frames, self._info
-
-    def decide(self, observation: Observation, policy_action: Amount | None) -> Applied:
-        """Show what is, wait for the control period, and ask the hands as late as possible.
-
-        ``policy_action`` is what the policy would do about the observation, in
-        [-1, 1]; None where the person drives alone.
-        """
-        self._frames, self._policy_action = observation, policy_action
-        self.show()
-        self.pacer.wait()
-        self._read()
-        if self._paused:
-            while self._paused and not self._to_end:
-                self._idle("")
-            self._paused = False
-            self.pacer.restart()
-        if policy_action is not None:
-            holds = self._intent.update(self._reading, time.monotonic())
-            self._applied = self._take_over.step(policy_action, self._reading.action, holds)
-        elif self.person.present:
-            first = self._number == 0 or not self._applied.human
-            self._applied = Applied(self._reading.action, "human", True, first)
-        else:  # The car rolls, and that demonstrates nothing.
-            self._applied = Applied(self._rest, "policy", False, False)
-        return self._applied
-
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control period; it is recorded. The person may end the episode after it."""
-        assert self._frames is not None
-        now = self._now()
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._info = info
-        if self._to_end and not (terminated or truncated):
-            truncated = True
-            info = {**info, "outcome": STOPPED if self.stop else RESTARTED}
-        applied = self._applied
-        step = Step(
-            **now,
-            sitting=self.recorder.sitting,
-            index=self.recorder.index,
-            seed=self._seed,
-            time_ns=self._read_ns,
-            seen=packed(self._frames),
-            seen_next=packed(observation),
-            action=applied.action,
-            human=applied.human,
-            first=applied.first,
-            reward=float(reward),
-            terminated=terminated,
-            truncated=truncated,
-            outcome=info.get("outcome", ""),
-        )
-        if terminated or truncated:
-            self._last_step = step
-        else:
-            self.recorder.write(step)
-        self._human_steps += applied.human
-        self._interventions += applied.first
-        if applied.first:
-            self._taken_over_at = self._number
-        self.cost["human_s"] += applied.human * self.env.control_period_s
-        self.cost["takeovers"] += applied.first
-        self._number += 1
-        return observation, reward, terminated, truncated, info
-
-    def rest(self, outcome: str) -> str:
-        """Show how the episode ended, which the person may still discard; how it really ended."""
-        # Counted in periods: on a machine that stands still, too, the person is asked.
-        for _ in range(math.ceil(REST_S / self.env.control_period_s)):
-            if self.stop:
-                break
-            self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
-            if self._discard:
-                self._write_last_step()  # At once: no kill shall take that back.
-        self._write_last_step()
-        told = DISCARDED if self._discard else outcome
-        self.ended.append(told)
-        self.cost["failures"] = sum(map(failed, settled(self.ended)))
-        period_s = self.env.control_period_s
-        driven_s = self._human_steps * period_s
-        since_s = (self._number - self._taken_over_at) * period_s
-        episode = Episode(self.episode, told, driven_s, self._interventions, since_s)
-        self.coach.episodes.append(episode)
-        if self._discard:
-            self.discarded += 1
-            return DISCARDED
-        self.episodes += 1
-        self.human_steps += self._human_steps
-        self.interventions += self._interventions
-        return outcome
-
-    def show(self, message: str = "") -> None:
-        """Show what is, and a line on what is going on besides driving."""
-        if self._frames is None or self.closed:
-            return
-        scene = self.env.scene()
-        view = View(
-            **self._now(),
-            scene=None if scene is None else {**BARE, **scene},
-            picture=self.env.render() if scene is None else None,
-            frames=self._frames if self._layout.stacked else None,
-            applied_action=self._applied.action,
-            distance_m=float(self._info["distance_m"]),
-            goal_m=float(self.env.goal_m),
-            late_ticks=self.pacer.late,
-            paused=self._paused,
-            progress=self.progress,
-            coach=self.coach.show(self.cost),
-            message=message,
-        )
-        self.person.show(view)
-
-    def _now(self) -> dict[str, Any]:
-        """What a view and a recorded step both say of the control period."""
-        return {
-            "scenario": self.env.scenario,
-            "episode": self.episode,
-            "step": self._number,
-            "time_s": self._number * self.env.control_period_s,
-            "policy_action": self._policy_action,
-            "human_action": self._reading.action,
-            "control": self._applied.control,
-            "speed_mps": float(self._info["speed_mps"]),
-        }
-
-    def summary(self) -> str:
-        """What it amounts to, in a line."""
-        if not self.recorder.index:
-            return "nothing was driven, and nothing recorded"
-        discarded = f"{counted(self.discarded, 'episode')} discarded, " * bool(self.discarded)
-        return (
-            f"{counted(self.episodes, 'episode')}, {discarded}"
-            f"{counted(self.interventions, 'intervention')}, "
-            f"{counted(self.human_steps, 'step')} yours, "
-            f"{counted(self.pacer.late, 'control period')} late: {self.recorder.path}"
-        )
-
-    def quit(self) -> bool:
-        """Ask for the end of the sitting; False where it is over already."""
-        self.stop = self.stop or not self.closed
-        return not self.closed
-
-    def close(self) -> None:
-        """Close the cockpit and the recording; a second call does nothing."""
-        self.closed = True
-        self._write_last_step()
-        self.recorder.close()
-        self.person.close()
-
-    @property
-    def _to_end(self) -> bool:
-        """Whether the person wants the episode to end."""
-        return self.stop or self._restart or self._discard
-
-    def _write_last_step(self) -> None:
-        """Record an episode's last step, which says whether it was discarded."""
-        step, self._last_step = self._last_step, None
-        if step is not None:
-            outcome = DISCARDED if self._discard else step.outcome
-            self.recorder.write(structs.replace(step, outcome=outcome))
-
-    def _forget(self, seed: int) -> None:
-        """Nothing of an episode has happened yet."""
-        self._seed, self._number = seed, 0
-        self._take_over, self._intent = TakeOver(), Intent(self._rest)
-        self._reading, self._read_ns = Reading(self._rest), 0
-        self._applied = Applied(self._rest, "human" if self.alone else "policy", self.alone, False)
-        self._policy_action = None
-        self._human_steps = self._interventions = 0
-        self._taken_over_at = math.nan
-        self._restart = self._discard = False
-
-    def _read(self) -> None:
-        """Ask the hands, and heed what they wish."""
-        self._read_ns = time.time_ns()
-        self._reading = self.person.poll(time.monotonic())
-        wishes = self._reading.wishes
-        self.stop |= "quit" in wishes
-        self._restart |= "restart" in wishes
-        self._discard |= "discard" in wishes
-        self._paused ^= "pause" in wishes
-
-    def _idle(self, message: str) -> None:
-        """A control period in which nothing moves."""
-        self.show(message)
-        self.pacer.restart()
-        self.pacer.wait()
-        self._read()
 
 
 class Pacer:
@@ -401,3 +51,273 @@ class Pacer:
             self._deadline_s += self.period_s
         else:
             self.restart()
+
+
+class Sitting(Guide):
+    """A person as a guide: waits for each control period, asks the hands, and shows what is.
+
+    ``env`` is the environment itself, ``recorder`` where the sitting is kept. ``alone``: nobody but
+    the person drives; ``speed``: simulated seconds in one of the person's.
+    """
+
+    def __init__(
+        self, person: Person, env: Any, recorder: Recorder, alone: bool = False, speed: float = 1.0
+    ) -> None:
+        self.person, self.env, self.recorder, self.alone = person, env, recorder, alone
+        self.pacer = Pacer(env.control_period_s / speed)
+        self.stop = self.closed = False
+        self.episode = 0  # The number of the episode, or of the next one
+        self.progress = ""
+        self.driven: list[Episode] = []  # In this sitting
+        self.ended: list[str] = []  # How each episode of the run ended
+        self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
+        """What the person has given so far, seconds of simulated time, in discarded episodes, too,
+        and the episodes that missed the goal. A run that goes on adds what it had."""
+        self.saved_at = 0, 0
+        """Sitting and step up to which the checkpoint knows what was recorded."""
+        self.coach = Coach()
+        self._paused = False
+        self._rest = amount(env.rest_action)
+        self._seen: tuple[Observation, dict[str, Any]] | None = None
+        """What the policy sees, and the info; None before the first episode: nothing to show."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing of an episode has happened yet."""
+        self._step = self._human_steps = self._takeovers = self._read_ns = 0
+        self._taken_over_at = math.nan  # The step at which the last take-over began
+        self._take_over = TakeOver()
+        self._intent = Intent(self._rest)
+        self._reading = Reading(self._rest)
+        self._policy_action: Amount | None = None
+        self._intervention: Intervention | None = None
+        self.applied: Amount = self._rest
+        self._control: Control = "human" if self.alone else "policy"
+        self._restart = self._discard = False
+
+    def begin(self, observation: Observation, info: dict[str, Any]) -> None:
+        """Start an episode as soon as the person is there; GuideGone where the person quits."""
+        self._seen = observation, info
+        self._forget()
+        while not self.person.present and not self.stop:
+            self._idle("waiting for the person's device")
+        if self.stop:
+            raise GuideGone
+        self._restart = self._discard = False
+        self.pacer.restart()
+
+    def watch(
+        self, observation: Observation, policy_action: Action | None, doubt: float = 0.0
+    ) -> Intervention | None:
+        """Show what is, wait for the control period, and ask the hands as late as possible.
+
+        ``policy_action`` is None where the person drives alone. In a hand-over the action is
+        neither the person's nor the policy's; the replay buffer takes it for the person's.
+        """
+        self._policy_action = None if policy_action is None else amount(policy_action)
+        self.show()
+        self.pacer.wait()
+        self._read()
+        if self._paused:
+            while self._paused and not self._to_end:
+                self._idle("")
+            self._paused = False
+            self.pacer.restart()
+        before, hands = self._intervention, self._reading.action
+        if self._policy_action is not None:
+            holds = self._intent.update(self._reading, time.monotonic())
+            self._intervention = self._take_over.step(self._policy_action, hands, holds)
+            assert self._take_over.applied is not None  # It has just decided.
+            self.applied = self._take_over.applied
+            self._control = self._take_over.control
+        elif self.person.present:
+            self._intervention = Intervention(vector(hands), BY_PERSON, first=before is None)
+            self.applied, self._control = hands, "human"
+        else:  # The car rolls, and that demonstrates nothing.
+            self._intervention, self.applied, self._control = None, self._rest, "policy"
+        self.moment, self.read_ns = self._now(), self._read_ns
+        return self._intervention
+
+    def moved(self, observation: Observation, info: dict[str, Any]) -> str:
+        """Take what a step has led to; return how the person ends the episode, else nothing."""
+        self._seen = observation, info
+        if self._intervention is not None:
+            self._human_steps += 1
+            self.cost["human_s"] += self.env.control_period_s
+        if self._intervention is not None and self._intervention.first:
+            self._takeovers += 1
+            self._taken_over_at = float(self._step)
+            self.cost["takeovers"] += 1
+        self._step += 1
+        return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
+
+    def end_episode(self, outcome: str) -> str:
+        """Show how the episode ended, which the person may still discard; return how it ended."""
+        period_s = self.env.control_period_s
+        # Counted in periods: on a machine that stands still, too, the person is asked.
+        for _ in range(math.ceil(REST_S / period_s)):
+            if self.stop:
+                break
+            self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
+            if self._discard:  # Written at once: no kill shall take that back.
+                self.recorder.end_episode(discarded=True)
+        self.recorder.end_episode(self._discard)
+        outcome = DISCARDED if self._discard else outcome
+        self.ended.append(outcome)
+        self.cost["failures"] = sum(map(failed, settled(self.ended)))
+        since_s = (self._step - self._taken_over_at) * period_s
+        human_s = self._human_steps * period_s
+        self.driven.append(Episode(self.episode, outcome, human_s, self._takeovers, since_s))
+        self.coach.episodes.append(self.driven[-1])
+        self.episode += 1
+        return outcome
+
+    def show(self, message: str = "") -> None:
+        """Show what is, and a line on what is going on besides driving."""
+        if self._seen is None or self.closed:
+            return
+        frames, info = self._seen
+        scene = self.env.scene()
+        view = View(
+            **self._now(),
+            scene=None if scene is None else {**BARE, **scene},
+            picture=self.env.render() if scene is None else None,
+            frames=frames if self.env.layout.stacked else None,
+            applied_action=self.applied,
+            distance_m=float(info["distance_m"]),
+            goal_m=float(self.env.goal_m),
+            late_ticks=self.pacer.late,
+            paused=self._paused,
+            progress=self.progress,
+            coach=self.coach.show(self.cost),
+            message=message,
+        )
+        self.person.show(view)
+
+    def summary(self) -> str:
+        """Return what the sitting amounts to, in a line."""
+        if not self.recorder.index:
+            return "nothing was driven, and nothing recorded"
+        kept = [episode for episode in self.driven if episode.outcome != DISCARDED]
+        discarded = len(self.driven) - len(kept)
+        steps = round(sum(episode.human_s for episode in kept) / self.env.control_period_s)
+        return (
+            f"{counted(len(kept), 'episode')}, "
+            + f"{counted(discarded, 'episode')} discarded, " * bool(discarded)
+            + f"{counted(sum(episode.takeovers for episode in kept), 'intervention')}, "
+            f"{counted(steps, 'step')} yours, "
+            f"{counted(self.pacer.late, 'control period')} late: {self.recorder.path}"
+        )
+
+    def quit(self) -> bool:
+        """Ask for the end of the sitting; False where it is over already."""
+        self.stop = self.stop or not self.closed
+        return not self.closed
+
+    def close(self) -> None:
+        """Close the cockpit and the recording; a second call does nothing."""
+        self.closed = True
+        self.recorder.end_episode(self._discard)
+        self.recorder.close()
+        self.person.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return how far the recording is, for a checkpoint; the person sees why nothing moves."""
+        self.show("saving")
+        return {"recorded": [self.recorder.sitting, self.recorder.index]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        sitting, index = map(int, state["recorded"])
+        self.saved_at = sitting, index
+
+    @property
+    def _to_end(self) -> bool:
+        """Whether the person wants the episode to end."""
+        return self.stop or self._restart or self._discard
+
+    def _now(self) -> dict[str, Any]:
+        """Return what a view and a recorded step both say of the control period."""
+        assert self._seen is not None
+        return {
+            "scenario": self.env.scenario,
+            "episode": self.episode,
+            "step": self._step,
+            "time_s": self._step * self.env.control_period_s,
+            "policy_action": self._policy_action,
+            "human_action": self._reading.action,
+            "control": self._control,
+            "speed_mps": float(self._seen[1]["speed_mps"]),
+        }
+
+    def _read(self) -> None:
+        """Ask the hands, and heed what they wish."""
+        self._read_ns = time.time_ns()
+        self._reading = self.person.poll(time.monotonic())
+        wishes = self._reading.wishes
+        self.stop |= "quit" in wishes
+        self._restart |= "restart" in wishes
+        self._discard |= "discard" in wishes
+        self._paused ^= "pause" in wishes
+
+    def _idle(self, message: str) -> None:
+        """Let a control period pass in which nothing moves."""
+        self.show(message)
+        self.pacer.restart()
+        self.pacer.wait()
+        self._read()
+
+
+class PacedEnvironment:
+    """Wraps an environment: an episode waits for the person, and ends when they wish."""
+
+    def __init__(self, env: Any, sitting: Sitting) -> None:
+        self.env, self.sitting = env, sitting
+
+    def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; GuideGone where the person quits before it begins."""
+        observation, info = self.env.reset(seed=seed)
+        self.seed = seed
+        self.sitting.begin(observation, info)
+        return observation, info
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Carry out an action for one control period."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        ended = self.sitting.moved(observation, info)
+        if ended and not (terminated or truncated):
+            truncated, info = True, {**info, "outcome": ended}
+        return observation, reward, terminated, truncated, info
+
+
+class SittingRecorder:
+    """Keeps every control period of a sitting: the transition, and what the person did in it."""
+
+    def __init__(self, vehicle: PacedEnvironment) -> None:
+        self._vehicle, self._sitting = vehicle, vehicle.sitting
+
+    def record(
+        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
+    ) -> None:
+        """Keep a control period; UserError on a full disk."""
+        sitting = self._sitting
+        recorder = sitting.recorder
+        recorder.add(
+            RecordedStep(
+                **sitting.moment,
+                sitting=recorder.sitting,
+                index=recorder.index,
+                seed=self._vehicle.seed,
+                time_ns=sitting.read_ns,
+                seen=packed(transition.observation),
+                seen_next=packed(transition.next_observation),
+                action=sitting.applied,
+                human=transition.human,
+                first=intervention is not None and intervention.first,
+                reward=float(transition.reward),
+                terminated=transition.terminal,
+                truncated=transition.truncated,
+                outcome=info.get("outcome", ""),
+                ahead=tuple(map(packed, transition.foreseen[1:])),
+            )
+        )

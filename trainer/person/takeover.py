@@ -5,12 +5,12 @@ the person wants control, ``TakeOver`` what the car is told while that changes.
 """
 
 import threading
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
+from trainer.human.guide import BY_PERSON, Intervention
 from trainer.person.interface import (
     WISHES,
     Amount,
@@ -19,6 +19,7 @@ from trainer.person.interface import (
     Wish,
     amount,
     distance,
+    vector,
 )
 
 SILENCE_S = 0.5  # A driver who is not heard for this long has let go
@@ -48,39 +49,35 @@ NEXT: dict[tuple[State, bool], tuple[State, State]] = {
 never jumps, and begins to move at once."""
 
 
-@dataclass(frozen=True)
-class Applied:
-    """One control period's decision."""
-
-    action: Amount  # What the car is told, in [-1, 1]
-    control: Control
-    human: bool
-    """Whether the step counts as the person's (mask Delta): all but the policy's own action."""
-    first: bool  # Whether an intervention begins here (eq. 17's intervention time)
-
-
 class TakeOver:
     """Decides each control period from what the policy and the person want, for one episode."""
 
     def __init__(self) -> None:
         self.state: State = "policy"
-        self._applied: Amount | None = None
+        self.applied: Amount | None = None  # What the car was told last
 
-    def step(self, policy_action: Amount, human_action: Amount, holds: bool) -> Applied:
-        """Decide one control period; ``holds``: whether the person wants control (``Intent``)."""
+    @property
+    def control(self) -> Control:
+        """What decides the applied action."""
+        return "human" if self.state == "taking" else self.state
+
+    def step(self, policy_action: Amount, human_action: Amount, holds: bool) -> Intervention | None:
+        """Decide one control period; ``holds``: whether the person wants control (``Intent``).
+
+        Every step counts as the person's whose action is not the policy's own.
+        """
         goal = human_action if holds else policy_action
         # At an episode's start there is nothing to leave from but the policy's action.
-        last = policy_action if self._applied is None else self._applied
+        last = policy_action if self.applied is None else self.applied
         before = self.state
         self.state = NEXT[before, holds][distance(goal, last) <= MAX_SLEW]
-        handing_over = self.state in ("taking", "returning")
-        if handing_over:
+        if self.state in ("taking", "returning"):
             change = np.clip(np.subtract(goal, last), -MAX_SLEW, MAX_SLEW)
             goal = amount(np.add(last, change))
-        self._applied = goal
-        control: Control = "human" if self.state == "taking" else self.state
-        human = self.state != "policy"
-        return Applied(self._applied, control, human, first=human and before == "policy")
+        self.applied = goal
+        if self.state == "policy":
+            return None
+        return Intervention(vector(goal), BY_PERSON, first=before == "policy")
 
 
 def moved(reading: Reading, rest: Amount) -> bool:

@@ -13,13 +13,11 @@ from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from trainer.learner.replay import FRAMES_LAYOUT
+from trainer.learner.replay import FRAMES_LAYOUT, Action, Observation
 from trainer.scenarios import Scene
 from trainer.scenarios.picture import BODY, COLUMNS, ROWS, Rasteriser, Rectangle, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle, footprint
 
-Observation = NDArray[np.uint8]
-Action = NDArray[np.float32]
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 Range = tuple[float, float]
 FAILURES = ("collision", "off_road")

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,15 +42,16 @@ from trainer.human.config import HumanModelConfig
 from trainer.human.model import HumanModel
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
-from trainer.learner.replay import Layout, ReplayBuffer
+from trainer.learner.replay import Layout, ReplayBuffer, Transition
 from trainer.learner.td3 import TD3Learner
-from trainer.person import session
+from trainer.person import drive as driving
 from trainer.person.controls import controls_of
+from trainer.person.drive import drive
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
-from trainer.person.session import Sitting, drive
+from trainer.person.session import Sitting
 from trainer.person.web import encode_view
-from trainer.training.delayed import VehicleEnd
+from trainer.training.delayed import DelayedVehicle
 from trainer.view import Shown, Steps
 
 
@@ -133,11 +135,11 @@ def test_the_papers_shape_learns_as_ever():
     random = np.random.default_rng(4)
     buffer = ReplayBuffer(60, steps=8, gamma=0.95, overruled_value=-10.0)
     frames = random.integers(0, 255, (42, 45, 80), np.uint8)
-    buffer.start_episode(frames[:2])
     for i in range(40):
         action = random.uniform(-1, 1, 1).astype(np.float32)
         seen, human, penalised = frames[i + 1 : i + 3], i % 3 == 0, i % 9 == 0
-        buffer.add(action, float(action[0]), seen, False, human, -action, penalised)
+        step = Transition(frames[i : i + 2], action, float(action[0]), seen, False, human=human)
+        buffer.add(replace(step, overruled=-action, penalised=penalised))
     learner = TD3Learner(LearnerConfig(precision="float32"), PHIL, seed=2)
     losses = [learner.update(buffer.sample(32, random))[:4] for _ in range(3)][-1]
     assert losses == pytest.approx((90.22279, 1.52736, 0.43012, -1.525), rel=1e-4)
@@ -179,9 +181,9 @@ def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space)
     size = layout.dtype.itemsize * int(np.prod(layout.shape))
     seen = np.frombuffer(random.bytes(41 * size), np.uint8) & 63  # no float that is not finite
     rows = seen.view(layout.dtype).reshape(41, *layout.shape)
-    buffer.start_episode(rows[0])
-    for row in rows[1:]:
-        buffer.add(np.zeros(2, np.float32), 1.0, row, False, bool(random.random() < 0.3))
+    for before, after in pairwise(rows):
+        human = bool(random.random() < 0.3)
+        buffer.add(Transition(before, np.zeros(2, np.float32), 1.0, after, False, human=human))
     copy = ReplayBuffer(50, 2, steps=3, layout=layout)
     copy.load_state_dict(buffer.state_dict())
     batch, again = (each.sample(16, np.random.default_rng(1)) for each in (buffer, copy))
@@ -257,9 +259,9 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
 
 def test_before_its_first_command_a_car_behind_a_network_has_hands_off():
     env = make_environment(ROVER)
-    seen, _ = env.reset(seed=0)
-    end = VehicleEnd(env, parse_spec("300ms"), 0, seen)
-    action = end.tick(seen, lambda _: np.ones(2, np.float32))
+    vehicle = DelayedVehicle(env, parse_spec("300ms"))
+    seen, _ = vehicle.reset(seed=0)
+    action = vehicle.behind(lambda _: np.ones(2, np.float32))(seen)
     assert outer(env.action_range, action).tolist() == [0.0, 0.0]
 
 
@@ -271,9 +273,9 @@ def test_a_person_drives_on_at_the_period_that_a_drive_was_recorded_with(monkeyp
     )  # fmt: skip
     task = bridge.describe(bridge.make_environment(dark), 0.5)
     recorded = RecordedEpisode(Path("drive.mcap"), "v", 0, origin, 0, task, began_ns=0)
-    monkeypatch.setattr(session, "find_fork", lambda *_: (recorded, 0))
+    monkeypatch.setattr(driving, "find_fork", lambda *_: (recorded, 0))
     asked: Any = SimpleNamespace(recording="drive.mcap", scenario=dark)
-    assert session._environment(asked)[0].control_period_s == 0.5
+    assert driving._environment(asked)[0].control_period_s == 0.5
 
 
 @pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])
@@ -349,9 +351,9 @@ def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
         for policy in (run, name.with_suffix(".onnx")):
             (episode,) = evaluate(policy, scenario, runs=1).episodes
             assert episode.time_s == 0.5 * episode.steps
-        env, _ = session._environment(drive_options(scenario, str(run.directory)))
+        env, _ = driving._environment(drive_options(scenario, str(run.directory)))
         assert env.control_period_s == 0.5
-        env, _ = session._environment(drive_options(scenario, None))
+        env, _ = driving._environment(drive_options(scenario, None))
         assert env.control_period_s != 0.5
         with pytest.raises(UserError, match=r"the control period is 0\.001"):
             make_environment(scenario, period_s=0.001)
@@ -432,7 +434,7 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     env, hands = make_environment(ROVER), Reading((1.0, 0.5), engaged=True)
     off = Reading(controls_of(ROVER).rest)
     person = Puppet([off] * 3 + [hands] * 5, then=off)
-    sitting = Sitting(person, Recorder(tmp_path), env, speed=QUICK)
+    sitting = Sitting(person, env, Recorder(tmp_path), speed=QUICK)
     drive(sitting, constant_driver(0.0, 2), abs, 1)
     sitting.close()
     steps = list(read_steps(sitting.recorder.path))

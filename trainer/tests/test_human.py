@@ -13,7 +13,7 @@ from trainer.drivers import constant_driver, load_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.config import HumanModelConfig
 from trainer.human.dagger import imitate
-from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, steps_held
+from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
@@ -204,13 +204,23 @@ def test_at_the_wheel_every_human_is_attentive():
 
 
 def test_the_robot_asks_where_its_doubt_is_high_once_it_knows_what_that_is():
-    asked: list[Any] = []
-    human: Any = SimpleNamespace(wants_control=lambda _: CRASH if len(asked) == 3 else None)
-    gate = Asking(human, 0.05)
-    for number in range(gate.MEMORY + 100):
-        gate.doubts.append(float(number % 100))
-        asked.append(gate.wants_control(FULL))
+    gate = Asking(0.05)
+    asked = [gate.ask(float(n % 100), CRASH if n == 3 else None) for n in range(gate.MEMORY + 100)]
     before, after = asked[: gate.MEMORY - 1], asked[gate.MEMORY - 1 :]
     assert [n for n, reason in enumerate(before) if reason] == [3]  # the human still watches
     assert {reason for reason in after if reason} == {ASKED}
     assert after.count(ASKED) == pytest.approx(0.05 * len(after), abs=1)
+
+
+@pytest.mark.parametrize("biased", [None, 1.0])
+def test_poor_hands_replace_their_share_of_the_actions(biased):
+    """By random actions, or by the same wrong one."""
+    hands = PoorHands(1 / 3, biased, np.random.default_rng(0))
+    done = np.array([hands.spoil(BRAKE)[0] for _ in range(600)])
+    poor = done[done != BRAKE]
+    assert len(poor) == pytest.approx(200, abs=40)
+    if biased is None:
+        assert np.abs(poor).max() <= 1.0
+        assert np.std(poor) == pytest.approx(3**-0.5, abs=0.08)  # uniform over the whole range
+    else:
+        assert set(poor) == {biased}

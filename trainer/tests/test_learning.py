@@ -1,3 +1,5 @@
+"""The learner's thread: what it averages, waits for and ends with; and one that never waits."""
+
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,24 +10,39 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.learner.config import ALGORITHMS, LearnerConfig
+from hil_tests.processes import wait_until
+from trainer.learner.config import LearnerConfig
+from trainer.learner.replay import Transition
 from trainer.learner.td3 import Losses
-from trainer.tests.test_run_loop import CONFIG, ScriptedEnv, scripted_run
+from trainer.tests.loops import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
-from trainer.training.learning import LearningThread
+from trainer.training.config import RunConfig
+from trainer.training.learning import LearningThread, UnhurriedLearning
 
 SMALL = LearnerConfig(batch_size=8, replay_capacity=60, warmup_steps=1)
 LOSSES = Losses(1.0, 2.0, 3.0, 4.0, np.full(SMALL.batch_size, 2.0))
 PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
+SOON_S = 30.0
+
+
+def transition(reward: float = 0.0, action: float = 0.5, **more: Any) -> Transition:
+    return Transition(
+        PICTURE,
+        np.full(1, action, np.float32),
+        reward,
+        PICTURE,
+        more.pop("terminal", False),
+        **more,
+    )
 
 
 @pytest.fixture(params=["phil_td3"])
 def learning(request):
     """One that is filled, with every third step the human's; its learner's update is scripted."""
-    made: Any = LearningThread(SMALL, ALGORITHMS[request.param], 1, 1)
-    made.start_episode(PICTURE)
+    config = RunConfig(algorithm=request.param, seed=1, learner=SMALL)
+    made: Any = LearningThread(config, ScriptedEnv())
     for step in range(20):
-        made.add(np.full(1, step / 20, np.float32), float(step % 5), PICTURE, False, step % 3 == 0)
+        made.add(transition(float(step % 5), step / 20, human=step % 3 == 0))
     made.learner.update = Mock(return_value=LOSSES)
     yield made
     made.close()
@@ -117,7 +134,7 @@ def test_what_is_too_small_to_count_does_not_slow_the_updates_down(learning):
 def test_validation_acts_in_the_learners_thread(tmp_path):
     config = replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2)
     run = scripted_run(tmp_path, config, length=3)
-    run.validation.envs = [ScriptedEnv(3, "goal") for _ in range(2)]
+    run.validation.envs = [ScriptedEnv(3) for _ in range(2)]
     learner, validations = run.learning.learner, []
     threads: list[threading.Thread] = []
     for actor in (learner.actor, learner.target_actor):
@@ -199,3 +216,84 @@ def test_each_second_of_a_control_period_is_counted_where_it_is_spent(tmp_path, 
     run.learning.close()
     assert (metrics.acting_s, metrics.environment_s) == (4 * 1.0, 4 * 4.0)
     assert metrics.storing_s == 3 * 2.0 + 4 * (16.0 + 32.0)  # the first step begins no update
+
+
+@pytest.fixture
+def unhurried(one_thread):
+    config = RunConfig(learner=LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1))
+    unhurried = UnhurriedLearning(config, ScriptedEnv())
+    for reward in range(3):
+        unhurried.add(transition(float(reward)))
+    unhurried.release()
+    yield unhurried
+    unhurried.close()
+
+
+@pytest.fixture
+def gate(unhurried, monkeypatch):
+    """Updates are held up until it is open."""
+    learner, gate = unhurried.learner, SimpleNamespace(open=threading.Event(), begun=0)
+    update = learner.update
+
+    def held_up(batch, beta=0.0):
+        gate.begun += 1
+        assert gate.open.wait(SOON_S)
+        return update(batch, beta)
+
+    monkeypatch.setattr(learner, "update", held_up)
+    return gate
+
+
+def test_while_an_update_hangs_everything_goes_on(unhurried, gate):
+    before = unhurried.act(PICTURE)
+    unhurried.begin(0.0)
+    for _ in range(5):
+        np.testing.assert_array_equal(unhurried.act(PICTURE), before)
+        unhurried.begin(0.0)
+        assert unhurried.finish() == 0.0
+    assert unhurried.updating
+    assert gate.begun <= 1
+    gate.open.set()
+    unhurried.settle()
+    assert np.any(unhurried.act(PICTURE) != before)
+
+
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurried, gate):
+    unhurried.begin(0.0)
+    for keep, reward in ((False, 9.0), (True, 3.0)):
+        unhurried.add(transition(reward, human=True))
+        unhurried.add(transition(reward + 1.0, terminal=True))
+        assert unhurried.added == 3
+        if not keep:
+            threading.Timer(0.05, gate.open.set).start()
+        unhurried.end_episode(0.0, keep)
+    unhurried.release()
+    state = unhurried.state_dict()["replay"]
+    assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert state["human"].tolist() == [False, False, False, True, False]
+    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_the_next_update_begins_when_the_last_is_done_and_its_error_comes_out(unhurried, gate):
+    gate.open.set()
+    for _ in range(3):
+        unhurried.begin(0.0)
+        wait_until(lambda: not unhurried.updating, "the update's end")
+    unhurried.settle()
+    assert gate.begun == 3
+    unhurried.learner.update = Mock(side_effect=RuntimeError("no more memory"))
+    unhurried.begin(0.0)
+    with pytest.raises(RuntimeError, match="no more memory"):
+        unhurried.settle()
+
+
+def test_a_restored_learner_acts_as_the_one_that_was_saved(unhurried):
+    unhurried.begin(0.0)
+    unhurried.settle()
+    state, action = unhurried.state_dict(), unhurried.act(PICTURE)
+    config = RunConfig(seed=5, learner=unhurried.config)
+    other = UnhurriedLearning(config, ScriptedEnv())
+    assert np.any(other.act(PICTURE) != action)
+    other.load_state_dict(state)
+    np.testing.assert_array_equal(other.act(PICTURE), action)
+    other.close()

@@ -1,82 +1,59 @@
-from types import SimpleNamespace
+"""A policy behind a network: what the vehicle does, and what a learner is told of it."""
+
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
+from trainer.drivers import TogetherDriver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes
-from trainer.tests.test_evaluate import brightness
-from trainer.training.delayed import DelayedPolicy, VehicleEnd, ticks_late
-
-
-def frames(step):
-    """The observation of a tick: its number and the one before as pictures."""
-    return np.stack([np.full((45, 80), max(n, 0), np.uint8) for n in (step - 1, step)])
-
-
-def number(seen):
-    """The tick of an observation whose two pictures follow each other."""
-    assert seen[1, 0, 0] - seen[0, 0, 0] in (0, 1)
-    return int(seen[1, 0, 0])
+from trainer.human.guide import Intervention, make_transition
+from trainer.learner.replay import Transition
+from trainer.tests.loops import CONFIG, ScriptedEnv, frames, number
+from trainer.training.delayed import DelayedVehicle, ticks_late
+from trainer.training.learning import LearningThread
 
 
 def answer(observation):
     return np.array([number(observation) / 100.0], np.float32)
 
 
-class Car:
-    """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
+def driven(monkeypatch, spec, ticks=60, seed=0, human=(), ahead=0) -> tuple[list[float], Any]:
+    """Drive over numbered observations; the actions carried out, and the transitions stored."""
+    network, env, stored = parse_spec(spec), ScriptedEnv(ticks), list[Transition]()
+    learning = LearningThread(replace(CONFIG, latency=spec), env)
+    monkeypatch.setattr(learning.replay, "add", stored.append)
+    vehicle = DelayedVehicle(env, network)
+    observation, _ = vehicle.reset(seed=seed)
+    act = vehicle.behind(answer)
+    for tick in range(ticks):
+        policy_action = action = act(observation)
+        by_human = None
+        if tick in human:
+            action = np.array([0.9], np.float32)
+            by_human = Intervention(action, "collision", True)
+        stepped = vehicle.step(action)
+        foreseen = [frames(tick + n) for n in range(ahead)]
+        given = policy_action, action, by_human, stepped, False, foreseen
+        learning.add(make_transition(observation, *given))
+        observation = stepped[0]
+    learning.close()
+    return env.actions, stored
 
-    brake_action, rest_action = np.array([[-1.0], [0.0]], np.float32)
-    control_period_s = 0.1
 
-
-class Driven:
-    """A policy behind a network, driven over numbered observations; the reward of tick n is n.
-
-    Keeps what was ``carried`` out, and what would be learned: what was ``stored``, and as ``rows``:
-    observation, action, reward, next observation, ends.
-    """
-
-    def __init__(self, spec, seed=0):
-        self.spec, self.env = parse_spec(spec), Car()
-        self.carried, self.stored, self.rows = [], [], list[Any]()
-        learner: Any = self  # as far as it is asked
-        self.delayed = DelayedPolicy(learner, self.env, self.spec)
-        self.delayed.start(frames(0), seed)
-
-    def start_episode(self, observation):
-        self.stored.append(observation)
-
-    def add(self, action, reward, observation, *ends, overruled=None, foreseen=()):
-        self.foreseen = [number(each) for each in foreseen]
-        seen = number(self.stored[-1]), float(action[0]), reward, number(observation)
-        self.rows.append((*seen, *ends))
-        self.stored.append(observation)
-
-    def drive(self, ticks, terminated=False, human=(), **guidance):
-        for tick in range(ticks):
-            action = self.delayed.act(frames(tick), answer)
-            action = np.array([0.9], np.float32) if tick in human else action
-            end = terminated and tick == ticks - 1
-            done = action, float(tick), frames(tick + 1), end, tick in human
-            more = {name: of(tick) for name, of in guidance.items()}
-            self.delayed.store(*done, **more)
-            self.carried.append(float(action[0]))
-        return self
+brightness = TogetherDriver(lambda seen: seen.mean((1, 2, 3))[:, None].astype(np.float32) / 255)
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 def test_a_perfect_network_is_none_to_the_bit(scenario):
     env = make_environment(scenario)
-    for seed in (0, 1):
-        end = VehicleEnd(env, LatencySpec(), seed, frames(0))
-        remote: Any = SimpleNamespace(
-            reset=brightness.reset, act=lambda seen, end=end: end.tick(seen, brightness.act)
-        )
-        assert drive_episodes(env, remote, [seed]) == drive_episodes(env, brightness, [seed])
+    vehicle: Any = DelayedVehicle(env, LatencySpec())
+    remote: Any = TogetherDriver(brightness.act_together)
+    remote.act = vehicle.behind(brightness.act)
+    assert drive_episodes(vehicle, remote, [0, 1]) == drive_episodes(env, brightness, [0, 1])
 
 
 def test_a_delayed_driver_is_another_and_the_same_each_time():
@@ -86,38 +63,37 @@ def test_a_delayed_driver_is_another_and_the_same_each_time():
     assert first[0].actions != drive_episodes(env, brightness, [3])[0].actions
 
 
-def test_a_reward_stands_beside_the_action_that_earned_it():
-    driven = Driven("100ms").drive(8, terminated=True)
+def test_a_reward_stands_beside_the_action_that_earned_it(monkeypatch):
+    carried, stored = driven(monkeypatch, "100ms", 8)
     # Round trip 2 ticks: hands off in ticks 0 and 1; tick n obeys the answer to n - 2.
-    assert driven.carried == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
-    wanted = [(n, pytest.approx(n / 100), n + 2.0, n + 1, n == 5, False) for n in range(6)]
-    assert driven.rows == wanted
+    assert carried == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    rows = [
+        (number(row.observation), row.action[0], row.reward, number(row.next_observation))
+        for row in stored
+    ]
+    assert rows == [(n, pytest.approx(n / 100), n + 3.0, n + 1) for n in range(6)]
+    assert [row.terminal for row in stored] == [False] * 5 + [True]
 
 
-def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer():
-    rows = Driven("100ms").drive(8, human=(4,)).rows
-    assert [row for row in rows if row[5]] == [(2, pytest.approx(0.9), 4.0, 3, False, True)]
+def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer(monkeypatch):
+    (row,) = (row for row in driven(monkeypatch, "100ms", 8, human=(4,))[1] if row.human)
+    found = number(row.observation), row.action[0], row.reward, number(row.next_observation)
+    assert found == (2, pytest.approx(0.9), 5.0, 3)
 
 
-def test_what_is_foreseen_is_seen_as_late_as_all_else():
-    driven = Driven("100ms").drive(
-        6,
-        overruled=lambda tick: np.ones(1, np.float32),
-        foreseen=lambda tick: [frames(each) for each in range(tick, tick + 4)],
-    )
-    assert driven.foreseen == [3, 4, 5, 6]
+def test_what_is_foreseen_is_seen_as_late_as_all_else(monkeypatch):
+    _, stored = driven(monkeypatch, "100ms", 6, ahead=4)
+    assert [number(seen) for seen in stored[-1].foreseen] == [3, 4, 5, 6]
 
 
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
-def test_every_tick_is_stored_with_what_was_carried_out(spec):
-    driven = Driven(spec, seed=1).drive(60)
-    rows, actions = driven.rows, driven.carried
-    late = ticks_late(parse_spec(spec), Car.control_period_s)
-    assert [row[0] for row in rows] == list(range(60 - late))
-    assert all(row[3] == row[0] + 1 for row in rows)
-    assert [row[1] for row in rows] == pytest.approx(actions[late:])
+def test_every_tick_is_stored_with_what_was_carried_out(monkeypatch, spec):
+    carried, stored = driven(monkeypatch, spec, 60, seed=1)
+    late = ticks_late(parse_spec(spec), 0.1)
+    assert [number(row.observation) for row in stored] == list(range(60 - late))
+    assert [row.action[0] for row in stored] == pytest.approx(carried[late:])
     answers = np.arange(60 - late) / 100.0
-    assert not np.allclose(actions[late:], answers)  # The network really spoils some of them.
+    assert not np.allclose(carried[late:], answers)  # The network really spoils some of them.
 
 
 @pytest.mark.parametrize(
@@ -125,8 +101,10 @@ def test_every_tick_is_stored_with_what_was_carried_out(spec):
     [("none", 0), ("12ms", 0), ("12.5ms", 0), ("13ms", 1), ("100ms", 2), ("up.delay=0.3s", 3)],
 )
 def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
-    assert ticks_late(parse_spec(spec), Car.control_period_s) == ticks
-    end = VehicleEnd(Car(), parse_spec(spec), 0, frames(0))
+    assert ticks_late(parse_spec(spec), 0.1) == ticks
+    vehicle = DelayedVehicle(ScriptedEnv(9), parse_spec(spec))
+    vehicle.reset(seed=0)
+    act = vehicle.behind(answer)
     for tick in range(8):
-        end.tick(frames(tick), answer)
-    assert end._link.hold.newest_step == 7 - ticks
+        act(frames(tick))
+    assert vehicle.link.hold.newest_step == 7 - ticks

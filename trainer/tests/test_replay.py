@@ -1,9 +1,11 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from trainer.learner.replay import ReplayBuffer, _find
+from trainer.learner.replay import ReplayBuffer, Transition, _find
 
 
 def frame(value):
@@ -38,13 +40,17 @@ class Source:
     def episode(self, steps, human=False, goal=True):
         """``human``: whether it acts, or in every how many steps."""
         first, self.next = self.next, self.next + steps + 1
-        self.buffer.start_episode(pair(first, first))
         for step in range(steps):
             now, last = first + step, step == steps - 1
             action, acts = np.array([step / 100], np.float32), bool(human) and step % human == 0
-            self.buffer.add(action, step + 1.0, pair(now, now + 1), goal and last, human=acts)
+            ends = goal and last
+            self.buffer.add(
+                Transition(pair(max(now - 1, first), now), action, step + 1.0, pair(now, now + 1),
+                           ends, human=acts)
+            )  # fmt: skip
             rewards = [n + 1.0 for n in range(step, steps)]
             self.stored[now] = max(now - 1, first), rewards, goal
+        self.buffer.end_episode()
 
 
 def filled(*episodes, capacity=100, **options):
@@ -93,10 +99,11 @@ def test_a_batch_holds_what_was_stored_and_not_yet_forgotten(episodes, capacity,
 def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_value, before):
     """Steps 0 to 5 with rewards 1 to 6; the policy is overruled in step 3, and the human stays."""
     buffer = ReplayBuffer(20, steps=4, gamma=0.5, overruled_value=overruled_value)
-    buffer.start_episode(pair(0, 0))
     for step in range(6):
-        given = np.zeros(1, np.float32), step + 1.0, pair(step, step + 1)
-        buffer.add(*given, step == 5, step >= 3, None, step == 3)
+        buffer.add(
+            Transition(pair(max(step - 1, 0), step), np.zeros(1, np.float32), step + 1.0,
+                       pair(step, step + 1), step == 5, human=step >= 3, penalised=step == 3)
+        )  # fmt: skip
     batch = sample(buffer, 200)
     assert batch.spans is not None
     found = zip(batch.rewards, batch.spans, batch.terminals, strict=True)
@@ -109,10 +116,10 @@ def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_
 
 def test_the_overruled_action_is_kept_beside_the_humans():
     buffer, copy = ReplayBuffer(10), ReplayBuffer(10)
-    buffer.start_episode(pair(0, 0))
     action, overruled = np.array([0.25], np.float32), np.array([-1.0], np.float32)
-    buffer.add(action, 0.0, pair(0, 1), False, False)
-    buffer.add(action, 0.0, pair(1, 2), False, True, overruled, penalised=True)
+    buffer.add(Transition(pair(0, 0), action, 0.0, pair(0, 1), False))
+    more: Any = {"human": True, "overruled": overruled, "penalised": True}
+    buffer.add(Transition(pair(0, 1), action, 0.0, pair(1, 2), False, **more))
     copy.load_state_dict(buffer.state_dict())
     for batch in (sample(buffer), sample(copy)):
         assert batch.overruled is not None
@@ -133,13 +140,16 @@ def test_a_full_ring_keeps_the_newest_and_mixes_no_pictures(capacity, steps, lea
 
 def test_what_is_foreseen_stands_beside_its_pair_and_is_restored():
     buffer, copy = (ReplayBuffer(8, foresees=True) for _ in range(2))
-    buffer.start_episode(pair(0, 0))
     for now in range(4):
-        ahead = [pair(max(now - 1, 0), now), pair(now, 100 + now), pair(100 + now, 200 + now)]
+        seen = pair(max(now - 1, 0), now)
+        ahead = [seen, pair(now, 100 + now), pair(100 + now, 200 + now)]
         actions = np.array([[0.5 + now], [-0.5 - now]], np.float32)
         human = now % 2 == 1
-        seen = ahead if human else []
-        buffer.add(actions[0], 1.0, pair(now, now + 1), False, human, actions[1], foreseen=seen)
+        foreseen = tuple(ahead) if human else ()
+        buffer.add(
+            Transition(seen, actions[0], 1.0, pair(now, now + 1), False, human=human,
+                       overruled=actions[1], foreseen=foreseen)
+        )  # fmt: skip
     copy.load_state_dict(buffer.state_dict())
     for found in (sample(buffer).foreseen, sample(copy).foreseen):
         assert found is not None

@@ -27,13 +27,15 @@ from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.pictures import write_learning_curve
+from trainer.tests.loops import rows_of
 from trainer.tests.test_td3 import same_weights
-from trainer.training import metrics as metrics_module
+from trainer.training import validation as validation_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory
 from trainer.training.config import CONFIG_FILE, RunConfig
-from trainer.training.metrics import NAMES, Trials, read_metrics
+from trainer.training.metrics import NAMES, read_metrics
 from trainer.training.run import TrainingRun
+from trainer.training.validation import Trials
 from trainer.util import Purpose, episode_seed, load_torch, save_torch, source_revision
 
 # Learning, the slowest part, begins late, and still before what a test looks at.
@@ -60,14 +62,6 @@ def train_in_parts(config: RunConfig, directory: Path) -> TrainingRun:
 
 def same_actors(one, other):
     return all(torch.equal(weights, other[name]) for name, weights in one.items())
-
-
-def rows_of(run):
-    """The metrics of a run but for times, which are never the same."""
-    return [
-        {name: value for name, value in row.items() if not name.endswith("_s")}
-        for row in read_metrics(run.run_dir)
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -108,15 +102,13 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
     human: dict[str, Any] = {"late_to_s": 0.8, "missed_share": 0.3}
     learner = replace(SMALL, warmup_steps=warmup_steps)
     config = replace(TINY, algorithm=row, learner=learner, **human)
-    whole, reasons = TrainingRun(config, tmp_path / "whole"), set[Any]()
-    whole.on_step = lambda seen: reasons.add(seen.intervention and seen.intervention.reason)
-    add, foreseen = whole.learning.replay.add, set()
+    whole, reasons, foreseen = TrainingRun(config, tmp_path / "whole"), set[Any](), set()
 
-    def spy(*stored, **more):
-        foreseen.add(len(more["foreseen"]))
-        add(*stored, **more)
+    def record(transition, intervention, info):
+        reasons.add(intervention and intervention.reason)
+        foreseen.add(len(transition.foreseen))
 
-    monkeypatch.setattr(whole.learning.replay, "add", spy)
+    whole.recorders.append(SimpleNamespace(record=record))
     whole.train()
     assert (foreseen != {0}) == (row == "ppl_td3")
     assert (ASKED in reasons) == (row == "phil_gated")
@@ -275,7 +267,7 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
         return Losses(0.0, 0.0, 0.0, 0.0, np.ones(len(batch.indices)))
 
     monkeypatch.setattr(TD3Learner, "update", nudge)
-    monkeypatch.setattr(metrics_module, "drive_together", drive)
+    monkeypatch.setattr(validation_module, "drive_together", drive)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     train(TINY, whole)
     parts.mkdir()

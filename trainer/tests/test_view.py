@@ -25,12 +25,13 @@ from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
+from trainer.learner.replay import Transition
 from trainer.person.recording import Recorder, packed, read_steps
+from trainer.tests.loops import rows_of
 from trainer.tests.test_td3 import same_weights
-from trainer.tests.test_training import rows_of
 from trainer.training.config import CURVE_FILE, RunConfig
 from trainer.training.metrics import read_metrics
-from trainer.training.run import Seen, TrainingRun
+from trainer.training.run import TrainingRun
 from trainer.view import Episode, Steps, Watcher
 
 ROOT = Path(__file__).parents[2]
@@ -119,8 +120,10 @@ def looking_on(kept, scene=lambda: {"roads": []}):
 
 
 def control_period():
-    action = np.array([0.5], np.float32)
-    return Seen(np.zeros((2, 45, 80), np.uint8), -action, None, action, speed_mps=3.0)
+    """What a recorder of the loop takes."""
+    action, frames = np.array([0.5], np.float32), np.zeros((2, 45, 80), np.uint8)
+    step = Transition(frames, action, 1.0, frames, False, overruled=-action)
+    return step, None, {"speed_mps": 3.0}
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ def control_period():
 )
 def test_a_scene_that_fails_is_not_shown_and_ends_no_training(scene):
     kept: list[Any] = []
-    looking_on(kept, scene=scene).on_step(control_period())
+    looking_on(kept, scene=scene).record(*control_period())
     assert kept[0].scene is None
 
 
@@ -138,7 +141,7 @@ def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     watcher = looking_on(kept)
     for _ in range(1007):  # Two seconds at 500 steps a second.
-        watcher.on_step(control_period())
+        watcher.record(*control_period())
         now_s[0] += 0.002
     watcher.hand_over()  # An episode that is broken off is handed over, too.
     assert [entry.step for part in kept for entry in part.entries] == list(range(40, 1047))

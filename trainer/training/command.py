@@ -173,10 +173,13 @@ def _train(
         if person.human in HUMANS:
             from trainer.person.run import training_with_person
 
-            training = stack.enter_context(training_with_person(person, config, run_dir))
+            began = training_with_person(person, config, run_dir)
+            training, sitting = stack.enter_context(began)
+            quit_training = sitting.quit
         else:
             check_person_options(person)
             training = TrainingRun(config, run_dir, person.resume)
+            quit_training = partial(_quit, training)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -187,7 +190,7 @@ def _train(
 
             watch = stack.enter_context(watched(training, sink))
         # Entered last: the first signal is ours, and the second the viewer's.
-        stack.enter_context(quit_on_signals(partial(_quit, training)))
+        stack.enter_context(quit_on_signals(quit_training))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)
         validation = "-"
 
@@ -221,13 +224,11 @@ def _train(
 
 
 def _quit(training: TrainingRun) -> bool:
-    heeded = training.quit()
-    if training.quitting:
-        # Not print: a signal may come in the midst of one, which takes no other. And the reader,
-        # such as `tee`, may have had the same ^C.
-        with suppress(OSError):
-            os.write(_STDERR, _ENDING)
-    return heeded
+    # Not print: a signal may come in the midst of one, which takes no other. And the reader, such
+    # as `tee`, may have had the same ^C.
+    with suppress(OSError):
+        os.write(_STDERR, _ENDING)
+    return training.quit()
 
 
 def _summary(run_dir: Path, period_s: float) -> str:

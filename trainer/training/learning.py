@@ -2,28 +2,38 @@
 
 The order is fixed, so that a run depends on its seed alone: in each control period the policy acts,
 an update on what was stored before is begun, the environment takes its step, the update is
-finished, and only then the step is stored.
+finished, and only then the step is stored. Beside a person nothing waits (`UnhurriedLearning`).
 """
 
+import copy
 import math
+import os
+import sys
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Space
 
+from bridge.network import parse_spec
 from edge_runtime.util import UserError
-from trainer.human.guide import Action, Observation
-from trainer.learner.config import Algorithm, LearnerConfig
-from trainer.learner.networks import FRAMES_SPACE
-from trainer.learner.replay import FRAMES_LAYOUT, Batch, Layout, ReplayBuffer
-from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
+from trainer.learner import equations
+from trainer.learner.config import HUMANS_ACTION, find_algorithm
+from trainer.learner.replay import Action, Batch, Observation, ReplayBuffer, Transition
+from trainer.learner.td3 import NETWORKS, Losses, TD3Learner, charges_overruled
+from trainer.training.config import RunConfig
+from trainer.training.delayed import ticks_late
 from trainer.util import Purpose, random_stream
 
 LOSSES = Losses._fields[:4]  # What is averaged over an episode
+NICENESS = 10
+"""Of what learns beside a person, with torch's own threads: the loop goes first."""
+LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
 
 
 class LearningThread:
@@ -33,49 +43,45 @@ class LearningThread:
     of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
     loop's thread, beside the update: a batch of one needs no other thread.
 
-    The networks are on ``device``, the replay buffer is in the processor's memory.
+    The networks are on the config's device, the replay buffer is in the processor's memory.
 
     Raises UserError: there is no memory for the replay buffer.
     """
 
-    def __init__(
-        self,
-        config: LearnerConfig,
-        algorithm: Algorithm,
-        seed: int,
-        action_size: int,
-        device: str = "cpu",
-        space: Space[Any] = FRAMES_SPACE,
-        layout: Layout = FRAMES_LAYOUT,
-    ) -> None:
-        self.config = config
-        self.learner = TD3Learner(config, algorithm, seed, action_size, device, space)
+    def __init__(self, config: RunConfig, env: Any) -> None:
+        self.config, self.algorithm = config.learner, find_algorithm(config.algorithm)
+        c, row, action_size = self.config, self.algorithm, env.action_space.shape[0]
+        self.learner = TD3Learner(
+            c, row, config.seed, action_size, config.device, env.observation_space
+        )
         try:
             self.replay = ReplayBuffer(
-                config.replay_capacity,
+                c.replay_capacity,
                 action_size,
-                config.alpha,
-                algorithm.separate_buffers,
-                config.return_steps,
-                config.gamma,
-                config.intervention_penalty if charges_overruled(config, algorithm) else None,
-                layout,
-                algorithm.human_share,
-                bool(algorithm.foresight),
+                c.alpha,
+                row.separate_buffers,
+                c.return_steps,
+                c.gamma,
+                c.intervention_penalty if charges_overruled(c, row) else None,
+                env.layout,
+                row.human_share,
+                bool(row.foresight),
             )
         except MemoryError:
             raise UserError(
-                f"there is no memory for a replay buffer of {config.replay_capacity} "
+                f"there is no memory for a replay buffer of {c.replay_capacity} "
                 "transitions: --set replay_capacity=N, a smaller one"
             ) from None
-        self._random = random_stream(seed, Purpose.REPLAY)
+        self._random = random_stream(config.seed, Purpose.REPLAY)
+        late = ticks_late(parse_spec(config.latency), env.control_period_s)
+        self._seen: deque[Observation] = deque(maxlen=late + 1)
+        """What the policy knows, and what it does not know yet, behind the network."""
         # Adam's mean of a gradient that has ended stays denormal for ever, and a processor takes
         # many times as long for those: 3 ms a step instead of 1. To a weight they add nothing.
         # First of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
-        self._updates = algorithm.updates_per_step
         self._begun: tuple[list[Batch], Future[tuple[list[Losses], float]]] | None = None
-        self._forget_episode()
+        self._forget_losses()
 
     @property
     def added(self) -> int:
@@ -88,33 +94,45 @@ class LearningThread:
         return self._begun is not None and not self._begun[1].done()
 
     def act(self, observation: Observation) -> Action:
-        """The actor's action, float32 [action size]; not while updating."""
+        """Return the actor's action; not while updating."""
         return self.in_thread(self.learner.actor.act, observation[None])[0]
 
     def doubt(self, observation: Observation, action: Action) -> float:
-        """How much the critics differ about an action; not while updating."""
+        """Return how much the critics differ about an action; not while updating."""
         return self.in_thread(self.learner.doubt, observation, action)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""
+        """Return ``work(*arguments)``, done in the updates' thread after the update under way."""
         return self._thread.submit(work, *arguments).result()
 
-    def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
-        self.replay.start_episode(observation)
+    def add(self, transition: Transition) -> None:
+        """Store what happened at the vehicle as the policy learns of it: late, and shaped.
 
-    def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``ReplayBuffer.add``."""
-        self.replay.add(*transition, **guidance)
+        Behind a network an episode's first transitions are not stored: the policy had seen nothing.
+        """
+        self._seen.append(transition.observation)
+        if len(self._seen) < (self._seen.maxlen or 1):
+            return
+        seen = [*self._seen, transition.next_observation]
+        ahead = [*self._seen, *transition.foreseen[1:]][: len(transition.foreseen)]
+        self.replay.add(
+            replace(
+                transition,
+                observation=seen[0],
+                reward=self._shaped(transition),
+                next_observation=seen[1],
+                foreseen=tuple(ahead),
+            )
+        )
 
     def begin(self, beta: float) -> None:
         """Start an update, or several, on what is stored; ``beta`` is eq. 15's exponent."""
-        size = self.config.batch_size
-        batches = [self.replay.sample(size, self._random) for _ in range(self._updates)]
+        size, updates = self.config.batch_size, self.algorithm.updates_per_step
+        batches = [self.replay.sample(size, self._random) for _ in range(updates)]
         self._begun = batches, self._thread.submit(self._update, batches, beta)
 
     def finish(self) -> float:
-        """Wait until the update that was begun is done, if one was; the seconds waited.
+        """Wait for the update that was begun, if one was; return the seconds waited.
 
         What the update raised comes out here; FloatingPointError where learning has diverged.
         """
@@ -133,10 +151,11 @@ class LearningThread:
             self.replay.update_priorities(batch.indices, losses.priorities)
         return waited_s
 
-    def end_episode(self, progress: float) -> dict[str, Any]:
-        """What was learned since the last call, as fields of `EpisodeMetrics`; rates fall.
+    def end_episode(self, progress: float, keep: bool = True) -> dict[str, Any]:
+        """Let the rates fall; return what was learned since the last call, for `EpisodeMetrics`.
 
-        Losses are nan where there was no update.
+        ``progress`` is the run's, 0 to 1. Losses are nan where there was no update. ``keep`` is
+        False where a person discards the episode, which only `UnhurriedLearning` can still forget.
         """
         self.learner.decay_learning_rates(progress)
         means = np.mean(self._losses, axis=0) if self._losses else [math.nan] * len(LOSSES)
@@ -148,11 +167,24 @@ class LearningThread:
             "learning_s": self._learning_s,
             "waiting_s": self._waiting_s,
         }
-        self._forget_episode()
+        self._forget_losses()
+        self.release(keep)
         return learned
 
+    def release(self, keep: bool = True) -> None:
+        """Let the next transition begin an episode; store, or forget, what was kept back."""
+        self._seen.clear()
+        self.replay.end_episode()
+
+    def check_weights(self) -> None:
+        """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
+        for name in NETWORKS:
+            for parameter in getattr(self.learner, name).parameters():
+                if not parameter.isfinite().all():
+                    raise FloatingPointError("its weights are no longer finite")
+
     def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on."""
+        """Return all that is needed to go on."""
         return {
             "learner": self.learner.state_dict(),
             "replay": {
@@ -172,11 +204,97 @@ class LearningThread:
         """Stop the thread."""
         self._thread.shutdown()
 
+    def _shaped(self, transition: Transition) -> float:
+        """Shape the reward by eq. 17 as it is printed, unless the overruled action is charged."""
+        reward = transition.reward if self.algorithm.rewarded else 0.0
+        charged = transition.penalised and self.config.penalty_on == HUMANS_ACTION
+        return equations.shaped_reward(reward, self.config.intervention_penalty, charged, False)
+
     def _update(self, batches: list[Batch], beta: float) -> tuple[list[Losses], float]:
         began_s = time.perf_counter()
         losses = [self.learner.update(batch, beta) for batch in batches]
         return losses, time.perf_counter() - began_s
 
-    def _forget_episode(self) -> None:
+    def _forget_losses(self) -> None:
         self._losses: list[tuple[float, ...]] = []
         self._learning_s = self._waiting_s = 0.0
+
+
+class UnhurriedLearning(LearningThread):
+    """A learner beside a person: ``act``, ``begin`` and ``finish`` never wait for an update.
+
+    The policy acts in the loop's thread, from a copy of the actor as of the last finished update.
+    The next update begins in the first control period after the last one's end. An episode's steps
+    are stored at its end, when it is known whether the person discards it. A run with a person is
+    not repeatable anyway.
+    """
+
+    def __init__(self, config: RunConfig, env: Any) -> None:
+        super().__init__(config, env)
+        self._actor = copy.deepcopy(self.learner.actor).eval()
+        self._kept: list[Transition] = []
+        self.in_thread(_step_aside)
+
+    def act(self, observation: Observation) -> Action:
+        """Return the action of the actor's copy."""
+        return self._actor.act(observation[None])[0]
+
+    def add(self, transition: Transition) -> None:
+        """Keep a transition for the end of the episode."""
+        self._kept.append(transition)
+
+    def begin(self, beta: float) -> None:
+        """Start an update on what is stored, unless the last one is still under way."""
+        if self._tidy():
+            super().begin(beta)
+
+    def finish(self) -> float:
+        """Wait for nothing: 0 seconds."""
+        return 0.0
+
+    def end_episode(self, progress: float, keep: bool = True) -> dict[str, Any]:
+        """End an episode after the update that is under way."""
+        self.settle()
+        return super().end_episode(progress, keep)
+
+    def release(self, keep: bool = True) -> None:
+        """Store what was taken since the last call, or forget it."""
+        self.settle()
+        kept, self._kept = self._kept, []
+        for transition in kept if keep else ():
+            super().add(transition)
+        super().release()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that is needed to go on, after the update under way."""
+        self.settle()
+        return super().state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        super().load_state_dict(state)
+        self._copy_actor()
+
+    def settle(self) -> None:
+        """Wait for the update that is under way."""
+        # In short waits: a signal that another thread took does not wake the main thread.
+        while not self._tidy():
+            time.sleep(LOOK_S)
+
+    def _tidy(self) -> bool:
+        """Finish an update that is done; return False where one is not."""
+        if self.updating:
+            return False
+        if self._begun is not None:
+            super().finish()
+            self._copy_actor()
+        return True
+
+    def _copy_actor(self) -> None:
+        self._actor.load_state_dict(self.learner.actor.state_dict())
+
+
+def _step_aside() -> None:
+    """Lower the priority of the thread that calls this, where threads have one (Linux)."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -1,9 +1,5 @@
-"""What a run is worth: its episodes as rows of CSV and of TensorBoard, and its policy alone.
+"""A run's metrics: its episodes as rows of CSV and of TensorBoard, and what they amount to."""
 
-Validation drives on seeds of their own, without help; the best actor is kept.
-"""
-
-import copy
 import csv
 import io
 import os
@@ -11,25 +7,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
-from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.network import parse_spec
-from bridge.report import GOAL, EpisodeResult, failed, settled
+from bridge.report import GOAL, failed, settled
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.drivers import BEST_FILE, TogetherDriver
-from trainer.environments import make_environment
-from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
-from trainer.learner.networks import Actor
-from trainer.scenarios import SCENARIOS
-from trainer.training.config import RunConfig
-from trainer.training.learning import LearningThread
-from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
@@ -247,93 +232,3 @@ def totals(
         "validation": validation,
         "until": until,
     }
-
-
-class Trials:
-    """The validation's episodes, which a policy drives without help, over the run's network."""
-
-    def __init__(self, config: RunConfig, env: Any = None) -> None:
-        """``env`` is one that is there: of some simulators no other may live beside it."""
-        self.config, self.network, self._env = config, parse_spec(config.latency), env
-        self._seeds = [
-            episode_seed(config.seed, Purpose.VALIDATION, run)
-            for run in range(config.evaluation_runs)
-        ]
-
-    @cached_property
-    def envs(self) -> list[Any]:
-        """What is driven at once: of our scenarios one for each seed, of any other only one."""
-        c = self.config
-        make = partial(
-            make_environment, c.scenario, printed_reward=c.printed_reward, period_s=c.period_s
-        )
-        return [make() for _ in self._seeds] if c.scenario in SCENARIOS else [self._env or make()]
-
-    def drive(self, driver: TogetherDriver, more: Sequence[int] = ()) -> list[EpisodeResult]:
-        """Drive them, and then ``more`` seeds."""
-        seeds = [*self._seeds, *more]
-        if self.network == NO_NETWORK:
-            return drive_together(self.envs, driver.act_together, seeds)
-        return drive_episodes(self.envs[0], driver, seeds, latency=self.network)
-
-
-class Validation(Trials):
-    """Drives the policy as it stands, and keeps the best actor so far."""
-
-    def __init__(
-        self,
-        config: RunConfig,
-        run_dir: Path,
-        learning: LearningThread,
-        env: Any = None,
-    ) -> None:
-        super().__init__(config, env)
-        self.run_dir, self.learning = run_dir, learning
-        self.best = (-1.0, -1.0)
-        """Success and return of the best actor of those validated when it was due."""
-        self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
-        self.kept_episode: int | None = None  # After so many was the actor that the file holds
-
-    def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
-        """Add to ``metrics`` how the policy drives after ``episode`` episodes.
-
-        One that was not ``due``, since the run stops early, may be kept as the best so far, but a
-        resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
-        """
-        actor = getattr(self.learning.learner, self.config.kept_actor)
-        driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
-        self.take(self.drive(driver), actor, metrics, episode, due)
-
-    def take(
-        self,
-        results: Sequence[EpisodeResult],
-        actor: Actor,
-        metrics: EpisodeMetrics,
-        episode: int,
-        due: bool = True,
-    ) -> None:
-        """Do what ``judge`` does with what ``drive`` gave of an actor."""
-        success = float(np.mean([result.outcome == GOAL for result in results]))
-        reward = float(np.mean([result.reward for result in results]))
-        metrics.validation_success, metrics.validation_reward = success, reward
-        metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        state = {**self.config.label(episode), "actor": actor.state_dict()}
-        if (success, reward) >= self.best:
-            save_torch(self.run_dir / BEST_FILE, state)
-            self.kept_episode = episode
-            if due:
-                self.best, self._best_actor = (success, reward), copy.deepcopy(state)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Its part of a checkpoint."""
-        return {"best_validation": self.best, "best_actor": self._best_actor}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave, and keep that actor again."""
-        self.best = tuple(state["best_validation"])
-        self._best_actor = state["best_actor"]
-        if self._best_actor is not None:
-            save_torch(self.run_dir / BEST_FILE, self._best_actor)
-            self.kept_episode = self._best_actor["episode"]
-        else:  # What is there was validated before it was due.
-            (self.run_dir / BEST_FILE).unlink(missing_ok=True)

@@ -1,118 +1,138 @@
-"""One training run: algorithm 1 around an environment, a human and a learner."""
+"""One training run: algorithm 1 around an environment, a guide, a learner and a validator."""
 
 import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bridge.episode import finite
 from bridge.network import parse_spec
+from bridge.report import DISCARDED
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
 from trainer import util
 from trainer.drivers import CHECKPOINT_FILE, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, make_environment
+from trainer.evaluation import NO_NETWORK
 from trainer.human.guide import (
     ASKED,
     STUCK,
     Asking,
     Attention,
     Guide,
+    GuideGone,
     HumanGuide,
     Intervention,
-    Trigger,
+    PoorHands,
+    make_transition,
     steps_held,
 )
 from trainer.learner import equations
-from trainer.learner.config import HUMANS_ACTION, find_algorithm
-from trainer.learner.td3 import NETWORKS, TD3Learner
+from trainer.learner.config import find_algorithm
+from trainer.learner.replay import Action, Observation, Transition
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
-from trainer.training.delayed import DelayedPolicy
+from trainer.training.delayed import DelayedVehicle
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
     MetricsWriter,
-    Validation,
     read_metrics,
     totals,
 )
+from trainer.training.validation import Validation
+
+NOBODY = Guide()
 
 
-@contextmanager
-def divergence_said(episode: int) -> Iterator[None]:
-    """Turn the FloatingPointError of learning that diverged into a UserError.
+class Recorder(Protocol):
+    """What takes every control period, once it is stored: a view, or a person's recording."""
 
-    The episode under way counts from 0; people count from 1.
-    """
-    try:
-        yield
-    except FloatingPointError as error:
-        raise UserError(
-            f"the training diverged in episode {episode + 1}: {error}; a smaller "
-            "--set actor_learning_rate or critic_learning_rate may help"
-        ) from None
+    def record(
+        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
+    ) -> None:
+        """Take one control period, and the info of its step; nothing in it changes afterwards."""
 
 
-def check_weights(learner: TD3Learner) -> None:
-    """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
-    for name in NETWORKS:
-        for parameter in getattr(learner, name).parameters():
-            if not parameter.isfinite().all():
-                raise FloatingPointError("its weights are no longer finite")
+@dataclass
+class Parts:
+    """What a run is made of; `make_parts` has them as they are without a person."""
+
+    env: Any  # The environment itself: it is foreseen in
+    delayed: DelayedVehicle | None  # The environment behind the config's network, if any
+    vehicle: Any  # What the loop drives: one of these, perhaps in a wrapper
+    guide: Guide
+    learning: LearningThread
+    validation: Any  # `Validation`, or something with its ``after`` and its state
+    recorders: list[Recorder] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """One control period, once it is stored; nothing in it changes afterwards."""
+def make_parts(config: RunConfig, run_dir: Path) -> Parts:
+    """Make the parts of a run with a scripted human, a human model, or nobody as its guide."""
+    env, delayed = make_vehicle(config)
+    learning = LearningThread(config, env)
+    guide, validation = make_guide(config, env), Validation(config, run_dir, learning, env)
+    return Parts(env, delayed, delayed or env, guide, learning, validation)
 
-    observation: NDArray[Any]  # s
-    policy_action: NDArray[np.float32]
-    """With the exploration's noise, as the vehicle would have had it."""
-    intervention: Intervention | None
-    action: NDArray[np.float32]  # What was carried out
-    speed_mps: float  # After the step
+
+def make_vehicle(config: RunConfig) -> tuple[Any, DelayedVehicle | None]:
+    """Make a run's environment, and the same behind the run's network, if it has one."""
+    env = make_environment(
+        config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
+    )
+    if find_algorithm(config.algorithm).foresight:
+        check_foresight(env)
+    network = parse_spec(config.latency)
+    return env, None if network == NO_NETWORK else DelayedVehicle(env, network)
+
+
+def make_guide(config: RunConfig, env: Any) -> Guide:
+    """Make the human of a run as its config describes it."""
+    row, random = (
+        find_algorithm(config.algorithm),
+        util.random_stream(config.seed, util.Purpose.GUIDANCE),
+    )
+    if not row.guided:
+        return Guide()
+    driver, _ = load_driver(config.human, env)
+    expert = expert_of(env, config.human if is_expert(config.human) else "expert")
+    attention, hands, period_s = None, None, env.control_period_s
+    if config.late_to_s or config.missed_share:
+        late_steps = config.late_from_s / period_s, config.late_to_s / period_s
+        attention = Attention(late_steps, config.missed_share, random)
+    if config.poor_guidance_share:
+        biased = env.biased_action if config.poor_guidance == BIASED else None
+        hands = PoorHands(config.poor_guidance_share, biased, random)
+    asking = Asking(row.asks) if row.asks else None
+    return HumanGuide(driver, expert, steps_held(period_s), attention, asking, hands, random)
 
 
 class TrainingRun:
     """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
-    learning_kind: ClassVar[type[LearningThread]] = LearningThread
-
-    def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
+    def __init__(
+        self, config: RunConfig, run_dir: Path, resume: bool = False, parts: Parts | None = None
+    ) -> None:
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        self.env = make_environment(
-            config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
-        )
-        if self.algorithm.foresight:
-            check_foresight(self.env)
-        self._copied = self.env  # the bare environment: a person's run wraps `self.env` later
-        action_size = self.env.action_space.shape[0]
-        self.network = parse_spec(config.latency)
-        seen = self.env.observation_space, self.env.layout
-        switches = config.learner, self.algorithm
-        self.learning = self.learning_kind(
-            *switches, config.seed, action_size, config.device, *seen
-        )
-        self.validation = Validation(config, run_dir, self.learning, self.env)
-        self.policy = DelayedPolicy(self.learning, self.env, self.network)
+        parts = parts or make_parts(config, run_dir)
+        self.env, self.delayed, self.vehicle = parts.env, parts.delayed, parts.vehicle
+        self.guide, self.learning, self.validation = parts.guide, parts.learning, parts.validation
+        self.recorders = parts.recorders
+        self.act = self.delayed.behind(self._explore) if self.delayed else self._explore
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
-        self.guidance = util.random_stream(config.seed, util.Purpose.GUIDANCE)
-        self.gate: Asking | None = None  # Where the robot asks for help
-        self.guide = self._make_guide()
         self.episode = self.steps = 0
-        self.on_step: Callable[[Seen], None] | None = None
-        """Called at the end of each control period, where the run is watched."""
+        """Episodes driven, and environment steps in those that were not discarded."""
         self.quitting = False  # The episode under way is to be the last of this call
         if resume:
-            self._load()
+            path = run_dir / CHECKPOINT_FILE
+            with util.fitting(f"{path} does not fit this run"):
+                self._restore(util.load_torch(path))
 
     def train(
         self,
@@ -131,33 +151,37 @@ class TrainingRun:
         metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
+                before = self.steps
                 metrics = self.advance()
-                late = self._must_stop(deadline_s)
-                self._validate(metrics, at_end=self.over or late)
+                late = self.guide.stop or time.monotonic() > deadline_s
+                at_end = self.over or late
+                self.validation.after(metrics, self.episode, self._due(before), at_end)
                 metrics_writer.add(metrics)
                 # Read once, so that every end has its checkpoint. Quitting adds no validation that
                 # is not due: a resumed run then has had the same ones.
-                ending = self.over or late or self.quitting
+                ending = at_end or self.quitting
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)
                 if ending:
                     break
+        except GuideGone:
+            self.save()
         finally:
             metrics_writer.close()
             self.learning.close()
-            self._copied.close()
+            self.env.close()
             rows, kept = read_metrics(self.run_dir), self.validation.kept_episode
             so_far = totals(rows, self.env.control_period_s, kept)
             write_json(self.run_dir / REPORT_FILE, so_far)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
-        with divergence_said(self.episode):
+        with self._divergence_said():
             metrics = self._episode()
-            check_weights(self.learning.learner)
+            self.learning.check_weights()
         self.episode += 1
-        self.steps += metrics.steps
+        self.steps = metrics.total_steps
         return metrics
 
     @property
@@ -178,29 +202,17 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        util.save_torch(
-            self.run_dir / CHECKPOINT_FILE,
-            {
+        with self._divergence_said():  # The update under way beside a person may be the one.
+            state = {
                 **self.config.label(self.episode),
-                **self._more_state(),
+                **self.guide.state_dict(),
                 "learning": self.learning.state_dict(),
                 "steps": self.steps,
                 "kept_actor": self.config.kept_actor,
                 "exploration": self.exploration.bit_generator.state,
-                "guidance": self.guidance.bit_generator.state,
-                "doubts": list(self.gate.doubts) if self.gate else [],
                 **self.validation.state_dict(),
-            },
-        )
-
-    def _more_state(self) -> dict[str, Any]:
-        """What a subclass adds to the checkpoint."""
-        return {}
-
-    def _load(self) -> None:
-        path = self.run_dir / CHECKPOINT_FILE
-        with util.fitting(f"{path} does not fit this run"):
-            self._restore(util.load_torch(path))
+            }
+        util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
 
     def _restore(self, state: dict[str, Any]) -> None:
         counts = state["episode"], state["steps"], state["learning"]["learner"]["updates"]
@@ -209,90 +221,61 @@ class TrainingRun:
         self.episode, self.steps, _ = counts
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
-        self.guidance.bit_generator.state = state["guidance"]
-        if self.gate:
-            self.gate.doubts.extend(state["doubts"])
+        self.guide.load_state_dict(state)
         self.validation.load_state_dict(state)
-
-    def _must_stop(self, deadline_s: float) -> bool:
-        """Whether the episode just driven is the last of this call."""
-        return time.monotonic() > deadline_s
-
-    def _make_guide(self) -> Guide | None:
-        if not self.algorithm.guided:
-            return None
-        config, asks = self.config, self.algorithm.asks
-        driver, _ = load_driver(config.human, self.env)
-        trigger: Trigger = expert_of(
-            self.env, config.human if is_expert(config.human) else "expert"
-        )
-        if asks:
-            trigger = self.gate = Asking(trigger, asks)
-        attention, period_s = None, self.env.control_period_s
-        if config.late_to_s or config.missed_share:
-            late_steps = config.late_from_s / period_s, config.late_to_s / period_s
-            attention = Attention(late_steps, config.missed_share, self.guidance)
-        return HumanGuide(driver, trigger, steps_held(period_s), attention)
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
         seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
-        observation, info = self.env.reset(seed=seed)
-        self.policy.start(observation, seed)
+        observation, info = self.vehicle.reset(seed=seed)
         self._drawn = np.zeros(self.env.action_space.shape)
-        guided = self.guide is not None and config.guided(self.episode, self.steps)
-        if self.guide is not None:
-            self.guide.reset()
+        guide = self.guide if config.guided(self.episode, self.steps) else NOBODY
+        self.guide.reset()
         ended = False
         while not ended:
-            observation, ended, info = self._step(observation, guided, metrics)
-        learned = self.learning.end_episode(self.progress)
+            observation, ended, info = self._step(observation, guide, metrics)
+        outcome = self.guide.end_episode(info["outcome"])
+        kept = outcome != DISCARDED
+        learned = self.learning.end_episode(self.progress, kept)
         return replace(
             metrics,
-            total_steps=self.steps + metrics.steps,
+            total_steps=self.steps + metrics.steps * kept,
             updates=self.learning.learner.updates,
             episode_return=float(metrics.episode_return),
             distance_m=finite("distance_m", info["distance_m"]),
-            outcome=info["outcome"],
+            outcome=outcome,
             exploration_std=self._exploration_std(),
             **learned,
         )
 
     def _step(
-        self, observation: NDArray[Any], guided: bool, metrics: EpisodeMetrics
-    ) -> tuple[NDArray[Any], bool, dict[str, Any]]:
+        self, observation: Observation, guide: Guide, metrics: EpisodeMetrics
+    ) -> tuple[Observation, bool, dict[str, Any]]:
         """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
-        policy_action = self.policy.act(observation, self._explore)
-        if guided and self.gate is not None:
-            self.gate.doubts.append(self.learning.doubt(observation, policy_action))
+        policy_action = self.act(observation)
+        asks = self.algorithm.asks and guide is not NOBODY
+        doubt = self.learning.doubt(observation, policy_action) if asks else 0.0
         acted_s = time.perf_counter()
         if self.learning.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
         begun_s = time.perf_counter()
-        intervention = None
-        if guided and self.guide is not None:
-            intervention = self._spoil(self.guide.watch(observation, policy_action))
+        intervention = guide.watch(observation, policy_action, doubt)
         human_action = None if intervention is None else intervention.action
-        if intervention is not None:
-            self.policy.yield_to_human()
         action = equations.masked_action(policy_action, human_action)
-        foreseen = []
+        foreseen: list[Observation] = []
+        if intervention is not None and self.delayed:
+            self.delayed.release_brake()
         if intervention is not None and self.algorithm.foresight:
-            foreseen = foresee(self._copied, observation, policy_action, self.algorithm.foresight)
-        next_observation, reward, terminated, truncated, info = self.env.step(action)
+            foreseen = foresee(self.env, observation, policy_action, self.algorithm.foresight)
+        stepped = next_observation, reward, terminated, truncated, info = self.vehicle.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
-        self.policy.store(
-            action,
-            self._shape(reward, intervention),
-            next_observation,
-            terminated,
-            intervention is not None,
-            overruled=policy_action,
-            penalised=self._penalises(intervention),
-            foreseen=foreseen,
-        )
+        transition = make_transition(
+            observation, policy_action, action, intervention, stepped,
+            self.penalises(intervention), foreseen,
+        )  # fmt: skip
+        self.learning.add(transition)
         stored_s = time.perf_counter()
         metrics.steps += 1
         metrics.episode_return += reward
@@ -301,25 +284,20 @@ class TrainingRun:
         metrics.acting_s += acted_s - began_s
         metrics.environment_s += moved_s - begun_s
         metrics.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
-        if self.on_step is not None:
-            speed_mps = float(info["speed_mps"])
-            self.on_step(Seen(observation, policy_action, intervention, action, speed_mps))
+        for recorder in self.recorders:
+            recorder.record(transition, intervention, info)
         return next_observation, terminated or truncated, info
 
-    def _spoil(self, intervention: Intervention | None) -> Intervention | None:
-        """Make a demonstration a wrong action, as often as the settings ask for."""
-        config, share = self.config, self.config.poor_guidance_share
-        if intervention is None or not share or self.guidance.random() >= share:
-            return intervention
-        shape = intervention.action.shape
-        wrong = (
-            np.full(shape, self.env.biased_action)
-            if config.poor_guidance == BIASED
-            else self.guidance.uniform(-1.0, 1.0, shape)
-        )
-        return replace(intervention, action=wrong.astype(np.float32))
+    def penalises(self, intervention: Intervention | None) -> bool:
+        """Return whether an intervention begins that costs the policy (eq. 17)."""
+        row = self.algorithm
+        if intervention is None or not intervention.first or not row.penalty:
+            return False
+        if intervention.reason == ASKED:  # That is no objection.
+            return False
+        return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
 
-    def _explore(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+    def _explore(self, observation: Observation) -> Action:
         action = self.learning.act(observation)
         if not np.isfinite(action).all():  # No car is to be driven by it.
             raise FloatingPointError("its actions are no longer finite")
@@ -335,35 +313,23 @@ class TrainingRun:
         left = max(0.0, 1.0 - self.progress / c.exploration_share)
         return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
-    def _penalises(self, intervention: Intervention | None) -> bool:
-        """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""
-        row = self.algorithm
-        if intervention is None or not intervention.first or not row.penalty:
-            return False
-        if intervention.reason == ASKED:  # That is no objection.
-            return False
-        return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
-
-    def _shape(self, reward: float, intervention: Intervention | None) -> float:
-        """Eq. 17 as it is printed, unless the overruled action has the penalty."""
-        c = self.config.learner
-        if not self.algorithm.rewarded:
-            reward = 0.0
-        if c.penalty_on != HUMANS_ACTION or not self._penalises(intervention):
-            return reward
-        return equations.shaped_reward(reward, c.intervention_penalty, True, False)
-
     def _beta(self) -> float:
-        """Eq. 15's exponent: zero at the end of the run, or where its weights are not used."""
+        """Return eq. 15's exponent: zero at a run's end, or where its weights are not used."""
         c = self.config.learner
         return c.beta * (1.0 - self.progress) if c.importance_sampling else 0.0
 
-    def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
-        """Judge the policy where that is due, and keep it if it is the best one."""
-        if self.config.evaluate_every_steps and (at_end or self._due(metrics.steps)):
-            self.validation.judge(metrics, self.episode, self._due(metrics.steps))
-
-    def _due(self, last_steps: int) -> bool:
-        """Whether a run that is never stopped validates now, too, after an episode of so many."""
+    def _due(self, steps_before: int) -> bool:
+        """Return whether a run that is never stopped validates after the last episode, too."""
         every = self.config.evaluate_every_steps
-        return self.over or self.steps // every > (self.steps - last_steps) // every
+        return bool(every) and (self.over or self.steps // every > steps_before // every)
+
+    @contextmanager
+    def _divergence_said(self) -> Iterator[None]:
+        """Turn the FloatingPointError of learning that diverged into a UserError."""
+        try:
+            yield
+        except FloatingPointError as error:
+            raise UserError(
+                f"the training diverged in episode {self.episode + 1}: {error}; a smaller "
+                "--set actor_learning_rate or critic_learning_rate may help"
+            ) from None

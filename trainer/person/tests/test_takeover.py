@@ -1,3 +1,6 @@
+from typing import Any
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,18 +19,20 @@ def test_a_hand_over_never_jumps_and_all_but_the_policys_own_action_is_the_perso
     """Within a hand-over and at both of its ends the action moves by at most the slew."""
     take_over, last, before = TakeOver(), None, "policy"
     for policy, human, holds in steps:
-        applied = take_over.step(policy, human, holds)
+        by_person = take_over.step(policy, human, holds)
+        applied: Any = take_over.applied
         followed = before == take_over.state in ("policy", "human")
         if last is not None and not followed:
-            assert distance(applied.action, last) <= MAX_SLEW + EPSILON
+            assert distance(applied, last) <= MAX_SLEW + EPSILON
         # An intervention has one first step, which already moves towards the person.
-        assert applied.first == (applied.human and before == "policy")
-        if applied.first:
+        assert by_person is None or by_person.action == np.float32(applied)
+        assert by_person is None or by_person.first == (before == "policy")
+        if by_person and by_person.first:
             start = policy if last is None else last
             left = max(distance(human, start) - MAX_SLEW, 0.0)
-            assert distance(human, applied.action) <= left + EPSILON
-        assert applied.human or (applied.action == policy and not holds)
-        last, before = applied.action, take_over.state
+            assert distance(human, applied) <= left + EPSILON
+        assert by_person or (applied == policy and not holds)
+        last, before = applied, take_over.state
 
 
 @given(STEPS, ACTION, ACTION)
@@ -37,17 +42,17 @@ def test_a_person_who_holds_or_lets_go_for_long_is_followed_exactly(steps, polic
         take_over.step(*step)
     for action, control in ((human, "human"), (policy, "policy")):
         for _ in range(4):
-            applied = take_over.step(policy, human, control == "human")
-        decided = (applied.action, applied.control, applied.human)
+            by_person = take_over.step(policy, human, control == "human")
+        decided = take_over.applied, take_over.control, by_person is not None
         assert decided == (action, control, control == "human")
 
 
 def test_on_the_way_back_the_steps_are_the_persons():
-    take_over = TakeOver()
-    back = [take_over.step(1.0, -1.0, held) for held in (True, True, False, False, False)]
-    assert [(b.action, b.control, b.human) for b in back[2:]] == [
-        (0.5, "returning", True), (1.0, "policy", False), (1.0, "policy", False)
-    ]  # fmt: skip
+    take_over, back = TakeOver(), []
+    for held in (True, True, False, False, False):
+        by_person = take_over.step(1.0, -1.0, held)
+        back.append((take_over.applied, take_over.control, by_person is not None))
+    assert back[2:] == [(0.5, "returning", True), (1.0, "policy", False), (1.0, "policy", False)]
     states = {state for state, _ in NEXT}
     assert len(NEXT) == 2 * len(states)
     assert {state for row in NEXT.values() for state in row} == states
