@@ -4,6 +4,8 @@ That loads torch, matplotlib or rerun, which take seconds; ``--help`` need not w
 """
 
 import argparse
+import textwrap
+from collections.abc import Iterator
 from typing import Any
 
 from bridge.fork import add_place
@@ -14,12 +16,18 @@ from trainer import options
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
 from trainer.human.config import FIELDS, HumanModelConfig
-from trainer.learner.config import ALGORITHMS
+from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.person.interface import HUMANS, add_person
-from trainer.training.config import CURVE_FILE, EXTENT, PRESETS, RunConfig
+from trainer.training.config import (
+    CURVE_FILE,
+    DEFAULTS,
+    EXTENT,
+    PRESETS,
+    SETTINGS,
+    TYPED,
+    RunConfig,
+)
 from trainer.util import PERIOD_S, kept
-
-DEFAULTS = RunConfig()
 
 
 @command(
@@ -33,51 +41,48 @@ DEFAULTS = RunConfig()
     "python -m trainer train --set    # lists the settings",
 )
 def train(parser: argparse.ArgumentParser) -> None:
-    parser.register("action", None, _Noted)
-    what = parser.add_argument_group("what is trained")
+    what = parser.add_argument_group("what to train")
     add = what.add_argument
     options.add_scenario(what)
-    rows = f"the learner: {', '.join(ALGORITHMS)}, one of an installed package, or module:ROW"
+    rows = f"learning algorithm: {', '.join(ALGORITHMS)}; of an installed package; or module:ROW"
     add("--algorithm", default=DEFAULTS.algorithm, metavar="NAME", help=rows)
-    options.add_seed(what, "everything that is drawn at random")
+    options.add_seed(what)
     options.add_fields(what, DEFAULTS, *EXTENT)
-    start = "the settings to start from: this project's, or the paper's as they are printed"
+    start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
-    file = "take options and settings from this file, as a run's own config.toml; options on "
-    file += "the command line win, but no setting may come from both"
+    file = "read options and settings from this file, such as the config.toml of a run; options "
+    file += "on the command line win; --preset and --algorithm may not change a setting in it"
     add("--config", metavar="F.toml", help=file)
-    change = "change a setting, as often as you like; without a value: list all with their "
+    change = "change a setting; may be repeated; --set alone lists all settings with their "
     change += "defaults and meanings"
     add("--set", action=_Set, nargs="?", default=[], metavar="NAME=VALUE", help=change)
     add(
         "--period", action=_Set, dest="set", default=[], metavar="SECONDS",
         type=lambda text: f"period_s={cli.positive_number(text)}",
-        help="seconds of a step (default: what the environment says, else its render_fps, else"
-        f" {PERIOD_S})",
+        help="control period, the seconds of a step (default: the environment's own, else from"
+        f" its render_fps, else {PERIOD_S})",
     )  # fmt: skip
-    options.add_latency(what, "the network between policy and vehicle, also in validation")
-    guide = parser.add_argument_group("the human")
+    options.add_latency(what, "simulated network between policy and vehicle, also in validation")
+    guide = parser.add_argument_group("who guides")
     whose = f"expert|module:Class|HUMAN_DIR|{'|'.join(HUMANS)}"
-    known = "the scripted expert, a model trained by `trainer human`, or you"
+    known = "who takes over from the policy: the environment's scripted expert, module:Class of "
+    known += "another expert, a model trained by `trainer human`, or you, in the browser"
     guide.add_argument("--human", default=DEFAULTS.human, metavar=whose, help=known)
     add_person(parser)
     how = parser.add_argument_group("the run")
-    how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
-    on = "go on from RUN_DIR's checkpoint, with its options"
+    how.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
+    on = "go on from the last checkpoint in RUN_DIR, with the options that the run had"
     how.add_argument("--resume", action="store_true", help=on)
-    options.add_time_limit(how, "stop after the episode that passes this time")
+    options.add_time_limit(how, "stop at the end of the episode in which this time is over")
     options.add_device(how)
     options.add_threads(how)
-    shown = "show the run in rerun: in a window, on a page on this machine, or into a file"
+    shown = "show the training in the rerun viewer: spawn opens a window, serve a page on this "
+    shown += "machine, F.rrd is a file to write"
     how.add_argument("--rerun", metavar="spawn|serve|F.rrd", help=shown)
-
-
-class _Noted(argparse._StoreAction):
-    """Stores an option's value, and that it was given: such a value wins over ``--config``."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
-        super().__call__(parser, namespace, values, option)
-        namespace.given = {*getattr(namespace, "given", ()), self.dest}
+    for action in parser._actions:
+        if action.dest in TYPED:  # Only what is typed wins over a config file.
+            action.help = f"{action.help} (default: {action.default})"
+            action.default = argparse.SUPPRESS
 
 
 class _Set(argparse.Action):
@@ -88,11 +93,21 @@ class _Set(argparse.Action):
 
     def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
         if value is None:
-            from trainer.training.command import setting_lines
-
             print("\n".join(setting_lines()))
             parser.exit()
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+def setting_lines() -> Iterator[str]:
+    """Describe every setting: as it is typed by default, and what it means."""
+    said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
+    for name, default in SETTINGS.items():
+        typed = str(default).lower() if isinstance(default, bool) else str(default)
+        begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
+        yield textwrap.fill(
+            said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent,
+            break_on_hyphens=False,
+        )  # fmt: skip
 
 
 @command(
@@ -104,18 +119,23 @@ class _Set(argparse.Action):
 def drive(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser, "what was recorded")
     add = parser.add_argument
-    device = "what your hands are on: the browser takes keyboard, touch, gamepad and wheel"
+    device = "how you drive: in the browser, with keyboard, touch, gamepad or wheel"
     add("--human", "--device", dest="human", choices=HUMANS, default=HUMANS[0], help=device)
-    driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
+    driver = "policy that drives until you take over, as in `trainer evaluate` (default: none)"
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
-    forked = "each episode repeats this recorded drive until --at, and goes on from there"
+    forked = "repeat this recorded drive until --at in each episode, and drive on from there"
     add("--from", dest="recording", metavar="F.mcap", type="path", help=forked)
     add_place(parser)
-    out = "the directory of the recordings; sittings add up there"
+    out = "directory of the recordings; each sitting adds one"
     add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
-    add("--episodes", type=cli.positive, metavar="N", help="stop after so many (default: no end)")
-    options.add_seed(parser, "the episodes, which are others in every sitting")
+    add(
+        "--episodes",
+        type=cli.positive,
+        metavar="N",
+        help="number of episodes (default: no end)",
+    )
+    options.add_seed(parser, " of the episodes, which are others in every sitting")
     add_person(parser)
     options.add_threads(parser)
 
@@ -129,14 +149,14 @@ def drive(parser: argparse.ArgumentParser) -> None:
 def human(parser: argparse.ArgumentParser) -> None:
     options.add_scenario(parser)
     add = parser.add_argument
-    add("--out", required=True, metavar="HUMAN_DIR", type="path", help="the directory of the model")
-    options.add_seed(parser, "everything that is drawn at random")
+    add("--out", required=True, metavar="HUMAN_DIR", type="path", help="directory of the model")
+    options.add_seed(parser)
     options.add_fields(parser, HumanModelConfig(), *FIELDS)
     person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
-    person += "their directories, or such a training run (default: the scripted expert)"
+    person += "their directories, or such a training run (default: imitate the scripted expert)"
     add("--from", dest="recordings", nargs="+", metavar="RECORDING", type="path", help=person)
-    last = "begin no episode after this time; the refining steps shrink in proportion to the "
-    options.add_time_limit(parser, f"{last}episodes")
+    last = "begin no episode after this time; the refining steps are reduced in proportion"
+    options.add_time_limit(parser, last)
     options.add_threads(parser)
 
 
@@ -149,19 +169,19 @@ def human(parser: argparse.ArgumentParser) -> None:
 )
 def evaluate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    policy = "an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, module:Class of another one, "
-    policy += "or constant:ACTION for one action from -1 to 1 throughout"
+    policy = "an .onnx file, a RUN_DIR, a HUMAN_DIR, expert, module:Class of another expert, or "
+    policy += "constant:ACTION, one action from -1 to 1 throughout"
     add("policy", metavar="POLICY", help=policy)
     add_public_key(parser)
     options.add_scenario(parser, "what the policy was trained in")
     scenes = "; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items())
     scenes = scenes.replace("%", "%%")
     add("--condition", choices=CONDITIONS, default="nominal", help=scenes)
-    options.add_latency(parser, "the network between policy and vehicle")
-    count = "how many episodes are driven"
+    options.add_latency(parser, "simulated network between policy and vehicle")
+    count = "number of episodes"
     add("--runs", type=cli.positive, default=50, metavar="N", help=count)
-    options.add_seed(parser, "the first episode; each next one has one more")
-    out = "write the report, with each episode, to this file instead of printing it"
+    options.add_seed(parser, " of the first episode; each next episode has one more")
+    out = "write the report and the results of each episode to this file; do not print it"
     add("--out", metavar="R.json", type="path", help=out)
 
 
@@ -170,10 +190,10 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key",
 )
 def export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="directory of a training run")
     options.add_scenario(parser, "what the run was trained in")
     parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
-    parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
+    parser.add_argument("--key", metavar="KEY", help="private key (PEM) that signs the policy")
 
 
 @command(

@@ -24,17 +24,16 @@ DEVICES = ("cpu", "cuda")
 
 def add_scenario(parser: Group, known: str = "") -> None:
     """``--scenario``; ``known``: what says it where it is None, in words."""
-    what = f"what is driven: {', '.join(scenarios())}, a gymnasium id, or module:id"
+    what = f"environment: {', '.join(scenarios())}, a gymnasium id, or module:id"
     what += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
 
 
-def add_seed(parser: Group, what: str) -> None:
-    """``--seed``; ``what`` says of what."""
-    parser.add_argument(
-        "--seed", type=not_negative, default=0, metavar="N", help=f"the seed of {what}"
-    )
+def add_seed(parser: Group, what: str = "") -> None:
+    """Add ``--seed``; ``what`` says of what."""
+    said = f"random seed{what}"
+    parser.add_argument("--seed", type=not_negative, default=0, metavar="N", help=said)
 
 
 def add_threads(parser: Group) -> None:
@@ -45,7 +44,7 @@ def add_threads(parser: Group) -> None:
         type=whole_number(0, MOST_THREADS),
         default=0,
         metavar="N",
-        help="processor threads of the learner; 0: torch's own default",
+        help="processor threads for PyTorch; 0: its own default",
     )
 
 
@@ -55,7 +54,7 @@ def add_latency(parser: Group, what: str) -> None:
         "--latency",
         metavar="SPEC",
         default="none",
-        help=f"{what}, in virtual time: {GRAMMAR}".replace("%", "%%"),
+        help=f"{what}: {GRAMMAR}".replace("%", "%%"),
     )
 
 
@@ -105,7 +104,10 @@ def meanings(config: type) -> dict[str, str]:
 def add_device(parser: Group) -> None:
     """``--device``."""
     parser.add_argument(
-        "--device", choices=DEVICES, default=DEVICES[0], help="where the learner computes"
+        "--device",
+        choices=DEVICES,
+        default=DEVICES[0],
+        help="device of the neural networks",
     )
 
 

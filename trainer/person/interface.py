@@ -127,11 +127,11 @@ SLOWEST, FASTEST = 0.01, 1000
 def add_person(parser: argparse.ArgumentParser) -> None:
     """Declare the person's options of ``drive`` and ``train``."""
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
-    here = "the address at which the cockpit listens; by default this machine's alone"
-    port = "the cockpit's port; 0: any that is free"
+    here = "address on which the cockpit listens; by default only this machine reaches it"
+    port = "port of the cockpit; 0: any free port"
     said = f"a number from {SLOWEST} to {FASTEST}"
     speed = number(said, lambda value: SLOWEST <= value <= FASTEST)
-    slow = "simulated seconds per real second: 0.5 is slow motion"
+    slow = "simulated seconds in a real second; 0.5 is slow motion"
     group.add_argument("--host", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)
     group.add_argument("--speed", type=speed, metavar="X", help=slow)

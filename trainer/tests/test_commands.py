@@ -15,8 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.policies import public_pem
 from trainer.options import add_time_limit, deadline_s
-from trainer.training.command import SETTINGS
-from trainer.training.config import RunConfig
+from trainer.training.config import SETTINGS, RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
 

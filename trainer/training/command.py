@@ -1,24 +1,20 @@
-"""Train a policy with human guidance: options, settings, and whether a run may begin or go on."""
+"""The command ``train``, and the same in Python: whether a run may begin or go on, and its end."""
 
 import argparse
-import difflib
-import inspect
 import math
 import os
 import re
 import sys
-import textwrap
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from bridge.network import parse_spec
 from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from bridge.rerun import check_sink
@@ -27,7 +23,7 @@ from edge_runtime.util import UserError, counted, name_in_file, read_json, read_
 from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert, located
 from trainer.environments import scenario_of
-from trainer.learner.config import LearnerConfig, find_algorithm
+from trainer.learner.config import find_algorithm
 from trainer.person.interface import (
     FASTEST,
     HUMANS,
@@ -36,34 +32,27 @@ from trainer.person.interface import (
     check_person_options,
 )
 from trainer.pictures import write_learning_curve
-from trainer.training.config import CONFIG_FILE, EXTENT, GONE, LATER, PRESETS, RunConfig
+from trainer.training.config import (
+    CONFIG_FILE,
+    DEFAULTS,
+    EXTENT,
+    LATER,
+    OPTIONS,
+    PRESETS,
+    SETTINGS,
+    TYPED,
+    RunConfig,
+    flat,
+    make_config,
+    parse_setting,
+    settings_in,
+)
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 from trainer.util import claimed
 
-DEFAULTS = RunConfig()
-OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
-"""What an option of its own decides."""
-SETTINGS: dict[str, Any] = {
-    **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
-    **asdict(DEFAULTS.learner),
-}
-"""Every setting that ``--set`` may change, with its default."""
-EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
 _STDERR = 2
 _ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Train, showing progress; returns the exit status."""
-    settings, own = arguments.set, Path(arguments.out) / CONFIG_FILE
-    if arguments.config is not None:
-        settings = [*_take_config(arguments), *settings]
-    elif arguments.resume and own.is_file():
-        settings = [*_take_own(arguments, own), *settings]
-    known = {**vars(arguments), "settings": settings}
-    done = train(**{name: known[name] for name in inspect.signature(train).parameters})
-    return INTERRUPTED if done.interrupted else 0
 
 
 @dataclass(frozen=True)
@@ -81,6 +70,20 @@ class Run:
     def metrics(self) -> list[dict[str, str]]:
         """A row for each training episode, as in ``metrics.csv``."""
         return read_metrics(self.directory)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, showing progress; return the exit status."""
+    given = {name: value for name, value in vars(arguments).items() if name in TYPED}
+    own = Path(arguments.out) / CONFIG_FILE
+    in_file: dict[str, Any] = {}
+    if arguments.config is not None:
+        in_file = _config_file(Path(arguments.config), given)
+    elif arguments.resume and own.is_file():
+        in_file = _own_config(own, given)
+    values = {**in_file, **given, **dict(map(parse_setting, arguments.set))}
+    done = _begin(values.pop("preset", "ours"), values, arguments)
+    return INTERRUPTED if done.interrupted else 0
 
 
 def train(
@@ -113,48 +116,36 @@ def train(
     Raises UserError: no such environment, algorithm, human or setting, or a directory that is
     taken.
     """
-    options.check_device(device)
+    options_given = dict(locals())
+    if isinstance(settings, Mapping):
+        settings = [f"{name}={value}" for name, value in settings.items()]
+    values = {name: options_given[name] for name in (*OPTIONS, *EXTENT)}
+    values |= dict(map(parse_setting, settings))
+    return _begin(preset, values, argparse.Namespace(**options_given))
+
+
+def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
+    """Train with these settings; ``how`` has the options that do not decide the result."""
+    human = values.get("human", DEFAULTS.human)
     if human == PERSON:  # as a run's own --config says
         raise UserError(f"a person guides that run: name --human {', '.join(HUMANS)}")
     if not is_expert(human) and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
         words = f"none of {known}, no module:Class and no human model's directory"
         raise UserError(f"--human {human} is {words}")
-    human = human if human in HUMANS else located(human)
-    if not SLOWEST <= speed <= FASTEST:
-        raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {speed}")
-    if preset not in PRESETS:
-        raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
-    start = PRESETS[preset]
-    try:
-        learner = replace(start.learner, **find_algorithm(algorithm).settings)
-    except TypeError as error:  # The row is a plug-in's.
-        raise UserError(f"settings of {algorithm}: {error}") from None
-    config = replace(
-        start,
-        scenario=scenario_of(scenario),
-        algorithm=algorithm,
-        human=PERSON if human in HUMANS else human,
-        episodes=episodes,
-        steps=steps,
-        seed=seed,
-        latency=str(parse_spec(latency)),
-        device=device,
-        threads=threads,
-        learner=learner,
-    )
-    if isinstance(settings, Mapping):
-        settings = [f"{name}={value}" for name, value in settings.items()]
-    changed = dict(map(parse_setting, settings))  # All at once: some hold only together.
-    ours = {name: changed.pop(name) for name in tuple(changed) if not hasattr(learner, name)}
-    config = replace(config, **ours, learner=replace(learner, **changed))
-    run_dir = (_new_directory(config) if out is None else Path(out)).absolute()
+    if not SLOWEST <= how.speed <= FASTEST:
+        raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
+    values["human"] = PERSON if human in HUMANS else located(human)
+    values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
+    config = make_config(preset, values)
+    options.check_device(config.device)
+    run_dir = (_new_directory(config) if how.out is None else Path(how.out)).absolute()
     person = argparse.Namespace(
-        human=human, scenario=config.scenario, host=host, port=port, speed=speed
+        human=human, scenario=config.scenario, host=how.host, port=how.port, speed=how.speed
     )
-    with claimed(run_dir), options.limited_threads(threads):
-        person.resume = check_directory(run_dir, config, resume)
-        return _train(person, config, run_dir, rerun, options.deadline_s(max_minutes))
+    with claimed(run_dir), options.limited_threads(config.threads):
+        person.resume = check_directory(run_dir, config, how.resume)
+        return _train(person, config, run_dir, how.rerun, options.deadline_s(how.max_minutes))
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -244,83 +235,44 @@ def _summary(run_dir: Path, period_s: float) -> str:
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
-def _take_config(arguments: argparse.Namespace) -> list[str]:
-    """Take what ``--config`` says and no option does; the settings in it, as ``--set`` has them."""
-    path, given = Path(arguments.config), getattr(arguments, "given", ())
-    values = _flat(read_toml(path, "config"))
-    both = {"preset": _preset_names(arguments.preset)} if "preset" in given else {}
-    rows = {arguments.algorithm, str(values.get("algorithm", arguments.algorithm))}
-    if len(rows) == 2 and "algorithm" in given:
-        both["algorithm"] = set().union(*(find_algorithm(row).settings for row in rows))
-    for option, names in both.items():
+def _config_file(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Read ``--config``. It holds every setting where a run wrote it, so that no ``--preset`` or
+    ``--algorithm`` may set the same ones.
+    """
+    found = read_toml(path, "config")
+    values = settings_in(found, str(path))
+    if "preset" in found:
+        values["preset"] = found["preset"]
+    clashes: dict[str, set[str]] = {}
+    if "preset" in given:
+        clashes["preset"] = _changed_by(given["preset"])
+    rows = {given.get("algorithm"), values.get("algorithm")} - {None}
+    if "algorithm" in given and len(rows) == 2:
+        clashes["algorithm"] = set().union(*(find_algorithm(str(row)).settings for row in rows))
+    for option, names in clashes.items():
         if clash := [name for name in values if name in names]:
             raise UserError(f"config {path} sets {clash[0]}, and so does --{option}: leave one out")
-    return _take(arguments, path, values)
+    return values
 
 
-def _take_own(arguments: argparse.Namespace, path: Path) -> list[str]:
-    """The same of the run's own config, where it goes on; `check_directory` compares the rest.
+def _own_config(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Read a run's own config, where it goes on; `check_directory` compares what is given.
 
-    What ``--preset`` may change is the preset's where one is given. A name of a module is to be
-    typed again: no file decides what is imported.
+    A name of a module is to be typed again: no file decides what is imported.
     """
-    kept = {*SETTINGS, *OPTIONS, *EXTENT}
-    if "preset" in getattr(arguments, "given", ()):
-        kept -= set().union(*map(_preset_names, PRESETS))
-    values = {name: v for name, v in _flat(read_json(path, "run config")).items() if name in kept}
-    for name in {"scenario", "algorithm", "human"} - set(getattr(arguments, "given", ())):
+    values = settings_in(read_json(path, "run config"), str(path))
+    if "preset" in given:
+        names = _changed_by("ours") | _changed_by("printed")
+        values = {name: value for name, value in values.items() if name not in names}
+    for name in {"scenario", "algorithm", "human"} - given.keys():
         name_in_file(str(values.get(name)), f"{path.parent} was trained with", f"--{name}")
-    return _take(arguments, path, values)
+    return values
 
 
-def _take(arguments: argparse.Namespace, path: Path, values: dict[str, Any]) -> list[str]:
-    assignments, given = [], getattr(arguments, "given", ())
-    for name, value in values.items():
-        if name not in (*OPTIONS, *EXTENT, "preset"):
-            assignments.append(f"{name}={value}")
-        elif type(value) is not type(getattr(DEFAULTS, name, "")):
-            raise UserError(f"config {path}: {name} cannot be {value!r}")
-        elif name not in given:
-            setattr(arguments, name, value)
-    return assignments
-
-
-def _preset_names(preset: str) -> set[str]:
-    """The settings that it changes."""
-    changed = _flat(asdict(PRESETS[preset]))
+def _changed_by(preset: str) -> set[str]:
+    """Return the settings that a preset changes."""
+    changed = flat(PRESETS[preset])
     return {name for name, default in SETTINGS.items() if changed[name] != default}
-
-
-def setting_lines() -> Iterator[str]:
-    """Every setting as it is typed by default, and what it means."""
-    said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
-    for name, default in SETTINGS.items():
-        typed = str(default).lower() if isinstance(default, bool) else str(default)
-        begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
-        yield textwrap.fill(
-            said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent,
-            break_on_hyphens=False,
-        )  # fmt: skip
-
-
-def parse_setting(assignment: str) -> tuple[str, Any]:
-    """The name and the value of one NAME=VALUE.
-
-    Raises UserError: no such setting, or no such value of it.
-    """
-    name, given, text = assignment.partition("=")
-    if not given:
-        raise UserError(f"--set {assignment}: expected NAME=VALUE")
-    if name not in SETTINGS:
-        near = difflib.get_close_matches(name, SETTINGS, 1)
-        guess = f"did you mean {near[0]}?" if near else "--set alone lists them"
-        raise UserError(f"--set {assignment}: there is no setting {name!r}; {guess}")
-    kind = type(SETTINGS[name])
-    try:
-        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
-    except (ValueError, KeyError):
-        raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
-    return name, value
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
@@ -344,9 +296,9 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved, wanted = _flat(read_json(path, "run config")), _flat(asdict(config))
+    saved, wanted = settings_in(read_json(path, "run config"), str(path)), flat(config)
     saved = {name: SETTINGS[name] for name in LATER if name in SETTINGS} | saved
-    if not all(isinstance(saved.get(name), int) for name in EXTENT):
+    if not all(name in saved for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []
     for name in wanted:
@@ -359,21 +311,6 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
         # Steps left out are 0: the run would go by episodes, and begin to explore anew.
         if wanted[name] < saved[name]:
             raise UserError(f"{run_dir} is a run of --{name} {saved[name]}: repeat that, or more")
-
-
-def _flat(values: dict[str, Any]) -> dict[str, Any]:
-    """A config's settings by their names, those of the learner among them.
-
-    Former settings are left out. UserError where one has a value that is no longer possible.
-    """
-    for name, taken in GONE.items():
-        if values.get(name, taken[0]) not in taken:
-            raise UserError(f"the setting {name} is gone: {values[name]} is no longer possible")
-    values = {name: value for name, value in values.items() if name not in GONE}
-    learner = values.get("learner")
-    if not isinstance(learner, dict):
-        return values
-    return {name: value for name, value in values.items() if name != "learner"} | learner
 
 
 def _option(name: str, values: dict[str, Any]) -> str:

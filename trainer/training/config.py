@@ -1,14 +1,16 @@
-"""What a training run is: everything that decides its result."""
+"""A training run's settings: all that decides its result, from options, files and presets."""
 
+import difflib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from bridge.network import parse_spec
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
-from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
+from trainer.learner.config import PRINTED_LEARNER, LearnerConfig, find_algorithm
 from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
@@ -33,6 +35,9 @@ GONE = {"snapshots": (False, True), "delay_known": (False,)}
 """Former settings, and those of their values with which a run trained as it does today."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
+OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
+"""What an option of its own decides; all else is changed by ``--set``."""
+TYPED = (*OPTIONS, *EXTENT, "preset")
 CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
 """A run's settings in its directory; the first with the source's revision, the second for
 ``--config``."""
@@ -50,44 +55,44 @@ class RunConfig:
     algorithm: str = "phil_td3"
     seed: int = 0
     episodes: int = 400
-    """Episodes to train, at most (table A5: 400)."""
+    """Maximum number of training episodes (table A5: 400)."""
     steps: int = 0
-    """Environment steps after which the episode under way is the last; 0: episodes decide."""
+    """Environment steps to train, to the end of the episode under way; 0: only episodes count."""
     human: str = "expert"
-    """Who guides: the word expert, ``module:Class`` of another script, or a human model's
-    directory."""
+    """The guide: the word expert, ``module:Class`` of another expert, a human model's directory, or
+    the word person."""
     guided_share: float = 1.0
-    """Share of the episodes that the human watches. (The authors' code: a third in the left
-    turn.)"""
+    """Share of the episodes in which the human watches (the authors' code: a third in the left
+    turn)."""
     guided_until_step: int = 0
-    """Environment steps after which the human leaves for good; 0: never."""
+    """Environment steps after which the human no longer watches; 0: no end."""
     guided_until_episode: int = 0
-    """Episodes after which the human gives up; 0: never."""
+    """Episodes after which the human no longer watches; 0: no end."""
     late_from_s: float = 0.0
-    """Least time by which the human takes over too late; each take-over's is drawn anew."""
+    """Minimum take-over delay, s; the delay of each take-over is drawn at random."""
     late_to_s: float = 0.0
-    """Longest such time."""
+    """Maximum take-over delay, s."""
     missed_share: float = 0.0
-    """Share of the reasons to take over that the human overlooks, for 15 control periods each."""
+    """Share of the reasons to take over that the human overlooks, each for 15 control periods."""
     penalise_stuck: bool = False
-    """Whether taking over from a car that only waits too long is penalised, too. A stuck car
-    looks like one that rightly waits, so the penalty teaches to fear waiting."""
+    """Whether a take-over from a car that waits too long is penalised, too. Such a car looks like
+    one that rightly waits, so the penalty teaches to fear waiting."""
     averaged_actor: bool = True
-    """Whether the target actor is what is validated, kept and exported. It is a running average
-    (Polyak and Juditsky, 1992) of the actor that learns, which swings from episode to episode."""
+    """Whether the target actor is validated, kept and exported, instead of the actor that learns.
+    It is a running average of that one (Polyak and Juditsky, 1992), which swings."""
     poor_guidance_share: float = 0.0
-    """Share of the human's actions that are replaced by wrong ones (section VII-E: one third)."""
+    """Share of the human's actions replaced by wrong ones (section VII-E: one third)."""
     poor_guidance: str = RANDOM
-    """How they are wrong: ``random`` (the paper's), or ``biased``, always the same."""
+    """The wrong actions: ``random`` (the paper's), or ``biased``, always the same one."""
     period_s: float = 0.0
-    """Seconds of a step, whatever the environment says; 0: what it says."""
+    """Control period, s; 0: the environment's own."""
     printed_reward: bool = False
     """Weight 1 on the term of eq. 31 or 32, as the equations are printed, instead of the scenario's
     own (``LeftTurnConfig.speed_weight``, ``CongestionConfig.steer_weight``)."""
     evaluate_every_steps: int = 500
-    """Environment steps between two evaluations on the validation seeds; 0: never."""
+    """Environment steps between two validations; 0: no validation."""
     evaluation_runs: int = 30
-    """Episodes of such an evaluation."""
+    """Episodes of a validation."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
     latency: str = "none"
@@ -95,8 +100,8 @@ class RunConfig:
     ``bridge simulate --latency``."""
     device: str = "cpu"
     threads: int = 0
-    """Processor threads of the learner, set by whoever starts the run; 0: as many as torch takes.
-    Another number sums in another order, and gives other weights."""
+    """Processor threads of the learner; 0: PyTorch's default. Another number sums in another order,
+    and gives other weights."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
     def __post_init__(self) -> None:
@@ -141,6 +146,90 @@ class RunConfig:
         }
 
 
+PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
+"""As the paper prints it; but a human who frees a stuck car is no penalty (eq. 17), and eq. 21b's
+exponent has a bound. Where the paper can be read in two ways, table A5's noise scale of 0.2 is that
+of TD3's target smoothing, which eq. 22 does not show, its rates of 1 and 0.05 are deviations of the
+exploration noise (eq. 18b), and eq. 32 counts steering in units of full action. What it leaves open
+is ours: cloning weight, precision, 256 steps before the first update, the best actor kept."""
+PRESETS = {"ours": RunConfig(), "printed": PRINTED}
+"""Where the settings of a training start from, by the word behind ``--preset``."""
+DEFAULTS = RunConfig()
+SETTINGS: dict[str, Any] = {
+    **{n: v for n, v in asdict(DEFAULTS).items() if n not in (*OPTIONS, *EXTENT, "learner")},
+    **asdict(DEFAULTS.learner),
+}
+"""Every setting that ``--set`` may change, with its default."""
+EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
+def make_config(preset: str, values: Mapping[str, Any]) -> RunConfig:
+    """Make a config of a preset, its algorithm's own settings, and ``values`` over both, by name.
+
+    Raises UserError: no such preset or algorithm, or a value out of range.
+    """
+    if preset not in PRESETS:
+        raise UserError(f"preset must be one of {', '.join(PRESETS)}: {preset}")
+    start, values = PRESETS[preset], dict(values)
+    values["latency"] = str(parse_spec(values.get("latency", start.latency)))
+    algorithm = values.get("algorithm", start.algorithm)
+    try:
+        learner = replace(start.learner, **find_algorithm(algorithm).settings)
+    except TypeError as error:  # The row is a plug-in's.
+        raise UserError(f"settings of {algorithm}: {error}") from None
+    own = {name: values.pop(name) for name in tuple(values) if hasattr(learner, name)}
+    # All at once: some hold only together.
+    return replace(start, **values, learner=replace(learner, **own))
+
+
+def parse_setting(assignment: str) -> tuple[str, Any]:
+    """Return the name and the value of one NAME=VALUE.
+
+    Raises UserError: no such setting, or no such value of it.
+    """
+    name, given, text = assignment.partition("=")
+    if not given:
+        raise UserError(f"--set {assignment}: expected NAME=VALUE")
+    if name not in SETTINGS:
+        near = difflib.get_close_matches(name, SETTINGS, 1)
+        guess = f"did you mean {near[0]}?" if near else "--set alone lists them"
+        raise UserError(f"--set {assignment}: there is no setting {name!r}; {guess}")
+    kind = type(SETTINGS[name])
+    try:
+        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
+    except (ValueError, KeyError):
+        raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
+    return name, value
+
+
+def flat(config: RunConfig) -> dict[str, Any]:
+    """Return all settings by their names, those of the learner among them."""
+    values = asdict(config)
+    return values | values.pop("learner")
+
+
+def settings_in(values: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """Return the settings that a file holds, by their names, those of the learner among them.
+
+    Former settings are left out. UserError where one has a value that is no longer possible, or a
+    setting is of another type.
+    """
+    learner = values.get("learner", {})
+    if not isinstance(learner, dict):
+        raise UserError(f"config {place}: learner cannot be {learner!r}")
+    found: dict[str, Any] = {}
+    for name, value in {**values, **learner}.items():
+        if name in GONE and value not in GONE[name]:
+            raise UserError(f"the setting {name} is gone: {value} is no longer possible")
+        if name in SETTINGS:
+            found[name] = parse_setting(f"{name}={value}")[1]
+        elif name in (*OPTIONS, *EXTENT):
+            if type(value) is not type(getattr(DEFAULTS, name)):
+                raise UserError(f"config {place}: {name} cannot be {value!r}")
+            found[name] = value
+    return found
+
+
 def period_of(config: Mapping[str, Any]) -> float | None:
     """How long a step was in a saved run, s; None where the environment said it.
 
@@ -150,13 +239,3 @@ def period_of(config: Mapping[str, Any]) -> float | None:
     if not isinstance(period_s, int | float):
         raise UserError(f"period_s of the run's config is no number: {period_s!r}")
     return period_s or None
-
-
-PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
-"""As the paper prints it; but a human who frees a stuck car is no penalty (eq. 17), and eq. 21b's
-exponent has a bound. Where the paper can be read in two ways, table A5's noise scale of 0.2 is that
-of TD3's target smoothing, which eq. 22 does not show, its rates of 1 and 0.05 are deviations of the
-exploration noise (eq. 18b), and eq. 32 counts steering in units of full action. What it leaves open
-is ours: cloning weight, precision, 256 steps before the first update, the best actor kept."""
-PRESETS = {"ours": RunConfig(), "printed": PRINTED}
-"""Where the settings of a training start from, by the word behind ``--preset``."""
