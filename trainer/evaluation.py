@@ -31,7 +31,7 @@ NO_NETWORK = LatencySpec()
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate and print the report; returns the exit status."""
+    """Evaluate and print the report; return the exit status."""
     check_writable(arguments.out)
     found = evaluate(
         arguments.policy,
@@ -58,14 +58,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a policy drove."""
+    """The results of test episodes."""
 
     report: dict[str, Any]  # As ``trainer evaluate`` prints it
     episodes: list[EpisodeResult]
 
     @property
     def success_rate(self) -> float | None:
-        """Share of episodes that reached the goal; None where the environment knows of none."""
+        """Share of episodes that reached the goal; None if the environment knows no goal."""
         return self.report["success_rate"]
 
     @property
@@ -89,8 +89,8 @@ def evaluate(
     ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
     else the left turn. Episode i is reset with ``seed + i``.
 
-    Raises UserError: nothing there that drives, or in another environment; a condition or number
-    of runs that there is not; an environment that reports what is no number.
+    Raises UserError: no such policy, condition or number of runs; a policy of another environment;
+    an environment that reports what is no number.
     """
     if condition not in CONDITIONS:
         raise UserError(f"condition must be one of {', '.join(CONDITIONS)}: {condition}")
@@ -122,9 +122,9 @@ def evaluate(
 
 
 def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
-    """The scenario of a run, a human model or a policy file, and how long a step was there.
+    """Return the scenario of a run, a human model or a policy file, and its control period, s.
 
-    That is None where the environment said it. Of anything else the left turn.
+    The period is None where the environment said it. Anything else drives the left turn.
     """
     for name in ("config.json", "human.json"):
         if (Path(policy) / name).is_file():
@@ -141,22 +141,22 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
 
 
 class Drive:
-    """One episode under way; ``observation`` is what its driver sees next.
+    """A test episode under way; its driver sees ``observation`` next.
 
-    Its seed is also that of the Gaussian noise on the command, of standard deviation ``noise_std``.
+    Gaussian noise of standard deviation ``noise_std`` is added to commands, with the same seed.
     """
 
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
         self.env, self.noise_std = env, noise_std
         self.over = False
         self.result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
-        """What it comes to; whole once it is over."""
+        """Complete once the episode is over."""
         self.observation, _ = env.reset(seed=seed)
         self._noise = np.random.default_rng([seed, 1])
         self._felt: list[list[float | None]] = []
 
     def step(self, action: Action) -> None:
-        """One control period."""
+        """Drive one control period."""
         if self.noise_std:
             disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
@@ -180,8 +180,8 @@ def drive_together(
 ) -> list[EpisodeResult]:
     """Drive an episode for each seed, as many at once as there are environments.
 
-    A network answers many pictures much sooner than each alone; its last bits may differ. ``act``
-    is that of a driver without memory: actions [n, action size] for observations [n, ...].
+    A batch of pictures is much faster than one after another; last bits may differ. ``act`` has no
+    memory: it returns actions [n, action size] for observations [n, ...].
     """
     noise_std = CONDITIONS[condition].noise_std
     results: dict[int, EpisodeResult] = {}
@@ -210,7 +210,7 @@ def drive_episodes(
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
-    Its noise is added here; its scene is the environment's own (``environments.make_environment``).
+    The condition's noise is added here; its scene is the environment's (``make_environment``).
     ``latency`` is the network between driver and vehicle, in virtual time.
     """
     results, act = [], driver.act

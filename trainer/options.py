@@ -23,7 +23,7 @@ DEVICES = ("cpu", "cuda")
 
 
 def add_scenario(parser: Group, known: str = "") -> None:
-    """``--scenario``; ``known``: what says it where it is None, in words."""
+    """Add ``--scenario``; ``known`` says in words where it comes from if not given."""
     what = f"environment: {', '.join(scenarios())}, a gymnasium id, or module:id"
     what += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
@@ -37,7 +37,6 @@ def add_seed(parser: Group, what: str = "") -> None:
 
 
 def add_threads(parser: Group) -> None:
-    """``--threads``."""
     parser.add_argument(
         "--threads",
         # torch asks the system for as many at once, and dies where it has none.
@@ -49,7 +48,7 @@ def add_threads(parser: Group) -> None:
 
 
 def add_latency(parser: Group, what: str) -> None:
-    """``--latency``, as it is typed: a run's config keeps the text."""
+    """Add ``--latency``, as text."""
     parser.add_argument(
         "--latency",
         metavar="SPEC",
@@ -59,21 +58,18 @@ def add_latency(parser: Group, what: str) -> None:
 
 
 def add_time_limit(parser: Group, what: str) -> None:
-    """``--max-minutes``; ``what`` says what becomes of the work then."""
+    """Add ``--max-minutes``; ``what`` says what happens then."""
     text = f"{what} (default: no limit)"
     parser.add_argument("--max-minutes", type=positive_number, metavar="MIN", help=text)
 
 
 def deadline_s(minutes: float | None, clock: Callable[[], float] = time.monotonic) -> float:
-    """When the minutes from now are over, as of ``clock``; infinity without a limit."""
+    """Return when the minutes are over, by ``clock``; infinity without a limit."""
     return math.inf if minutes is None else clock() + 60.0 * minutes
 
 
 def add_fields(parser: Group, config: Any, *names: str) -> None:
-    """An option for each named field of a config: its default and meaning are the field's.
-
-    The config itself checks the ranges, once it is made of the options.
-    """
+    """Add an option for each named field of a config, which itself checks the ranges."""
     said = meanings(type(config))
     for name in names:
         option, default = f"--{name.replace('_', '-')}", getattr(config, name)
@@ -87,7 +83,7 @@ def add_fields(parser: Group, config: Any, *names: str) -> None:
 
 
 def meanings(config: type) -> dict[str, str]:
-    """Field of a dataclass -> the first sentence of the docstring that stands below it."""
+    """Return the first sentence of each field's docstring, by the field's name."""
     (made,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
     assert isinstance(made, ast.ClassDef)
     found = {}
@@ -102,7 +98,6 @@ def meanings(config: type) -> dict[str, str]:
 
 
 def add_device(parser: Group) -> None:
-    """``--device``."""
     parser.add_argument(
         "--device",
         choices=DEVICES,
@@ -122,7 +117,7 @@ def check_device(device: str) -> None:
 
 
 def set_threads(count: int) -> None:
-    """Limit torch's threads; 0 leaves them as they are."""
+    """Limit PyTorch's threads; 0 leaves them alone."""
     if count:
         import torch  # takes two seconds, which --help need not wait
 
@@ -131,7 +126,7 @@ def set_threads(count: int) -> None:
 
 @contextmanager
 def limited_threads(count: int) -> Iterator[None]:
-    """``set_threads`` for the block."""
+    """Limit PyTorch's threads within a block."""
     import torch  # see set_threads
 
     before = torch.get_num_threads()

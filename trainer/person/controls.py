@@ -29,14 +29,14 @@ class Controls:
     names: tuple[str, ...]  # Of the actions
 
     def mix(self, shares: Mapping[str, float]) -> Amount:
-        """The action for keys pressed by these shares, 0 to 1; unknown ones do nothing."""
+        """Return the action for keys pressed by these shares, 0 to 1; unknown keys do nothing."""
         pressed = [np.multiply(share, self.keys[key]) for key, share in shares.items()
                    if key in self.keys]  # fmt: skip
         return amount(np.clip(np.add(self.rest, sum(pressed)), -1.0, 1.0))
 
     @property
     def help(self) -> str:
-        """What to hold for what, in one line."""
+        """A line for the page: which key does what."""
         held: dict[Amount, list[str]] = {}
         for key in self.keys:
             held.setdefault(self.mix({key: 1.0}), []).append(key.capitalize())
@@ -50,7 +50,7 @@ def _text(names: tuple[str, ...], action: Amount) -> str:
 
 @cache
 def controls_of(scenario: str) -> Controls:
-    """The controls of an environment, by its name; UserError where a person could not drive it."""
+    """Return the controls of an environment; UserError where a person cannot drive it."""
     with closing(make_environment(scenario)) as env:
         if isinstance(env, Adapted) and not env.can_be_seen:
             what = "it offers no render() and no scene()"

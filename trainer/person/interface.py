@@ -32,24 +32,24 @@ PERSON = "person"  # ``RunConfig.human`` of a run that a person guides
 
 
 def amount(action: Any) -> Amount:
-    """An action of any kind as one."""
+    """Convert an action of any kind."""
     values = np.asarray(action, float).reshape(-1).tolist()
     return values[0] if len(values) == 1 else tuple(values)
 
 
 def distance(one: Amount, other: Amount) -> float:
-    """How far two actions are apart, in the number that differs most."""
+    """Return the largest difference between two actions."""
     return float(np.abs(np.subtract(one, other)).max())
 
 
 def vector(action: Amount) -> Any:
-    """An action as the environment takes it, float32 [n]."""
+    """Convert an action to what the environment takes, float32 [n]."""
     return np.atleast_1d(np.asarray(action, np.float32))
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What the person does now."""
+    """The state of the person's hands."""
 
     action: Amount = 0.0
     """In [-1, 1]: the pedal in the left turn (1 full throttle, -1 full brake), the steering in the
@@ -87,7 +87,7 @@ class View:
     progress: str = ""  # One line on the learner; empty without one
     coach: Coaching | None = None  # Episodes, learning curve and advice; None: nothing yet
     message: str = ""
-    """What is going on besides driving: "saving", "episode ended: goal"; mostly empty."""
+    """A line for the page, such as "saving" or "episode ended: goal"; mostly empty."""
     picture: NDArray[np.uint8] | None = None
     """What the environment draws, [height, width, 3], where it has no scene."""
 
@@ -101,13 +101,13 @@ class Person(Protocol):
 
     @property
     def present(self) -> bool:
-        """Whether a person can act: a browser has the wheel.
+        """Whether a browser has the wheel.
 
         Before an episode the loop waits for it; within one, an absent person has let go.
         """
 
     def poll(self, now_s: float) -> Reading:
-        """What the person does at ``now_s`` (``time.monotonic``); without a device, rest."""
+        """Return the hands at ``now_s`` (``time.monotonic``); at rest without a device."""
 
     def show(self, view: View) -> None:
         """Show the newest view, unless there is no time for it."""

@@ -57,7 +57,7 @@ class RecordedStep(msgspec.Struct, frozen=True):
     speed_mps: float
     outcome: str = ""  # How the episode ended here, if it did
     ahead: tuple[bytes, ...] = ()
-    """What the policy's action would have led to, where the algorithm foresees; as ``seen``."""
+    """Observations that the policy's action would have led to, if the algorithm foresees."""
 
     @property
     def observation(self) -> NDArray[Any]:
@@ -71,12 +71,12 @@ class RecordedStep(msgspec.Struct, frozen=True):
 
     @property
     def foreseen(self) -> tuple[NDArray[Any], ...]:
-        """As a transition's: the observation, and what the policy's action would have led to."""
+        """``Transition.foreseen``: the observation, and those of ``ahead``."""
         return tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
 
 
 def packed(array: NDArray[Any]) -> bytes:
-    """An array as an .npy file, as a recorded step has it."""
+    """Return an array as the bytes of an .npy file."""
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=False)
     return stream.getvalue()
@@ -88,7 +88,7 @@ def _unpacked(data: bytes) -> NDArray[Any]:
 
 
 class Recorder:
-    """Writes a new sitting into a directory; UserError where that cannot be written."""
+    """Writes a new sitting into a directory; UserError where it cannot be written."""
 
     def __init__(self, directory: Path) -> None:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
@@ -147,13 +147,13 @@ class Recorder:
 
 
 def sittings(directory: Path) -> list[Path]:
-    """The recordings in a directory, in their order; none where it is not there."""
+    """Return the recordings of a directory in order; none if it does not exist."""
     found = [path for path in directory.glob("sitting-*.mcap") if NAME.fullmatch(path.name)]
     return sorted(found, key=_number)
 
 
 def _begun(directory: Path) -> list[Path]:
-    """Those that hold anything: of one that was just begun a power cut may leave nothing."""
+    """Return the recordings that hold anything: a power cut may leave an empty file."""
     return [path for path in sittings(directory) if path.stat().st_size > MAGIC_SIZE]
 
 
@@ -162,7 +162,7 @@ def _number(path: Path) -> int:
 
 
 def find_recordings(places: Sequence[Path]) -> list[Path]:
-    """The recordings in files, directories and training runs; UserError where a place has none."""
+    """Return the recordings in files, directories and runs; UserError where a place has none."""
     found: list[Path] = []
     for place in places:
         here = [place] if place.is_file() else _begun(place) or _begun(place / DIRECTORY)
@@ -173,12 +173,10 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
 
 
 def read_steps(path: Path) -> Iterator[RecordedStep]:
-    """The steps of a recording, up to its end or to where a kill has cut it off.
+    """Yield the steps of a recording, up to its end or to where a kill has cut it off.
 
-    Of a damaged one, an episode that the damage has torn is left out: its steps do not follow one
-    another, or how it ended is gone, and whether the person discarded it. One line says how much.
-
-    Raises UserError: no such file, or not one of ours.
+    An episode that damage has torn is left out: steps are missing, or its end, which says whether
+    the person discarded it. One line says how much. UserError: no such file, or not one of ours.
     """
     recording, steps, given = Recording(path), 0, 0
     for _, drive in groupby(_steps(recording), key=lambda step: step.index - step.step):
@@ -194,7 +192,7 @@ def read_steps(path: Path) -> Iterator[RecordedStep]:
 
 
 def _steps(recording: Recording) -> Iterator[RecordedStep]:
-    """Every step that can be read."""
+    """Yield every step that can be read."""
     path = recording.path
     for channel, message in recording.messages():
         if channel.topic != TOPIC:
@@ -207,7 +205,7 @@ def _steps(recording: Recording) -> Iterator[RecordedStep]:
 
 
 def read_episodes(steps: Iterable[RecordedStep]) -> Iterator[list[RecordedStep]]:
-    """Recorded steps by the episode, without the episodes that the person discarded."""
+    """Yield the steps of each episode, without episodes that the person discarded."""
     for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
         episode = list(drive)
         if episode[-1].outcome != DISCARDED:
@@ -215,7 +213,7 @@ def read_episodes(steps: Iterable[RecordedStep]) -> Iterator[list[RecordedStep]]
 
 
 def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[RecordedStep]:
-    """The recorded steps from ``position``, a sitting and an index, on, over all sittings."""
+    """Yield the steps from ``position``, a sitting and an index, on, over all sittings."""
     for path in _begun(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
 
@@ -223,12 +221,9 @@ def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Recorded
 def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
     """Give the model every recorded step in which the person was in control.
 
-    During a hand-over the model gets the hands' action, not the blend that was applied; on the
-    way back to the policy the hands have let go. Episodes that the person discarded are left out.
-
-    Returns how many take-overs the recordings hold; a whole episode driven alone is one.
-
-    Raises UserError: a recording of another scenario, or none in which a person drove.
+    During a hand-over the model gets the hands' action, not the blend that was applied; on the way
+    back to the policy the hands have let go. Returns the number of take-overs; a whole episode
+    driven alone counts as one. UserError: another scenario, or nobody drove.
     """
     interventions = 0
     for path in recordings:

@@ -25,7 +25,7 @@ person notices."""
 
 
 class Pacer:
-    """Absolute deadlines, one a period, so that one delay does not make every later period late.
+    """Keeps absolute deadlines, so that one delay does not make every later period late.
 
     A delay of less than a period is caught up. After a longer one the deadlines begin anew: a car
     that leaps through what was missed cannot be driven.
@@ -41,7 +41,6 @@ class Pacer:
         self._deadline_s = time.monotonic() + self.period_s
 
     def wait(self) -> None:
-        """Wait for the next period to begin."""
         # A signal that another thread took does not wake Python's main thread. A period is short
         # enough to notice it afterwards.
         while (left_s := self._deadline_s - time.monotonic()) > 0.0:
@@ -83,7 +82,7 @@ class Sitting(Guide):
         self._forget()
 
     def _forget(self) -> None:
-        """Nothing of an episode has happened yet."""
+        """Set the state of an episode's beginning."""
         self._step = self._human_steps = self._takeovers = self._read_ns = 0
         self._taken_over_at = math.nan  # The step at which the last take-over began
         self._take_over = TakeOver()
@@ -109,7 +108,7 @@ class Sitting(Guide):
     def watch(
         self, observation: Observation, policy_action: Action | None, doubt: float = 0.0
     ) -> Intervention | None:
-        """Show what is, wait for the control period, and ask the hands as late as possible.
+        """Show the scene, wait for the control period, and read the hands as late as possible.
 
         ``policy_action`` is None where the person drives alone. In a hand-over the action is
         neither the person's nor the policy's; the replay buffer takes it for the person's.
@@ -173,7 +172,7 @@ class Sitting(Guide):
         return outcome
 
     def show(self, message: str = "") -> None:
-        """Show what is, and a line on what is going on besides driving."""
+        """Show the scene, and a line about what happens besides driving."""
         if self._seen is None or self.closed:
             return
         frames, info = self._seen
@@ -195,7 +194,7 @@ class Sitting(Guide):
         self.person.show(view)
 
     def summary(self) -> str:
-        """Return what the sitting amounts to, in a line."""
+        """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
         kept = [episode for episode in self.driven if episode.outcome != DISCARDED]
@@ -227,13 +226,11 @@ class Sitting(Guide):
         return {"recorded": [self.recorder.sitting, self.recorder.index]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
         sitting, index = map(int, state["recorded"])
         self.saved_at = sitting, index
 
     @property
     def _to_end(self) -> bool:
-        """Whether the person wants the episode to end."""
         return self.stop or self._restart or self._discard
 
     def _now(self) -> dict[str, Any]:
@@ -251,7 +248,7 @@ class Sitting(Guide):
         }
 
     def _read(self) -> None:
-        """Ask the hands, and heed what they wish."""
+        """Read the hands, and note their wishes."""
         self._read_ns = time.time_ns()
         self._reading = self.person.poll(time.monotonic())
         wishes = self._reading.wishes
@@ -282,7 +279,6 @@ class PacedEnvironment:
         return observation, info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action for one control period."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         ended = self.sitting.moved(observation, info)
         if ended and not (terminated or truncated):

@@ -81,12 +81,12 @@ class TakeOver:
 
 
 def moved(reading: Reading, rest: Amount) -> bool:
-    """Whether a wheel or a pedal is so far from rest that it takes over."""
+    """Return whether a wheel or a pedal is far enough from rest to take over."""
     return reading.by_moving and distance(reading.action, rest) > MOVED
 
 
 class Intent:
-    """Whether the person wants control: holds something, or has moved the wheel."""
+    """Decides whether the person wants control: holds something, or has moved the wheel."""
 
     def __init__(self, rest: Amount = 0.0) -> None:
         self._rest = rest
@@ -94,7 +94,7 @@ class Intent:
         self._resting_since_s: float | None = None
 
     def update(self, reading: Reading, now_s: float) -> bool:
-        """Whether the person wants control, from the newest reading."""
+        """Return whether the person wants control, by the newest reading."""
         if not reading.by_moving:
             self._moved, self._resting_since_s = False, None
         elif distance(reading.action, self._rest) > RESTING:
@@ -112,7 +112,7 @@ MOST_ACTIONS = 16
 
 
 class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page says, at least every 100 ms; saying nothing is letting go."""
+    """A page's message, at least every 100 ms; silence is letting go."""
 
     at_ms: Annotated[float, msgspec.Meta(ge=0.0, le=1e15)]
     """The page's clock, sent back at once, so that the page knows the round trip."""
@@ -125,7 +125,7 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Seat:
-    """One driver, the page that has been here longest; the others watch.
+    """The pages of a cockpit: the oldest one drives, the others watch.
 
     A hold, or a wheel that is turned, counts only after the page was heard with its hands off, and
     after a silence it must be heard so again: a connection that comes back does not take over by
@@ -145,29 +145,28 @@ class Seat:
         self._heard_s = float("-inf")
 
     def sit_down(self, page: object) -> None:
-        """A page has come."""
         with self._lock:
             self._pages.append(page)
 
     def get_up(self, page: object) -> None:
-        """A page is gone; what its driver wished for still stands."""
+        """Remove a page; what its driver wished for still stands."""
         with self._lock:
             if self._pages[:1] == [page]:
                 self._let_go()
             self._pages = [other for other in self._pages if other != page]
 
     def is_driver(self, page: object) -> bool:
-        """Whether ``page`` has the wheel."""
+        """Return whether ``page`` has the wheel."""
         with self._lock:
             return self._pages[:1] == [page]
 
     def is_heard(self, now_s: float) -> bool:
-        """Whether the driver can act."""
+        """Return whether the driver was heard lately."""
         with self._lock:
             return now_s - self._heard_s <= SILENCE_S
 
     def hear(self, page: object, said: Input, now_s: float) -> bool:
-        """Take note of what ``page`` says; whether that counts."""
+        """Record a page's input; return whether it was accepted."""
         with self._lock:
             if self._pages[:1] != [page]:
                 return False
@@ -189,7 +188,7 @@ class Seat:
             return True
 
     def poll(self, now_s: float) -> Reading:
-        """What the driver does at ``now_s``; each wish once."""
+        """Return what the driver does at ``now_s``; each wish once."""
         with self._lock:
             said = self._said if now_s - self._heard_s <= SILENCE_S else self._off
             if said is not self._off and not self._wants(said) and self._tap is not None:
@@ -199,7 +198,7 @@ class Seat:
             return Reading(said.action, said.engaged, wishes, said.by_moving)
 
     def _wants(self, said: Reading) -> bool:
-        """Whether something is held, or a wheel or a pedal is moved."""
+        """Return whether something is held, or a wheel or a pedal moved."""
         return said.engaged or moved(said, self._rest)
 
     def _let_go(self) -> None:

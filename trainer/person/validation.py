@@ -34,8 +34,6 @@ from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_bloc
 
 
 class Candidate(NamedTuple):
-    """A policy to be validated."""
-
     actor: Actor
     episode: int  # So many had been driven
     human_s: float  # So much had the person given
@@ -90,15 +88,12 @@ class PersonValidation:
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the validation's part of a checkpoint."""
         return self.alone.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
         self.alone.load_state_dict(state)
 
     def close(self) -> None:
-        """Break off what is under way."""
         self._behind.close()
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
@@ -137,7 +132,6 @@ class BehindTheScenes:
         return self._begun is not None and not self._begun[1].done()
 
     def begin(self, candidate: Candidate) -> None:
-        """Start to validate."""
         # Not as tensors: torch would share their memory with the process.
         weights = {name: value.numpy() for name, value in candidate.actor.state_dict().items()}
         seeds = list(candidate.seeds.values())
@@ -161,7 +155,6 @@ class BehindTheScenes:
         return candidate, answer.result()
 
     def close(self) -> None:
-        """Break off what is under way."""
         self.kill()
         self._process.shutdown(cancel_futures=True)
 

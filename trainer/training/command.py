@@ -57,7 +57,7 @@ _ENDING = b"ending after this episode; a second time: at once, back to the last 
 
 @dataclass(frozen=True)
 class Run:
-    """A training run as a path: what is in its directory is all that there is of it."""
+    """A training run, usable as the path of its directory."""
 
     directory: Path
     interrupted: bool = False  # Whether it was asked to end before its time; ``resume`` goes on
@@ -68,7 +68,7 @@ class Run:
 
     @property
     def metrics(self) -> list[dict[str, str]]:
-        """A row for each training episode, as in ``metrics.csv``."""
+        """The rows of ``metrics.csv``, one a training episode."""
         return read_metrics(self.directory)
 
 
@@ -110,11 +110,9 @@ def train(
     """Train a policy with human guidance, as ``python -m trainer train`` does.
 
     The arguments are that command's options, ``out`` a new directory in ``runs`` by default, and
-    ``settings`` what ``--set`` changes, name to value. Gives the run, for ``evaluate`` and
-    ``export``.
-
-    Raises UserError: no such environment, algorithm, human or setting, or a directory that is
-    taken.
+    ``settings`` what ``--set`` changes, name to value. Returns the run, for ``evaluate`` and
+    ``export``. Raises UserError: no such environment, algorithm, human or setting, or a directory
+    that is taken.
     """
     options_given = dict(locals())
     if isinstance(settings, Mapping):
@@ -125,7 +123,7 @@ def train(
 
 
 def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
-    """Train with these settings; ``how`` has the options that do not decide the result."""
+    """Train with these settings; ``how`` holds the options that do not decide the result."""
     human = values.get("human", DEFAULTS.human)
     if human == PERSON:  # as a run's own --config says
         raise UserError(f"a person guides that run: name --human {', '.join(HUMANS)}")
@@ -149,7 +147,7 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
 
 
 def _new_directory(config: RunConfig) -> Path:
-    """The first of ``runs/SCENARIO-ALGORITHM-1`` and on that is not there."""
+    """Return the first free path of ``runs/SCENARIO-ALGORITHM-1``, ``-2`` and so on."""
     stem = re.sub(r"[^\w-]+", "_", f"{config.scenario}-{config.algorithm}")
     paths = (Path("runs") / f"{stem}-{number}" for number in count(1))
     return next(path for path in paths if not path.exists())
@@ -236,9 +234,7 @@ def _summary(run_dir: Path, period_s: float) -> str:
 
 
 def _config_file(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Read ``--config``. It holds every setting where a run wrote it, so that no ``--preset`` or
-    ``--algorithm`` may set the same ones.
-    """
+    """Read the file of ``--config``; --preset and --algorithm may not change a setting in it."""
     found = read_toml(path, "config")
     values = settings_in(found, str(path))
     if "preset" in found:
@@ -256,10 +252,7 @@ def _config_file(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _own_config(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a run's own config, where it goes on; `check_directory` compares what is given.
-
-    A name of a module is to be typed again: no file decides what is imported.
-    """
+    """Read a resumed run's own config; a name of a module must be typed: no file imports one."""
     values = settings_in(read_json(path, "run config"), str(path))
     if "preset" in given:
         names = _changed_by("ours") | _changed_by("printed")
@@ -276,9 +269,9 @@ def _changed_by(preset: str) -> set[str]:
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
-    """Whether there is a checkpoint to go on from.
+    """Return whether there is a checkpoint to resume.
 
-    Raises UserError rather than overwrite a run, or resume one under other settings.
+    Raises UserError rather than overwrite a run, or resume it under other settings.
     """
     started = (run_dir / CHECKPOINT_FILE).is_file()
     if started and not resume:
@@ -314,7 +307,7 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
 
 
 def _option(name: str, values: dict[str, Any]) -> str:
-    """The option with its value, as it was typed."""
+    """Return an option with its value, as it was typed."""
     if name == "period_s":  # 0: what the environment says
         return f"--period {values[name]}" if values[name] else "no --period"
     return (f"--{name} " if name in OPTIONS else f"--set {name}=") + _typed(name, values)

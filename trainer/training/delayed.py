@@ -46,7 +46,6 @@ class DelayedVehicle:
         return observation, info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action for one control period."""
         result: tuple[Observation, float, bool, bool, dict[str, Any]] = self.env.step(action)
         return result
 

@@ -184,7 +184,6 @@ class LearningThread:
                     raise FloatingPointError("its weights are no longer finite")
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that is needed to go on."""
         return {
             "learner": self.learner.state_dict(),
             "replay": {
@@ -195,13 +194,11 @@ class LearningThread:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
 
     def close(self) -> None:
-        """Stop the thread."""
         self._thread.shutdown()
 
     def _shaped(self, transition: Transition) -> float:
@@ -271,7 +268,6 @@ class UnhurriedLearning(LearningThread):
         return super().state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
         super().load_state_dict(state)
         self._copy_actor()
 

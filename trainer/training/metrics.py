@@ -27,17 +27,16 @@ ALWAYS = (
     "interventions",
     "human_steps",
 )
-"""Columns that every row has a number in; the others may be empty, as those that a run began
-without."""
+"""Columns that hold a number in every row; others are empty in runs from before they came."""
 WHOLE = ("episode", "total_steps", "updates", "interventions", "human_steps")  # What is counted
 
 
 @dataclass
 class EpisodeMetrics:
-    """One training episode; a mean over its steps or updates where not said otherwise."""
+    """One training episode; means over its steps or updates unless said otherwise."""
 
     episode: int
-    total_steps: int = 0  # Environment steps since the run began
+    total_steps: int = 0  # Environment steps since the run began, without discarded episodes
     updates: int = 0  # Updates since the run began
     steps: int = 0
     episode_return: float = 0.0  # Sum of the rewards, without the shaping of eq. 17
@@ -47,8 +46,8 @@ class EpisodeMetrics:
     human_steps: int = 0
     total_human_s: float = 0.0  # Simulated seconds that the human drove since the run began
     total_takeovers: int = 0
-    total_failures: int = 0  # Episodes that missed the goal since then, whoever drove
-    human_s_to_90: float = NAN  # That total when the policy alone first reached 90 % in validation
+    total_failures: int = 0  # Episodes that missed the goal so far, whoever drove
+    human_s_to_90: float = NAN  # `total_human_s` when validation first reached 90 % success
     human_s_to_98: float = NAN
     exploration_std: float = 0.0
     critic_loss: float = NAN
@@ -65,21 +64,17 @@ class EpisodeMetrics:
     waiting_s: float = 0.0
     """How long the loop waited for an update after the environment's step was done."""
     validation_success: float = NAN
-    """Success rate on the validation seeds (nan where the episode ended without one)."""
+    """Success rate on the validation seeds (nan: no validation after this episode)."""
     validation_distance_m: float = NAN
     validation_reward: float = NAN
-    """Mean of the episodes' sums of rewards: between equal success rates it decides which actor is
-    kept."""
+    """Mean return of the validation; at equal success rates it decides which actor is kept."""
 
 
 NAMES = [f.name for f in fields(EpisodeMetrics)]
 
 
 class MetricsWriter:
-    """Appends rows; a run that is resumed drops the rows after its checkpoint first.
-
-    A control period of the run takes ``period_s``.
-    """
+    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T."""
 
     def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
         self.path = run_dir / METRICS_FILE
@@ -127,18 +122,16 @@ class MetricsWriter:
                 self._board.add_scalar(name, value, metrics.episode)
 
     def close(self) -> None:
-        """Flush and close both."""
         with suppress(OSError):  # What could not be written is tried once more, and was said.
             self._file.close()
         self._board.close()
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """The rows of a run, empty where it has none; a column that it began without is empty in each.
+    """Read the rows of a run, none where it has none; a column that came later is empty.
 
     A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
-
-    Raises UserError: the file is damaged, or not of this project.
+    Raises UserError for a file that is damaged, or not of this project.
     """
     path = run_dir / METRICS_FILE
     if not path.exists():
@@ -152,7 +145,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
 
 def _rows(text: str) -> list[dict[str, str]]:
-    """The rows of the whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
+    """Read whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
         raise ValueError("its columns are others")
@@ -172,21 +165,21 @@ def _rows(text: str) -> list[dict[str, str]]:
 
 
 LEARNED = (0.9, 0.98)
-"""Success of the policy alone, in validation, at which one asks what it has cost."""
+"""Success rates of the policy alone, in validation, whose cost is reported."""
 
 
 def was_validated(row: Mapping[str, str]) -> bool:
-    """Whether the policy alone was validated as this row's episode ended."""
+    """Return whether the policy was validated after this row's episode."""
     return row["validation_success"] not in ("", "nan")
 
 
 def is_reached(level: float, success: float) -> bool:
-    """Whether a success rate is at a level, but for the last bits of a mean."""
+    """Return whether a success rate reaches a level, up to rounding."""
     return success >= level - 1e-9
 
 
 def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
-    """What these episodes have cost: steps, the human's effort, failures by their outcome."""
+    """Sum up what episodes cost: steps, the human's effort, failures by outcome."""
     human_steps = sum(int(row["human_steps"]) for row in rows)
     failures = Counter(filter(failed, settled(row["outcome"] for row in rows)))
     return {
@@ -201,13 +194,13 @@ def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
 def totals(
     rows: Sequence[dict[str, str]], period_s: float, kept_episode: int | None = None
 ) -> dict[str, Any]:
-    """What a run cost and came to, from its rows; empty where there is none.
+    """Sum up what a run cost and what it reached, from its rows; empty without rows.
 
-    ``failures`` are the training episodes, with the human's help, that missed the goal, by outcome;
-    ``validation`` has the best and the last success rate, and after how many steps the actor that
-    is kept drove so, or nothing where none was measured; ``until`` what was spent until the policy
-    alone first reached each of ``LEARNED``, or None. ``kept_episode``: after so many episodes it
-    did, where that is known; else the rows tell.
+    ``failures``: training episodes, with the human's help, that missed the goal, by outcome.
+    ``validation``: the best and the last success rate, and the steps after which the kept actor
+    reached the best; empty without a validation. ``until``: what was spent until the policy alone
+    first reached each of ``LEARNED``, or None. ``kept_episode``: episodes before the kept actor,
+    where known; else the rows tell.
     """
     if not rows:
         return {}

@@ -22,9 +22,9 @@ from trainer.util import Purpose, episode_seed, save_torch
 
 
 class Trials:
-    """The validation's episodes, which a policy drives without help, over the run's network.
+    """The validation's episodes: a policy drives them without help, over the run's network.
 
-    ``env`` is one that exists already: of some simulators no other may live beside it.
+    ``env`` exists already: some simulators allow only one in a process.
     """
 
     def __init__(self, config: RunConfig, env: Any = None) -> None:
@@ -36,7 +36,7 @@ class Trials:
 
     @cached_property
     def envs(self) -> list[Any]:
-        """What is driven at once: of our scenarios one for each seed, of any other only one."""
+        """Environments driven at once: one a seed for our scenarios, else a single one."""
         c = self.config
         make = partial(
             make_environment, c.scenario, printed_reward=c.printed_reward, period_s=c.period_s
@@ -44,7 +44,7 @@ class Trials:
         return [make() for _ in self._seeds] if c.scenario in SCENARIOS else [self._env or make()]
 
     def drive(self, driver: TogetherDriver, more: Sequence[int] = ()) -> list[EpisodeResult]:
-        """Drive them, and then ``more`` seeds."""
+        """Drive the validation seeds, then ``more`` seeds."""
         seeds = [*self._seeds, *more]
         if self.network == NO_NETWORK:
             return drive_together(self.envs, driver.act_together, seeds)
@@ -60,20 +60,20 @@ class Validation(Trials):
         super().__init__(config, env)
         self.run_dir, self.learning = run_dir, learning
         self.best = (-1.0, -1.0)
-        """Success and return of the best actor of those validated when it was due."""
+        """Success and return of the best actor among the validations that were due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
         self.kept_episode: int | None = None  # After so many was the actor that the file holds
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Judge the policy after ``episode`` episodes where that is due, or at a run's end."""
+        """Validate after ``episode`` episodes where that is due, or at the end of a run."""
         if due or (at_end and self.config.evaluate_every_steps):
             self.judge(metrics, episode, due)
 
     def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
-        """Add to ``metrics`` how the policy drives.
+        """Validate the policy as it stands, into ``metrics``; keep it if it is the best so far.
 
-        One that was not ``due``, since the run stops early, may be kept as the best so far, but a
-        resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
+        A resumed run forgets a validation that was not ``due`` but came from an early stop: when a
+        run was stopped must not decide which actor it ends with.
         """
         actor = getattr(self.learning.learner, self.config.kept_actor)
         driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
@@ -87,7 +87,7 @@ class Validation(Trials):
         episode: int,
         due: bool = True,
     ) -> None:
-        """Do what ``judge`` does with what ``drive`` gave of an actor."""
+        """Enter an actor's drives into ``metrics``, and keep the actor if it is the best."""
         success = float(np.mean([result.outcome == GOAL for result in results]))
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
@@ -100,11 +100,10 @@ class Validation(Trials):
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the validation's part of a checkpoint."""
         return {"best_validation": self.best, "best_actor": self._best_actor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave, and keep that actor again."""
+        """Take up ``state_dict``, and write its best actor again."""
         self.best = tuple(state["best_validation"])
         self._best_actor = state["best_actor"]
         if self._best_actor is not None:
