@@ -19,7 +19,6 @@ from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
 from trainer.training.metrics import read_metrics, spent
 from trainer.training.run import Parts, TrainingRun, make_vehicle
-from trainer.training.validation import Validation
 
 PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share")
 """What makes a scripted human imperfect."""
@@ -43,8 +42,8 @@ def training_with_person(
         sitting = Sitting(person, env, recorder, speed=arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
-        alone = Validation(config, run_dir, learning, env)
-        validation = stack.enter_context(closing(PersonValidation(alone, sitting)))
+        validation = PersonValidation(config, run_dir, learning, sitting)
+        stack.enter_context(closing(validation))
         vehicle = PacedEnvironment(delayed or env, sitting)
         recorders = [SittingRecorder(vehicle)]
         parts = Parts(env, delayed, vehicle, sitting, learning, validation, [*recorders])

@@ -14,6 +14,7 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from multiprocessing import get_context
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from trainer.drivers import TogetherDriver
 from trainer.learner.networks import Actor
 from trainer.person.session import Sitting
 from trainer.training.config import RunConfig
-from trainer.training.learning import NICENESS
+from trainer.training.learning import NICENESS, LearningThread
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.validation import Trials, Validation
 from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_blocked
@@ -41,25 +42,22 @@ class Candidate(NamedTuple):
     """Episode -> its seed, of those that the policy is to try, beside the validation's own."""
 
 
-class PersonValidation:
+class PersonValidation(Validation):
     """Validates behind the scenes, and once more at a sitting's end, when the page is closed."""
 
-    def __init__(self, alone: Validation, sitting: Sitting) -> None:
-        self.alone, self.sitting, self.config = alone, sitting, alone.config
-        self._behind = BehindTheScenes(alone.config)
-
-    @property
-    def kept_episode(self) -> int | None:
-        """After so many episodes was the actor that is kept."""
-        return self.alone.kept_episode
+    def __init__(
+        self, config: RunConfig, run_dir: Path, learning: LearningThread, sitting: Sitting
+    ) -> None:
+        super().__init__(config, run_dir, learning, sitting.env)
+        self.sitting, self._behind = sitting, BehindTheScenes(config)
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        learning, sitting = self.alone.learning, self.sitting
+        sitting = self.sitting
         human_s = sum(each.human_s for each in sitting.driven)
         takeovers = sum(each.takeovers for each in sitting.driven)
         sitting.progress = (
-            f"{counted(learning.added, 'step')} stored, "
+            f"{counted(self.learning.added, 'step')} stored, "
             f"{round(human_s / sitting.env.control_period_s)} yours in "
             f"{counted(takeovers, 'intervention')} of this sitting; "
             f"{self.learned(metrics.critic_loss)}, return {metrics.episode_return:.1f}"
@@ -67,33 +65,28 @@ class PersonValidation:
         if not at_end:
             self._beside(metrics, episode, due)
             return
+        runs, every = self.config.evaluation_runs, self.config.evaluate_every_steps
         try:
             sitting.close()
-            self._behind.close()
-            if self.config.evaluate_every_steps:
-                runs = self.config.evaluation_runs
+            self.close()
+            if every:
                 said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
                 print(said, file=sys.stderr, flush=True)
             with sigterm_as_interrupt():  # SIGHUP, too: this episode's row is to be written.
-                self.alone.after(metrics, episode, bool(self.config.evaluate_every_steps), at_end)
+                super().after(metrics, episode, bool(every), at_end)
         except KeyboardInterrupt:
             with suppress(OSError):  # The terminal may be gone.
                 print("validation left out", file=sys.stderr)
 
     def learned(self, critic_loss: float) -> str:
         """Return what the learner did in an episode: nothing before its warm-up is over."""
-        added, warmup = self.alone.learning.added, self.config.learner.warmup_steps
+        added, warmup = self.learning.added, self.config.learner.warmup_steps
         if added < warmup:
             return f"not learning yet ({added} of {warmup} steps)"
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
-    def state_dict(self) -> dict[str, Any]:
-        return self.alone.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.alone.load_state_dict(state)
-
     def close(self) -> None:
+        """Break off what is under way beside the person."""
         self._behind.close()
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
@@ -102,13 +95,12 @@ class PersonValidation:
         if found is not None:
             candidate, drives = found
             runs = self.config.evaluation_runs
-            self.alone.take(drives[:runs], candidate.actor, metrics, candidate.episode)
+            self.take(drives[:runs], candidate.actor, metrics, candidate.episode)
             goals = [drive.outcome == GOAL for drive in drives[runs:]]
             mastered = dict(zip(candidate.seeds, goals, strict=True))
             coach.take(candidate.human_s, metrics.validation_success, mastered)
         if due and metrics.updates and not self._behind.busy:
-            learner = self.alone.learning.learner
-            actor = copy.deepcopy(getattr(learner, self.config.kept_actor)).cpu()
+            actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
             seeds = {
                 number: episode_seed(self.config.seed, Purpose.TRAINING, number)
                 for number in coach.to_check()

@@ -1,9 +1,6 @@
-import argparse
 import json
-import math
 import shlex
 import shutil
-import time
 from dataclasses import asdict
 from pathlib import Path
 from unittest.mock import Mock
@@ -14,7 +11,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.policies import public_pem
-from trainer.options import add_time_limit, deadline_s
 from trainer.training.config import SETTINGS, RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
@@ -26,20 +22,18 @@ CONGESTION = POLICY.replace("left_turn", "congestion")
 WRONG = [
     *(f"train --out {{tmp}}/x {words}" for words in (
         "--scenario moon", "--algorithm magic", "--human mouse", "--human {tmp}/nobody",
-        "--episodes 0", "--seed 99999999999999999999999", "--threads 1025", "--max-minutes 0",
-        "--max-minutes nan", "--resume", "--set no_such=1", "--set batch_size", "--set gamma=nan",
-        "--set batch_size=many", "--set batch_size=0", "--set evaluation_runs=0",
-        "--set replay_capacity=99999999999999",
+        "--episodes 0", "--threads 1025", "--max-minutes nan", "--resume", "--set no_such=1",
+        "--set gamma=nan", "--set replay_capacity=99999999999999",
     )),
     *(f"evaluate {words}" for words in (
         "{tmp}/nothing.onnx", "{tmp}/nothing", "{tmp}/file", "expert --runs -1",
         "expert --condition rain", "expert --out /dev/null/r.json",
     )),
     *(f"export {{tmp}} --out {{tmp}}/{words}" for words in (
-        "p.onnx", "p.onnx --key {tmp}/no.key", "p.txt",
+        "p.onnx", "p.txt",
     )),
     "train --out {tmp}/file/x", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
-    "plot {tmp} --out {tmp}/c.pdf", "plot {tmp} --out {tmp}/c.txt", "view {tmp} --save ''",
+    "plot {tmp} --out {tmp}/c.pdf", "view {tmp} --save ''",
     "plot {tmp} --out /dev/null/p.png", "human --out {tmp}/file", "bench --threads -1",
     "bench --out /dev/null/b.json", "experiment status --results ''",
 ]  # fmt: skip
@@ -47,18 +41,14 @@ WRONG = [
 
 TOLD = [
     *((f"evaluate constant:{action}", "expected an action from -1 to 1")
-      for action in ("''", "fast", "nan", "1.5", "-2", "inf")),
-    ("train --out x --set printed_reward", "--set printed_reward: expected NAME=VALUE"),
+      for action in ("fast", "nan", "1.5")),
     ("train --out x --set printed_reward=maybe", "expected true or false, got 'maybe'"),
     ("train --out x --set batch_size=1.5", "expected a whole number, got '1.5'"),
-    ("train --out x --set gamma=", "expected a number, got ''"),
     ("train --out x --set bach_size=4", "did you mean batch_size?"),
     ("trian", "did you mean train?"),
     ("plot x --out a.jpg", "a picture is a .png"),
     ("evaluate none", "none is no policy"),
     ("plot one two --out c.png", "one holds no metrics"),
-    ("plot one two", "several runs go into one picture"),
-    ("experiment fig99", "invalid choice"),
     ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
     ("train --out x --period 0", "argument --period"),
     ("experiment fig7 --seeds 0", "--seeds"),
@@ -218,15 +208,6 @@ def test_no_file_of_a_run_decides_what_is_imported(config, tmp_path, monkeypatch
 def test_a_config_that_is_none_is_one_line(spoilt, config):
     values, refused = config
     refused({**values, **spoilt} if isinstance(spoilt, dict) else spoilt, *GIVEN.split())
-
-
-def test_minutes_count_from_now_and_none_is_no_limit():
-    parser = argparse.ArgumentParser()
-    add_time_limit(parser, "stop")
-    before_s = time.monotonic()
-    end_s = deadline_s(parser.parse_args(["--max-minutes", "2"]).max_minutes)
-    assert before_s + 120.0 <= end_s <= time.monotonic() + 120.0
-    assert deadline_s(parser.parse_args([]).max_minutes) == math.inf
 
 
 def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_path, capsys):

@@ -31,8 +31,6 @@ LATER = (
 )  # fmt: skip
 """Fields of a run's config and of an algorithm's row that came after the first records. A run or a
 record without one had its default."""
-GONE = {"snapshots": (False, True), "delay_known": (False,)}
-"""Former settings, and those of their values with which a run trained as it does today."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
@@ -211,16 +209,13 @@ def flat(config: RunConfig) -> dict[str, Any]:
 def settings_in(values: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Return the settings that a file holds, by their names, those of the learner among them.
 
-    Former settings are left out. UserError where one has a value that is no longer possible, or a
-    setting is of another type.
+    Former settings are left out. UserError where a value is of another type.
     """
     learner = values.get("learner", {})
     if not isinstance(learner, dict):
         raise UserError(f"config {place}: learner cannot be {learner!r}")
     found: dict[str, Any] = {}
     for name, value in {**values, **learner}.items():
-        if name in GONE and value not in GONE[name]:
-            raise UserError(f"the setting {name} is gone: {value} is no longer possible")
         if name in SETTINGS:
             found[name] = parse_setting(f"{name}={value}")[1]
         elif name in (*OPTIONS, *EXTENT):

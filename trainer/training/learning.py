@@ -56,17 +56,10 @@ class LearningThread:
         )
         try:
             self.replay = ReplayBuffer(
-                c.replay_capacity,
-                action_size,
-                c.alpha,
-                row.separate_buffers,
-                c.return_steps,
-                c.gamma,
-                c.intervention_penalty if charges_overruled(c, row) else None,
-                env.layout,
-                row.human_share,
-                bool(row.foresight),
-            )
+                c.replay_capacity, action_size, c.alpha, row.separate_buffers, c.return_steps,
+                c.gamma, c.intervention_penalty if charges_overruled(c, row) else None,
+                env.layout, row.human_share, bool(row.foresight),
+            )  # fmt: skip
         except MemoryError:
             raise UserError(
                 f"there is no memory for a replay buffer of {c.replay_capacity} "

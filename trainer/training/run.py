@@ -68,7 +68,7 @@ class Parts:
     vehicle: Any  # What the loop drives: one of these, perhaps in a wrapper
     guide: Guide
     learning: LearningThread
-    validation: Any  # `Validation`, or something with its ``after`` and its state
+    validation: Validation
     recorders: list[Recorder] = field(default_factory=list)
 
 

@@ -69,8 +69,8 @@ def test_a_script_that_trains_is_not_run_again_by_its_validation(tmp_path):
     ],
 )
 def test_before_it_learns_it_says_so_instead_of_nan(added, loss, said):
-    alone = SimpleNamespace(config=RunConfig(), learning=SimpleNamespace(added=added))
-    validation: Any = SimpleNamespace(alone=alone, config=alone.config)
+    learning = SimpleNamespace(added=added)
+    validation: Any = SimpleNamespace(config=RunConfig(), learning=learning)
     assert PersonValidation.learned(validation, loss) == said
 
 

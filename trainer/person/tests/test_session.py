@@ -77,14 +77,6 @@ def test_quitting_ends_the_episode_and_keeps_its_last_step(tmp_path):
     assert (last.truncated, last.terminated, last.outcome) == (True, False, STOPPED)
 
 
-def test_a_sitting_that_is_over_has_nobody_to_heed(tmp_path):
-    sitting = make_sitting(tmp_path, Puppet())
-    assert (sitting.quit(), sitting.stop) == (True, True)
-    sitting.stop = False
-    sitting.close()
-    assert (sitting.quit(), sitting.stop) == (False, False)
-
-
 @pytest.mark.parametrize(("wished", "outcome"), [("restart", RESTARTED), ("discard", DISCARDED)])
 def test_an_episode_begun_anew_or_thrown_away_ends_and_is_marked(tmp_path, wished, outcome):
     readings = [hold(1.0), hold(1.0), wish(wished), *[LET_GO] * 14]
@@ -151,14 +143,6 @@ def test_nobody_demonstrates_where_nobody_is(tmp_path):
     human, policy = (True, "human"), (False, "policy")
     assert [(step.human, step.control) for step in steps] == [human, human, policy, policy, human]
     assert [step.first for step in steps] == [True, False, False, False, True]
-
-
-def test_sittings_drive_other_episodes(tmp_path):
-    seeds = [
-        {step.seed for step in drive_and_read(tmp_path, [wish("restart"), *[LET_GO] * 12])[1]}
-        for _ in range(2)
-    ]
-    assert len(seeds[0] | seeds[1]) == 4
 
 
 @pytest.mark.parametrize(

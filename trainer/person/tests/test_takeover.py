@@ -78,14 +78,6 @@ def test_moving_or_holding_takes_over_and_resting_or_letting_go_hands_back(readi
         assert intent.update(reading, now_s) == wants_control, now_s
 
 
-@given(st.lists(st.tuples(st.floats(-0.15, 0.15), st.floats(0.0, 1.0)), max_size=30))
-def test_below_the_threshold_nothing_is_taken_over(moves):
-    intent, now_s = Intent(), 0.0
-    for action, waited_s in moves:
-        now_s += waited_s
-        assert not intent.update(wheel(action), now_s)
-
-
 OFF, HOLD = Input(0.0, 0.0, engaged=False), Input(0.0, 0.8, engaged=True)
 RESTING, TURNED = (Input(0.0, place, engaged=False, by_moving=True) for place in (0.03, 0.8))
 
