@@ -5,7 +5,7 @@ import math
 import pytest
 from hil_tests.testing.vehicles import OK, PEDAL, SPEC, HunterRig
 
-from edge_runtime.vehicles import core as rules
+from edge_runtime.vehicles import plausibility
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
@@ -102,7 +102,7 @@ def test_time_limits_to_the_instant(driving):
     core.bus_failed("full", 0.0)
     holds_until(BUS_PATIENCE_S, State.ENABLED, lambda at_s: core.bus_failed("full", at_s))
     core.state, core._since_s = State.ENABLING, 0.0
-    holds_until(rules.ENABLE_TIMEOUT_S, State.ENABLING, core.tick)
+    holds_until(plausibility.ENABLE_TIMEOUT_S, State.ENABLING, core.tick)
 
 
 def test_what_is_at_rest(rig):

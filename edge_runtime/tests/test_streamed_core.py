@@ -11,17 +11,16 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.vehicles.core import (
-    DEVIATES_S,
     FOLLOWS_S,
     LEADS_TO,
     STANDS_MPS,
     Event,
     Finding,
-    FollowWatch,
     Speeds,
     State,
 )
 from edge_runtime.vehicles.mapping import wish_of
+from edge_runtime.vehicles.plausibility import DEVIATES_S, FollowWatch
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import base, make_vehicle
-from edge_runtime.vehicles.base import BRAKING, LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
+from edge_runtime.vehicles import base, make_vehicle, plausibility
+from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
+from edge_runtime.vehicles.plausibility import BRAKING, LYING, SILENT, STUCK, VehicleWatch
 from edge_runtime.wire import SAFE_STOP, encode
 
 
@@ -236,7 +237,7 @@ def test_words_that_no_message_can_carry_are_written_as_escapes(vehicle, runner)
 
 @pytest.mark.parametrize("stop", [-1.0, 0.0, 1.0])
 def test_a_stop_brakes_whatever_number_is_the_policys(runner, stop):
-    end_s = time.monotonic() + base.LAG_S + base.DEVIATES_S + 0.4
+    end_s = time.monotonic() + plausibility.LAG_S + plausibility.DEVIATES_S + 0.4
     while time.monotonic() < end_s:
         runner.command(make_command(mode=SAFE_STOP, action=[stop]))
         time.sleep(T / 2)
@@ -442,8 +443,8 @@ def test_silence_after_two_periods_also_before_the_first_report():
 def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
     watch, now_s = watched(asked=0.6, pedal=0.6)
     watch.report(report(pedal=-1.0), now_s + TICK_S)
-    assert watch.fault(now_s + TICK_S + base.DEVIATES_S) == ""
-    assert watch.fault(now_s + TICK_S + base.DEVIATES_S + 0.001) == STUCK
+    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S) == ""
+    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S + 0.001) == STUCK
     watch.report(report(pedal=0.6), now_s + 2 * TICK_S)
     assert watch.fault(now_s + 2 * TICK_S) == ""
 

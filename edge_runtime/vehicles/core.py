@@ -18,8 +18,9 @@ from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
-from edge_runtime.vehicles.base import ENABLE_TIMEOUT_S, VehicleReport
+from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, FollowWatch
 
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
@@ -31,7 +32,6 @@ STOP_TAKES_S = 1.0
 FOLLOWS_S = 1.0  # a drive may still follow a set-point of this age
 STEERS_S = 0.2  # so may a wheel, by its dead time and lag; what is heard of it is older still
 DEVIATION = 0.1  # of top speed, or of full lock (a wheel has play), outside of all that was asked
-DEVIATES_S = 0.1
 STANDS_MPS = 0.02
 IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
 _WINDOW_S = 0.11
@@ -135,39 +135,6 @@ class Speeds:
             return 0.0
         (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
         return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
-
-
-class FollowWatch:
-    """Whether what is measured stays outside of all that a healthy actuator can do.
-
-    It is, give or take `tolerance`, where it was asked to be within `follows_s`. At first, or where
-    it was not judged for a time, it comes from elsewhere: by `rate` a second.
-    """
-
-    def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
-        self._tolerance, self._follows_s, self._rate = tolerance, follows_s, rate
-        self._asked: Deque[Tuple[float, float]] = deque()
-        self._low = self._high = 0.0  # a healthy one is in between
-        self._deviates_since_s = math.inf
-
-    def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
-        """Note what is asked and measured now, and judge; a None is not judged."""
-        if measured is None:
-            self._asked.clear()
-            return False
-        nearer = self._rate * (now_s - self._asked[-1][0]) if self._asked else 0.0
-        self._asked.append((now_s, asked))
-        while len(self._asked) > 1 and self._asked[1][0] < now_s - self._follows_s:
-            self._asked.popleft()
-        if self._asked[0][0] > now_s - self._follows_s:
-            self._low, self._high, self._deviates_since_s = measured, measured, math.inf
-            return False  # it has had no time to follow
-        values = [value for _, value in self._asked]
-        self._low = min(*values, self._low + nearer)
-        self._high = max(*values, self._high - nearer)
-        follows = self._low - self._tolerance <= measured <= self._high + self._tolerance
-        self._deviates_since_s = math.inf if follows else min(self._deviates_since_s, now_s)
-        return now_s - self._deviates_since_s > DEVIATES_S
 
 
 class StreamedCore(abc.ABC):

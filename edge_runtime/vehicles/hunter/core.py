@@ -11,7 +11,6 @@ from typing import Dict, List, Optional
 
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import (
-    ENABLE_TIMEOUT_S,
     IMPOSSIBLE,
     STOP_TAKES_S,
     Event,
@@ -23,6 +22,7 @@ from edge_runtime.vehicles.core import (
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, Similarity
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S
 
 STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
 COUNTERS = 256  # byte 7 of 0x211 runs over

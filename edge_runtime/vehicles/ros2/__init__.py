@@ -22,7 +22,6 @@ from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import (
-    ENABLE_TIMEOUT_S,
     IMPOSSIBLE,
     Event,
     Finding,
@@ -31,6 +30,7 @@ from edge_runtime.vehicles.core import (
     StreamedCore,
 )
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S
 from edge_runtime.vehicles.stream import StreamedVehicle
 
 if TYPE_CHECKING:

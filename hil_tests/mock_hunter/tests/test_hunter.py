@@ -15,11 +15,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
+from edge_runtime.vehicles.core import FOLLOWS_S, State
 from edge_runtime.vehicles.core import Event as CoreEvent
 from edge_runtime.vehicles.hunter import open_bus, parse_bus, protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
+from edge_runtime.vehicles.plausibility import DEVIATES_S
 from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.hunter import (
