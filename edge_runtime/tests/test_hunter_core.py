@@ -5,10 +5,10 @@ import math
 import pytest
 from hil_tests.testing.vehicles import OK, PEDAL, SPEC, HunterRig
 
-from edge_runtime.vehicles import plausibility
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault
 
 TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
 CLEAR, LOCK, GIVE_BACK = (0x441, b"\x00"), (0x131, b"\x01"), (0x421, b"\x00")
@@ -102,7 +102,7 @@ def test_time_limits_to_the_instant(driving):
     core.bus_failed("full", 0.0)
     holds_until(BUS_PATIENCE_S, State.ENABLED, lambda at_s: core.bus_failed("full", at_s))
     core.state, core._since_s = State.ENABLING, 0.0
-    holds_until(plausibility.ENABLE_TIMEOUT_S, State.ENABLING, core.tick)
+    holds_until(ENABLE_TIMEOUT_S, State.ENABLING, core.tick)
 
 
 def test_what_is_at_rest(rig):
@@ -183,9 +183,9 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
         (protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
          Event.FOREIGN, "somebody else sends 0x111"),
         (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0),
-         Event.LYING, "the chassis reports 3.0 m/s"),
+         Fault.LYING, "the chassis reports 3.0 m/s"),
         (protocol.MOTION_STATUS, protocol.MotionStatus(0.0, 1.0),
-         Event.LYING, "a steering angle of 1.00 rad"),
+         Fault.LYING, "a steering angle of 1.00 rad"),
         (None, "bus-off", Event.BUS, "the CAN bus fails: bus-off"),
     ],
 )  # fmt: skip
@@ -283,7 +283,7 @@ def test_frames_that_repeat_themselves_are_silence_after_three_of_them(driving):
     driving.step(10, PEDAL)
     assert driving.core.state is State.ENABLED
     driving.step(7, PEDAL)
-    assert (driving.core.state, driving.core.cause) == (State.STOPPED, Event.SILENT)
+    assert (driving.core.state, driving.core.cause) == (State.STOPPED, Fault.SILENT)
     assert driving.words == driving.report.standing == [FROZEN]  # it is not re-armed
     driving.core.enable(driving.now_s)
     driving.step(60, PEDAL)

@@ -12,7 +12,8 @@ from hil_tests.testing.vehicles import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, R
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.ros2_side import RosHunter
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import Event, State
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.plausibility import Fault
 from edge_runtime.vehicles.ros2 import (
     STEERING,
     YAW_RATE,
@@ -45,7 +46,7 @@ def test_odometry_that_repeats_itself_is_silence():
     for _ in range(15):
         rig.core.hear(round(100 * 1e9), 0.5, 0.0, rig.now_s)
         rig.step(1, PEDAL)
-    assert (rig.core.cause, rig.words[0]) == (Event.SILENT, "no fresh odometry on odom")
+    assert (rig.core.cause, rig.words[0]) == (Fault.SILENT, "no fresh odometry on odom")
 
 
 def test_a_clock_set_back_counts_after_the_next_enable():
@@ -63,7 +64,7 @@ def test_a_clock_set_back_is_believed_once_nothing_is_driven():
     for tick in range(1, 40):
         rig.core.hear(tick, 0.0, 0.0, rig.now_s)
         rig.step(1, PEDAL)
-    assert rig.core.cause is Event.SILENT
+    assert rig.core.cause is Fault.SILENT
     assert rig.core.standing(rig.now_s) == []  # Else no re-arm would ever be taken.
 
 
@@ -93,7 +94,7 @@ def test_an_angle_that_no_wheel_has_is_not_believed():
         rig.angular = angular
         rig.step(2)
         assert rig.core.state is (State.ENABLED if believed else State.STOPPED)
-        assert rig.core.cause is (None if believed else Event.LYING)
+        assert rig.core.cause is (None if believed else Fault.LYING)
 
 
 def test_at_a_stand_a_yaw_rate_tells_nothing_and_the_asked_steering_is_reported():

@@ -11,16 +11,14 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.vehicles.core import (
-    FOLLOWS_S,
     LEADS_TO,
     STANDS_MPS,
     Event,
-    Finding,
     Speeds,
     State,
 )
 from edge_runtime.vehicles.mapping import wish_of
-from edge_runtime.vehicles.plausibility import DEVIATES_S, FollowWatch
+from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S, Fault, Finding, FollowWatch
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -87,11 +85,11 @@ def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
     rig.driving(1.0)
     rig.obeys, rig.speed_mps = False, 0.7
     rig.step(130, {"pedal": -1.0})
-    assert rig.core.cause is Event.STUCK
+    assert rig.core.cause is Fault.STUCK
     rig.enabled().step(40, {"pedal": -1.0})
     assert rig.core.state is State.ENABLED
     rig.step(30, {"pedal": -1.0})
-    assert rig.core.cause is Event.STUCK
+    assert rig.core.cause is Fault.STUCK
 
 
 def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_while():
@@ -170,7 +168,7 @@ def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
     rig.jammed_rad = math.copysign(SPEC.inner_rad(wheel_rad), wheel_rad)
     wrong = abs(wheel_rad - asked_rad) > TOLERANCE_RAD
     rig.step(round(FOUND_WITHIN_S / STREAM_S), {"steering": steering}, scenario_speed_mps=4.0)
-    assert rig.core.cause is (Event.ASTRAY if wrong else None)
+    assert rig.core.cause is (Fault.STEERING_STUCK if wrong else None)
     assert rig.core.set_point.speed_mps == 0.0 if wrong else rig.speed_mps > 0.9
 
 
@@ -179,7 +177,7 @@ def test_a_wheel_need_not_turn_before_it_is_to_drive(rig):
     rig.enabled().step(200, {"pedal": -1.0, "steering": -1.0})
     assert rig.core.state is State.ENABLED
     rig.step(60, PEDAL)
-    assert rig.core.cause is Event.ASTRAY
+    assert rig.core.cause is Fault.STEERING_STUCK
     assert 0.0 < max(rig.speeds()) < 0.75
 
 
@@ -188,7 +186,7 @@ def test_a_wheel_need_not_turn_where_it_stands_nor_where_it_is_to_stand(rig, spe
     rig.jammed_rad = 0.5
     rig.enabled().obeys, rig.speed_mps = False, speed_mps
     rig.step(100, {"pedal": pedal})
-    assert rig.core.cause is (Event.STUCK if pedal > 0 else None)
+    assert rig.core.cause is (Fault.STUCK if pedal > 0 else None)
 
 
 @pytest.mark.parametrize(("period_s", "lag_s"), [(0.1, 0.36), (0.5, 1.16)])
@@ -207,9 +205,9 @@ def test_a_wheel_may_lag_behind_all_the_time(rig, period_s, lag_s):
 
 def test_of_two_findings_the_graver_is_named(rig, monkeypatch):
     rig.driving()
-    monkeypatch.setattr(rig.core._steering_watch, "is_stuck", lambda *_: True)
+    monkeypatch.setattr(rig.core._drive_watch._steering, "is_stuck", lambda *_: True)
     rig.core.tick(rig.core.late_at_s + 1.0)
-    assert rig.core.cause is Event.SILENT
+    assert rig.core.cause is Fault.SILENT
 
 
 @pytest.mark.parametrize("pedal", [0.05, 1.0])
@@ -222,7 +220,7 @@ def test_a_runaway_is_found_at_any_scale_and_throttle(make, scale, pedal):
     for _ in range(60):
         rig.speed_mps = min(rig.speed_mps + 2.0 * STREAM_S, 1.6)
         rig.step(1, {"pedal": pedal})
-    assert rig.core.cause is Event.STUCK
+    assert rig.core.cause is Fault.STUCK
 
 
 def test_a_drive_with_a_lag_is_not_stuck(rig):
@@ -316,7 +314,7 @@ def lie(rig):
     rig.speed_mps, rig.obeys = 3.0, False
     rig.step(2, PEDAL)
     rig.speed_mps, rig.obeys = 0.0, True
-    return rig.lie
+    return rig.lie.split(" 3.")[0]
 
 
 def be_stuck(rig):
@@ -336,8 +334,8 @@ def be_astray(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Event.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
-        (lie, Event.LYING), (be_stuck, Event.STUCK), (be_astray, Event.ASTRAY),
+        (fall_silent, Fault.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
+        (lie, Fault.LYING), (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
     ],
 )  # fmt: skip
 def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
@@ -360,7 +358,7 @@ def after(state, event):
 
 
 def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
-    ways = {(event, *way) for event in Event for way in LEADS_TO[event].items()}
+    ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
     assert all(before is not then for _, before, then in ways)
     assert {event for event, _, then in ways if then is State.ENABLED} == {Event.CONFIRMED}
     out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
@@ -369,11 +367,11 @@ def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
 
 def test_the_readme_shows_the_table():
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
-    assert render_table(Event, State, after) in readme
+    assert render_table(LEADS_TO, State, after) in readme
 
 
 @pytest.mark.parametrize("state", State)
-@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("event", LEADS_TO)
 def test_the_core_goes_where_the_table_says(rig, state, event):
     core = rig.core
     core.state = state

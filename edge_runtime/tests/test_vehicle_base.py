@@ -19,7 +19,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import base, make_vehicle, plausibility
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
-from edge_runtime.vehicles.plausibility import BRAKING, LYING, SILENT, STUCK, VehicleWatch
+from edge_runtime.vehicles.plausibility import REASONS, Fault, VehicleWatch
 from edge_runtime.wire import SAFE_STOP, encode
 
 
@@ -131,7 +131,7 @@ def test_a_driver_that_raises_or_reports_nonsense_is_silent_and_its_thread_lives
     wait_until(lambda: runner.heard, "feedback")
     setattr(vehicle, name, wrong)
     wait_until(lambda: runner.faults, "the fault")
-    assert runner.fault(runner.silent_at_s + 0.001) == SILENT
+    assert runner.fault(runner.silent_at_s + 0.001) == REASONS[Fault.SILENT]
     runner.command(make_command(mode=SAFE_STOP))
     wait_until(lambda: vehicle.asked == ["brake"], "the brake")
     setattr(vehicle, name, right)
@@ -178,7 +178,10 @@ def test_a_command_not_taken_is_a_fault_until_one_is(vehicle, runner, broken, ac
     wait_until(lambda: runner.faults, "the fault")
     assert runner.fault(time.monotonic())
     if broken:
-        wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "the feedback")
+        wait_until(
+            lambda: runner.heard and runner.heard[-1].faults == [REASONS[Fault.SILENT]],
+            "the feedback",
+        )
     vehicle.broken = ""
     # A stop is one whatever stands beside it.
     runner.command(make_command(1, mode=SAFE_STOP, action=action))
@@ -190,7 +193,7 @@ def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(veh
     vehicle.hang()
     runner.command(make_command())
     runner.command(make_command(1, mode=SAFE_STOP))
-    wait_until(lambda: runner.fault(time.monotonic()) == SILENT, "the fault")
+    wait_until(lambda: runner.fault(time.monotonic()) == REASONS[Fault.SILENT], "the fault")
     assert vehicle.asked == []
     vehicle.go_on()
     wait_until(lambda: vehicle.asked == ["brake"], "the brake alone")
@@ -397,12 +400,17 @@ def watched(asked=0.0, **reported):
 @pytest.mark.parametrize(
     ("asked", "reported", "newest", "fault"),
     [
-        (0.3, {"pedal": 0.3}, {}, ""),
-        (0.6, {"pedal": -1.0, "self_braking": True}, {}, BRAKING),  # though it is to drive
-        (0.0, {}, {"speed_mps": 9.0}, LYING),
-        (0.0, {}, {"speed_mps": math.nan}, LYING),
-        (0.0, {}, {"pedal": 1.1}, LYING),
-        (0.0, {}, {"pedal": math.inf}, LYING),
+        (0.3, {"pedal": 0.3}, {}, None),
+        (
+            0.6,
+            {"pedal": -1.0, "self_braking": True},
+            {},
+            Fault.SELF_BRAKING,
+        ),  # though it is to drive
+        (0.0, {}, {"speed_mps": 9.0}, Fault.LYING),
+        (0.0, {}, {"speed_mps": math.nan}, Fault.LYING),
+        (0.0, {}, {"pedal": 1.1}, Fault.LYING),
+        (0.0, {}, {"pedal": math.inf}, Fault.LYING),
     ],
 )
 def test_what_a_vehicle_may_report(asked, reported, newest, fault):
@@ -424,32 +432,32 @@ def test_one_that_brakes_by_itself_while_it_is_to_drive_is_at_fault_once_it_coul
         return said
 
     said = live(lambda now_s: True, True)
-    assert (said[1.2], said[1.25]) == ("", BRAKING)
-    assert set(live(lambda now_s: True, False).values()) == {""}
-    assert set(live(lambda now_s: now_s % 0.2 < 0.1, True).values()) == {""}
+    assert (said[1.2], said[1.25]) == (None, Fault.SELF_BRAKING)
+    assert set(live(lambda now_s: True, False).values()) == {None}
+    assert set(live(lambda now_s: now_s % 0.2 < 0.1, True).values()) == {None}
 
 
 def test_silence_after_two_periods_also_before_the_first_report():
     watch = VehicleWatch(T, MockVehicle.limits)
-    assert watch.fault(1e9) == ""  # what was not begun owes nothing
+    assert watch.fault(1e9) is None  # what was not begun owes nothing
     watch.begin(10.0)
-    assert watch.fault(10.0 + 2 * T) == ""
-    assert watch.fault(10.001 + 2 * T) == SILENT
+    assert watch.fault(10.0 + 2 * T) is None
+    assert watch.fault(10.001 + 2 * T) == Fault.SILENT
     watch.report(report(), 10.3)
-    assert watch.fault(10.3) == ""
+    assert watch.fault(10.3) is None
     assert watch.silent_at_s == pytest.approx(10.3 + 2 * T)
 
 
 def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
     watch, now_s = watched(asked=0.6, pedal=0.6)
     watch.report(report(pedal=-1.0), now_s + TICK_S)
-    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S) == ""
-    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S + 0.001) == STUCK
+    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S) is None
+    assert watch.fault(now_s + TICK_S + plausibility.DEVIATES_S + 0.001) == Fault.STUCK
     watch.report(report(pedal=0.6), now_s + 2 * TICK_S)
-    assert watch.fault(now_s + 2 * TICK_S) == ""
+    assert watch.fault(now_s + 2 * TICK_S) is None
 
 
-REACHED = [(60.0, ""), (45.1, ""), (44.9, STUCK), (81.0, LYING)]
+REACHED = [(60.0, None), (45.1, None), (44.9, Fault.STUCK), (81.0, Fault.LYING)]
 
 
 @pytest.mark.parametrize(("reached", "fault"), REACHED)
@@ -465,7 +473,10 @@ def test_what_is_far_from_what_was_asked_depends_on_the_actions_range(reached, f
 
 def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     watch, now_s = watched(speed_mps=1.0)
-    for after_s, words in ((0.2, LYING), (0.3, "")):  # 0.5 m/s and 15 m/s2: up to 4.5, then 6.0
+    for after_s, words in (
+        (0.2, Fault.LYING),
+        (0.3, None),
+    ):  # 0.5 m/s and 15 m/s2: up to 4.5, then 6.0
         watch.report(report(speed_mps=5.0), now_s + after_s)
         assert watch.fault(now_s + after_s) == words
 
@@ -486,7 +497,7 @@ def test_the_mock_stays_within_its_limits_and_is_never_accused(pedals):
             assert -1.0 - 1e-9 <= report.action["pedal"] <= 1.0 + 1e-9
             assert 0.0 <= report.speed_mps <= MockParameters().max_speed_mps
             watch.report(report, now_s)
-            assert watch.fault(now_s) == ""
+            assert watch.fault(now_s) is None
 
 
 # The mock.

@@ -18,7 +18,7 @@ from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.util import UserError, ends_within, printable
-from edge_runtime.vehicles.plausibility import PEDAL, SILENT, VehicleWatch
+from edge_runtime.vehicles.plausibility import PEDAL, REASONS, Fault, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 if TYPE_CHECKING:
@@ -365,7 +365,8 @@ class VehicleRunner:
         )
 
     def _seen_fault(self, now_s: float) -> str:
-        return SILENT if self._refuses else self._watch.fault(now_s)
+        fault = Fault.SILENT if self._refuses else self._watch.fault(now_s)
+        return REASONS[fault] if fault else ""
 
     def _ask(self) -> Optional[VehicleReport]:
         """The vehicle's report; None where the driver fails, which is silence like any other."""

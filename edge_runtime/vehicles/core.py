@@ -14,13 +14,13 @@ import abc
 import math
 from collections import deque
 from enum import Enum
-from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
+from typing import Deque, Dict, List, Optional, Tuple
 
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, FollowWatch
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, DriveWatch, Fault, Finding
 
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
@@ -29,11 +29,7 @@ LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
 # known to stand gets the parking brake, where there is one.
 STOP_TAKES_S = 1.0
 
-FOLLOWS_S = 1.0  # a drive may still follow a set-point of this age
-STEERS_S = 0.2  # so may a wheel, by its dead time and lag; what is heard of it is older still
-DEVIATION = 0.1  # of top speed, or of full lock (a wheel has play), outside of all that was asked
 STANDS_MPS = 0.02
-IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
 _WINDOW_S = 0.11
 
 
@@ -47,7 +43,7 @@ class State(str, Enum):
 
 
 class Event(str, Enum):
-    """What can happen. All after CLOSE are what the vehicle, the bus or time do."""
+    """What can happen, besides a `Fault`. After CLOSE: what the vehicle, the bus or time do."""
 
     ENABLE = "enable"
     BRAKE = "brake"
@@ -60,10 +56,6 @@ class Event(str, Enum):
     STANDBY = "chassis_standby"  # or another mode that is not CAN control
     LOCKED = "brake_locked"
     FAULT = "chassis_fault"
-    SILENT = "feedback_silent"
-    LYING = "feedback_impossible"
-    STUCK = "speed_stuck"
-    ASTRAY = "steering_stuck"
     BUS = "bus_error"
     FOREIGN = "foreign_command"  # somebody else commands the chassis
 
@@ -71,7 +63,7 @@ class Event(str, Enum):
 _D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
 
 # By the state before. A state that is not named stays as it is.
-LEADS_TO: Dict[Event, Dict[State, State]] = {
+LEADS_TO: Dict[Enum, Dict[State, State]] = {
     Event.ENABLE: {_D: _G, _E: _G, _X: _G},
     Event.BRAKE: {_G: _X, _E: _X},
     Event.CLOSE: {_G: _D, _E: _D, _X: _D},
@@ -83,20 +75,13 @@ LEADS_TO: Dict[Event, Dict[State, State]] = {
     Event.STANDBY: {_E: _X},  # while ENABLING that is what is to be ended; so for the next three
     Event.LOCKED: {_E: _X},
     Event.FAULT: {_E: _X},
-    Event.SILENT: {_E: _X},
-    Event.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
-    Event.STUCK: {_E: _X},
-    Event.ASTRAY: {_E: _X},
+    Fault.SILENT: {_E: _X},
+    Fault.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
+    Fault.STUCK: {_E: _X},
+    Fault.STEERING_STUCK: {_E: _X},
     Event.BUS: {_G: _X, _E: _X},
     Event.FOREIGN: {_G: _X, _E: _X},
 }
-
-
-class Finding(NamedTuple):
-    """An event with what it is in words, empty where our own side asked for it."""
-
-    event: Event
-    words: str
 
 
 class Speeds:
@@ -142,7 +127,7 @@ class StreamedCore(abc.ABC):
 
     def __init__(self, similarity: Similarity, heard: Speeds) -> None:
         self.state = State.DISABLED
-        self.cause: Optional[Event] = None  # what stopped it
+        self.cause: Optional[Enum] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
@@ -227,10 +212,7 @@ class StreamedCore(abc.ABC):
         return self._spec.centre_rad(self.set_point.inner_rad)
 
     def _watch_anew(self) -> None:
-        spec, follows_s = self._spec, STEERS_S + self._heard.silence_s
-        most_rad = DEVIATION * spec.centre_rad(spec.max_inner_steering_rad)
-        self._speed_watch = FollowWatch(DEVIATION * spec.max_speed_mps, FOLLOWS_S)
-        self._steering_watch = FollowWatch(most_rad, follows_s, spec.max_steering_rate_radps)
+        self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)
 
     def _obstacles(self, now_s: float) -> List[str]:
         """In words what stands between the vehicle and our commands."""
@@ -251,20 +233,23 @@ class StreamedCore(abc.ABC):
             self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
         if self.state is not State.ENABLED:
             return
-        found = self._silence(self._since_s, now_s)
-        if found is None and now_s > self.late_at_s:
-            found = Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
-        asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps
-        if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
-            words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"
-            found = Finding(Event.STUCK, words)
+        asked_mps = self.set_point.speed_mps
         drives = asked_mps > 0.0 and not self._heard.stands  # a wheel need not turn at a stand
-        asked_rad, turned_rad = self._asked_rad(), self._centre_rad() if drives else None
-        if self._steering_watch.is_stuck(asked_rad, turned_rad, now_s) and found is None:
-            words = f"the steering stays at {turned_rad:.2f} rad, asked for {asked_rad:.2f}"
-            found = Finding(Event.ASTRAY, words)
+        stuck = self._drive_watch.stuck(
+            asked_mps,
+            self._heard.speed_mps,
+            self._asked_rad(),
+            self._centre_rad() if drives else None,
+            now_s,
+        )
+        found = self._silence(self._since_s, now_s) or self._late(now_s) or stuck
         if found is not None:
             self._apply(found, now_s)
+
+    def _late(self, now_s: float) -> Optional[Finding]:
+        if now_s <= self.late_at_s:
+            return None
+        return Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""

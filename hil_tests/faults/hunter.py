@@ -19,9 +19,8 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
-from edge_runtime.vehicles.core import FOLLOWS_S
 from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
-from edge_runtime.vehicles.plausibility import DEVIATES_S
+from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
     CanMonitor,

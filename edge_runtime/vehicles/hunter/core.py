@@ -11,10 +11,8 @@ from typing import Dict, List, Optional
 
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import (
-    IMPOSSIBLE,
     STOP_TAKES_S,
     Event,
-    Finding,
     Speeds,
     State,
     StreamedCore,
@@ -22,7 +20,7 @@ from edge_runtime.vehicles.core import (
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, Similarity
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 
 STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
 COUNTERS = 256  # byte 7 of 0x211 runs over
@@ -90,11 +88,11 @@ class Reports(Speeds):
     def silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         """SILENT where feedback is missing that was due since `since_s`."""
         if now_s - max(self.motion_s, since_s) > self.silence_s:
-            return Finding(Event.SILENT, "the chassis sends no 0x221")
+            return Finding(Fault.SILENT, "the chassis sends no 0x221")
         if now_s - max(self.status_s, since_s) > STATUS_SILENCE_S:
             repeats = now_s - self._last_status_s <= STATUS_SILENCE_S
             words = "repeats itself: the counter of 0x211 stands still"
-            return Finding(Event.SILENT, f"the chassis {words if repeats else 'sends no 0x211'}")
+            return Finding(Fault.SILENT, f"the chassis {words if repeats else 'sends no 0x211'}")
         return None
 
     def commander(self) -> Optional[Finding]:
@@ -109,7 +107,7 @@ class Reports(Speeds):
         """What stands between the chassis and our commands now; the gravest only."""
         status = self.status
         if status is None:
-            return Finding(Event.SILENT, "the chassis sends no 0x211")
+            return Finding(Fault.SILENT, "the chassis sends no 0x211")
         outranked = self.commander()
         if outranked is not None:
             return outranked
@@ -139,13 +137,8 @@ class Reports(Speeds):
         """LYING where it reports what the model cannot do."""
         if self.motion is None:
             return None
-        speed_mps, inner_rad = self.motion
-        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
-            return Finding(Event.LYING, f"the chassis reports {speed_mps:.1f} m/s")
-        if abs(inner_rad) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
-            words = f"the chassis reports a steering angle of {inner_rad:.2f} rad"
-            return Finding(Event.LYING, words)
-        return None
+        words = impossible(*self.motion, self._spec)
+        return Finding(Fault.LYING, f"the chassis reports {words}") if words else None
 
 
 class HunterCore(StreamedCore):
@@ -222,7 +215,7 @@ class HunterCore(StreamedCore):
         before = self.state
         super()._apply(finding, now_s)
         if self.state is not before and self.state is State.STOPPED:
-            at_once = finding.event is Event.STUCK  # no set-point will stop it: the brake must
+            at_once = finding.event is Fault.STUCK  # no set-point will stop it: the brake must
             self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
         elif self.state is State.ENABLED:
             self._ask_s = math.inf

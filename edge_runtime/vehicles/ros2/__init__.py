@@ -22,15 +22,13 @@ from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.core import (
-    IMPOSSIBLE,
     Event,
-    Finding,
     Speeds,
     State,
     StreamedCore,
 )
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 from edge_runtime.vehicles.stream import StreamedVehicle
 
 if TYPE_CHECKING:
@@ -146,12 +144,9 @@ class Ros2Core(StreamedCore):
                 return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
-        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
-            self._apply(Finding(Event.LYING, f"the odometry says {speed_mps:.2f} m/s"), now_s)
-        elif self._is_angle and abs(angular) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
-            self._apply(Finding(Event.LYING, f"the odometry says {angular:.2f} rad"), now_s)
-        else:
-            self._apply(Finding(Event.CONFIRMED, ""), now_s)
+        words = impossible(speed_mps, angular if self._is_angle else 0.0, self._spec)
+        lie = Finding(Fault.LYING, f"the odometry says {words}") if words else None
+        self._apply(lie or Finding(Event.CONFIRMED, ""), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
         """What to publish now; None while DISABLED."""
@@ -172,7 +167,7 @@ class Ros2Core(StreamedCore):
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         if now_s - max(self._newest_s, since_s) <= self._heard.silence_s:
             return None
-        return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
+        return Finding(Fault.SILENT, f"no fresh odometry on {self._topic}")
 
     def _centre_rad(self) -> Optional[float]:
         """From the odometry; None where a yaw rate tells nothing: it hardly moves."""

@@ -15,12 +15,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import FOLLOWS_S, State
-from edge_runtime.vehicles.core import Event as CoreEvent
+from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import open_bus, parse_bus, protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
-from edge_runtime.vehicles.plausibility import DEVIATES_S
+from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S, Fault
 from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.hunter import (
@@ -610,7 +609,7 @@ def test_a_wheel_that_stays_anywhere_else_is_found(
     pair.jammed_rad = jammed_rad
     turns_s = abs(pair.core.set_point.inner_rad - spec.inner_rad(asked_rad))  # at 1 rad/s
     pair.run(turns_s + FOUND_WITHIN_S)
-    assert pair.core.cause is CoreEvent.ASTRAY
+    assert pair.core.cause is Fault.STEERING_STUCK
 
 
 def test_a_pause_of_the_edge_longer_than_the_chassiss_time_out_does_not_move_it_on():
