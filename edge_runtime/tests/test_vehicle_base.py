@@ -332,7 +332,7 @@ def test_whatever_a_driver_raises_it_gets_no_drive_that_no_enable_has_allowed(st
             runner._report()
         else:
             command = make_command(mode="drive" if deed == "drive" else SAFE_STOP)
-            runner._obey(base._Task(command, None, True, time.monotonic()))
+            runner._obey(base._Order(command, None, True, time.monotonic()))
             wanted = "brake" if deed == "stop" else "command"
             assert vehicle.asked == ([] if refused and deed == "drive" else [wanted])
         assert runner.fault(time.monotonic()) or not refused

@@ -28,7 +28,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 
 class Cart(MockVehicle):
     name = "cart"
-    open = classmethod(Vehicle.open.__func__)  # no settings of the mock
+    arguments_of = classmethod(Vehicle.arguments_of.__func__)  # no settings of the mock
     def __init__(self, wheels=4, port=""):
         super().__init__()
         self.wheels = wheels

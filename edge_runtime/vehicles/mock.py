@@ -54,22 +54,15 @@ class MockVehicle(Vehicle):
         self._latched = True  # until it is enabled
 
     @classmethod
-    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """As quick as the policy's car, where that is known and the settings say nothing else."""
+    def arguments_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Mapping[str, Any]:
+        """Be as quick as the policy's car, where that is known and the settings do not say."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
         parameters = convert({**known, **settings}, MockParameters, "vehicle.mock")
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
-        return cls(parameters)
-
-    @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
-        """As `Vehicle.limits_of`; making a mock opens nothing."""
-        if cls.open.__func__ is MockVehicle.open.__func__:  # type: ignore[attr-defined]
-            cls.open(settings, manifest)
-        return super().limits_of(settings, manifest)
+        return {"parameters": parameters}
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
