@@ -122,7 +122,7 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     # The optional ROS 2 messages, too, in the same bytes.
     twist = "Twist(Vector3(1.5), Vector3(0.0, 0.0, 0.5))"
     code = (
-        "from edge_runtime.vehicles.ros2.node import *;"
+        "from edge_runtime.vehicles.ros2 import *;"
         f" m = {twist}; b = encode(m); assert decode(b, Twist) == m; print(b.hex())"
     )
     written = run(python, "-c", code, cwd=tmp_path)

@@ -21,8 +21,9 @@ from edge_runtime.vehicles.ros2 import (
     Ros2Core,
     Ros2Settings,
     Ros2Vehicle,
+    drive_of,
+    twist_of,
 )
-from edge_runtime.vehicles.ros2.node import drive_of, twist_of
 
 
 def test_only_odometry_confirms_it_and_without_any_it_stops_and_says_so():

@@ -99,6 +99,8 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     module, _, member = place.partition(":")
     try:
         kind = getattr(import_module(module), member)
+    except UserError:
+        raise
     except BaseException as error:  # whatever a stranger's module raises
         raise UserError(f"vehicle {name!r} cannot be loaded: {_words(error)}") from None
     if not (isinstance(kind, type) and issubclass(kind, Vehicle)):

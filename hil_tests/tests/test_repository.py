@@ -41,7 +41,7 @@ EDGE_LIBRARIES = {
 }  # fmt: skip
 DOORS = {
     "can": ROOT / "edge_runtime/vehicles/hunter/__init__.py",
-    "pycdr2": ROOT / "edge_runtime/vehicles/ros2/node.py",
+    "pycdr2": ROOT / "edge_runtime/vehicles/ros2/__init__.py",
 }
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""
 ELSEWHERE = {"ray", "pycdr2", "av", "pyarrow", "foxglove"}
