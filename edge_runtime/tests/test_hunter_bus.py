@@ -32,7 +32,7 @@ from edge_runtime.vehicles.hunter import (
 )
 
 
-class Chassis:
+class ObedientChassis:
     """Answers as a chassis that obeys at once; keeps every frame that it heard."""
 
     def __init__(self, channel):
@@ -74,7 +74,7 @@ def channel(request):
 
 @pytest.fixture
 def chassis(channel):
-    with contextlib.closing(Chassis(channel)) as chassis:
+    with contextlib.closing(ObedientChassis(channel)) as chassis:
         yield chassis
 
 

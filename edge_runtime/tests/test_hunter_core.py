@@ -5,7 +5,7 @@ import math
 import pytest
 from hil_tests.testing.vehicles import OK, PEDAL, SPEC, HunterRig
 
-from edge_runtime.vehicles.core import Event, State
+from edge_runtime.vehicles.core import State, VehicleEvent
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault
@@ -179,14 +179,14 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
     ("frame", "message", "cause", "words"),
     [
         (protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 90, 0b10),
-         Event.FAULT, "rear left motor: motor overtemperature"),
+         VehicleEvent.FAULT, "rear left motor: motor overtemperature"),
         (protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
-         Event.FOREIGN, "somebody else sends 0x111"),
+         VehicleEvent.FOREIGN, "somebody else sends 0x111"),
         (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0),
          Fault.LYING, "the chassis reports 3.0 m/s"),
         (protocol.MOTION_STATUS, protocol.MotionStatus(0.0, 1.0),
          Fault.LYING, "a steering angle of 1.00 rad"),
-        (None, "bus-off", Event.BUS, "the CAN bus fails: bus-off"),
+        (None, "bus-off", VehicleEvent.BUS, "the CAN bus fails: bus-off"),
     ],
 )  # fmt: skip
 def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, words):

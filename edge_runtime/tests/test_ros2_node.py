@@ -33,11 +33,11 @@ FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=40)
 UINT32 = st.integers(0, 2**32 - 1)
 HEADERS = st.builds(
-    ros.Header, st.builds(ros.Time, st.integers(-(2**31), 2**31 - 1), UINT32), TEXTS
+    ros.Header, st.builds(ros.RosTime, st.integers(-(2**31), 2**31 - 1), UINT32), TEXTS
 )
 VECTORS = st.builds(ros.Vector3, *[DOUBLES] * 3)
 TWISTS = st.builds(ros.Twist, VECTORS, VECTORS)
-POSES = st.builds(ros.Pose, VECTORS, st.builds(ros.Quaternion, *[DOUBLES] * 4))
+POSES = st.builds(ros.RosPose, VECTORS, st.builds(ros.Quaternion, *[DOUBLES] * 4))
 COVARIANCES = st.lists(DOUBLES, min_size=36, max_size=36)
 ODOMETRIES = st.builds(
     ros.Odometry, HEADERS, TEXTS, st.builds(ros.PoseWithCovariance, POSES, COVARIANCES),
@@ -202,7 +202,7 @@ def test_dds_refuses_another_type(through_dds):
 
 
 def test_we_hear_the_second_library_and_count_what_is_none():
-    odometry = ros.Odometry(ros.Header(ros.Time(5, 6), "odom"), "base_link")
+    odometry = ros.Odometry(ros.Header(ros.RosTime(5, 6), "odom"), "base_link")
     odometry.twist.twist.linear.x = 0.75
     good = second.serialize("nav_msgs/msg/Odometry", asdict(odometry))
     heard: list = []

@@ -13,9 +13,9 @@ import edge_runtime
 from edge_runtime.vehicles.core import (
     LEADS_TO,
     STANDS_MPS,
-    Event,
     Speeds,
     State,
+    VehicleEvent,
 )
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S, Fault, Finding, FollowWatch
@@ -334,7 +334,7 @@ def be_astray(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Fault.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
+        (fall_silent, Fault.SILENT), (command_no_more, VehicleEvent.COMMAND_LATE), (brake, VehicleEvent.BRAKE),
         (lie, Fault.LYING), (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
     ],
 )  # fmt: skip
@@ -360,9 +360,9 @@ def after(state, event):
 def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
     ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
     assert all(before is not then for _, before, then in ways)
-    assert {event for event, _, then in ways if then is State.ENABLED} == {Event.CONFIRMED}
+    assert {event for event, _, then in ways if then is State.ENABLED} == {VehicleEvent.CONFIRMED}
     out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
-    assert out_of_stopped == {Event.ENABLE, Event.CLOSE}
+    assert out_of_stopped == {VehicleEvent.ENABLE, VehicleEvent.CLOSE}
 
 
 def test_the_readme_shows_the_table():

@@ -42,7 +42,7 @@ class State(str, Enum):
     STOPPED = "stopped"
 
 
-class Event(str, Enum):
+class VehicleEvent(str, Enum):
     """What can happen, besides a `Fault`. After CLOSE: what the vehicle, the bus or time do."""
 
     ENABLE = "enable"
@@ -64,23 +64,25 @@ _D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
 
 # By the state before. A state that is not named stays as it is.
 LEADS_TO: Dict[Enum, Dict[State, State]] = {
-    Event.ENABLE: {_D: _G, _E: _G, _X: _G},
-    Event.BRAKE: {_G: _X, _E: _X},
-    Event.CLOSE: {_G: _D, _E: _D, _X: _D},
-    Event.CONFIRMED: {_G: _E},
-    Event.NOT_CONFIRMED: {_G: _X},
-    Event.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
-    Event.REMOTE: {_G: _X, _E: _X},
-    Event.ESTOP: {_G: _X, _E: _X},
-    Event.STANDBY: {_E: _X},  # while ENABLING that is what is to be ended; so for the next three
-    Event.LOCKED: {_E: _X},
-    Event.FAULT: {_E: _X},
+    VehicleEvent.ENABLE: {_D: _G, _E: _G, _X: _G},
+    VehicleEvent.BRAKE: {_G: _X, _E: _X},
+    VehicleEvent.CLOSE: {_G: _D, _E: _D, _X: _D},
+    VehicleEvent.CONFIRMED: {_G: _E},
+    VehicleEvent.NOT_CONFIRMED: {_G: _X},
+    VehicleEvent.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
+    VehicleEvent.REMOTE: {_G: _X, _E: _X},
+    VehicleEvent.ESTOP: {_G: _X, _E: _X},
+    VehicleEvent.STANDBY: {
+        _E: _X
+    },  # while ENABLING that is what is to be ended; so for the next three
+    VehicleEvent.LOCKED: {_E: _X},
+    VehicleEvent.FAULT: {_E: _X},
     Fault.SILENT: {_E: _X},
     Fault.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
     Fault.STUCK: {_E: _X},
     Fault.STEERING_STUCK: {_E: _X},
-    Event.BUS: {_G: _X, _E: _X},
-    Event.FOREIGN: {_G: _X, _E: _X},
+    VehicleEvent.BUS: {_G: _X, _E: _X},
+    VehicleEvent.FOREIGN: {_G: _X, _E: _X},
 }
 
 
@@ -146,7 +148,7 @@ class StreamedCore(abc.ABC):
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
         self._watch_anew()  # a new chance to follow
-        self._apply(Finding(Event.ENABLE, ""), now_s)
+        self._apply(Finding(VehicleEvent.ENABLE, ""), now_s)
         self._since_s = now_s
 
     def command(
@@ -162,7 +164,7 @@ class StreamedCore(abc.ABC):
         self._wish = None
         self.set_point.speed_mps = 0.0
         if latch:
-            self._apply(Finding(Event.BRAKE, ""), now_s)
+            self._apply(Finding(VehicleEvent.BRAKE, ""), now_s)
 
     @property
     def late_at_s(self) -> float:
@@ -230,7 +232,7 @@ class StreamedCore(abc.ABC):
     def _watch(self, now_s: float) -> None:
         """What time alone tells."""
         if self.state is State.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
-            self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
+            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
         if self.state is not State.ENABLED:
             return
         asked_mps = self.set_point.speed_mps
@@ -249,7 +251,7 @@ class StreamedCore(abc.ABC):
     def _late(self, now_s: float) -> Optional[Finding]:
         if now_s <= self.late_at_s:
             return None
-        return Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
+        return Finding(VehicleEvent.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""

@@ -24,9 +24,9 @@ from hil_tests.mock_hunter.chassis import (
     LIE_MPS,
     STEERING,
     Chassis,
-    Condition,
+    ChassisCondition,
+    ChassisEvent,
     Control,
-    Event,
 )
 
 STANDS_MPS = 0.005
@@ -43,14 +43,14 @@ _MODES = {
     Control.REMOTE_OVER_CAN: codec.REMOTE_CONTROL,
 }
 _STATES = {
-    Condition.OK: codec.STATE_OK,
-    Condition.ESTOP: codec.STATE_ESTOP,
-    Condition.EXCEPTION: codec.STATE_EXCEPTION,
-    Condition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
+    ChassisCondition.OK: codec.STATE_OK,
+    ChassisCondition.ESTOP: codec.STATE_ESTOP,
+    ChassisCondition.EXCEPTION: codec.STATE_EXCEPTION,
+    ChassisCondition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
 }
 _OF_A_PERSON = {
-    "remote": (Event.REMOTE_ON, Event.REMOTE_OFF),
-    "estop": (Event.ESTOP_ON, Event.ESTOP_OFF),
+    "remote": (ChassisEvent.REMOTE_ON, ChassisEvent.REMOTE_OFF),
+    "estop": (ChassisEvent.ESTOP_ON, ChassisEvent.ESTOP_OFF),
 }
 _SLOW = (codec.STEER_MOTOR_SLOW, codec.REAR_RIGHT_SLOW, codec.REAR_LEFT_SLOW)
 _ENABLED = 1 << 6
@@ -215,7 +215,7 @@ class MockHunter:
             if message.mode == codec.CAN_CONTROL:
                 self.chassis = rules.take_can_mode(self.chassis, now_s)
             elif message.mode == codec.STANDBY:
-                self.chassis = rules.advance(self.chassis, Event.STANDBY_MODE)
+                self.chassis = rules.advance(self.chassis, ChassisEvent.STANDBY_MODE)
         elif isinstance(message, codec.BrakeCommand) and message.locked in (0, 1):
             self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
         elif isinstance(message, codec.ClearCommand):

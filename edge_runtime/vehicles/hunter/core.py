@@ -12,10 +12,10 @@ from typing import Dict, List, Optional
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import (
     STOP_TAKES_S,
-    Event,
     Speeds,
     State,
     StreamedCore,
+    VehicleEvent,
 )
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
@@ -98,9 +98,9 @@ class Reports(Speeds):
     def commander(self) -> Optional[Finding]:
         """What outranks us: the remote control, or the emergency stop."""
         if self.remote_drives:
-            return Finding(Event.REMOTE, "the remote control drives")
+            return Finding(VehicleEvent.REMOTE, "the remote control drives")
         if self.status is not None and self.status.state == protocol.STATE_ESTOP:
-            return Finding(Event.ESTOP, "the emergency stop is pressed")
+            return Finding(VehicleEvent.ESTOP, "the emergency stop is pressed")
         return None
 
     def finding(self) -> Optional[Finding]:
@@ -113,14 +113,16 @@ class Reports(Speeds):
             return outranked
         errors = self.errors()
         if errors:
-            return Finding(Event.FAULT, ", ".join(errors))
+            return Finding(VehicleEvent.FAULT, ", ".join(errors))
         if status.state != protocol.STATE_OK:
-            return Finding(Event.FAULT, f"the chassis is in state {status.state} (exception)")
+            return Finding(
+                VehicleEvent.FAULT, f"the chassis is in state {status.state} (exception)"
+            )
         if status.mode != protocol.CAN_CONTROL:
             name = "standby" if status.mode == protocol.STANDBY else f"mode {status.mode}"
-            return Finding(Event.STANDBY, f"the chassis is in {name}, not under CAN control")
+            return Finding(VehicleEvent.STANDBY, f"the chassis is in {name}, not under CAN control")
         if status.brake:
-            return Finding(Event.LOCKED, "the chassis has locked its brake")
+            return Finding(VehicleEvent.LOCKED, "the chassis has locked its brake")
         return self.lie()
 
     def _count(self, counter: int, now_s: float) -> None:
@@ -160,7 +162,7 @@ class HunterCore(StreamedCore):
         """The last frames: stand, park, give control back. None where it was never taken."""
         if self.state is State.DISABLED:
             return []
-        self._apply(Finding(Event.CLOSE, ""), now_s)
+        self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
         park = [] if self.reports.remote_drives else [_LOCK]
         return [self._motion(), *park, _GIVE_BACK]
 
@@ -169,7 +171,7 @@ class HunterCore(StreamedCore):
         if self.state is State.DISABLED:
             self.bus_works()  # nothing is sent then that it could take
         if can_id in protocol.COMMAND_IDS:
-            self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
+            self._apply(Finding(VehicleEvent.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
         self.reports.hear(can_id, data, now_s)
         if can_id == protocol.SYSTEM_STATUS.can_id or can_id in protocol.MOTOR_OF_SLOW:
@@ -186,7 +188,7 @@ class HunterCore(StreamedCore):
         self._bus_failed_s = min(self._bus_failed_s, now_s)
         if fatal or now_s - self._bus_failed_s > BUS_PATIENCE_S:
             self._bus_words = f"the CAN bus fails: {words}"
-            self._apply(Finding(Event.BUS, self._bus_words), now_s)
+            self._apply(Finding(VehicleEvent.BUS, self._bus_words), now_s)
 
     def bus_works(self) -> None:
         """The bus took a frame, or (while none is sent) gave one."""
@@ -225,7 +227,7 @@ class HunterCore(StreamedCore):
         finding = self.reports.finding()
         if self.state is State.ENABLING and self.reports.status_s <= self._since_s:
             return  # from before it was asked
-        self._apply(finding or Finding(Event.CONFIRMED, ""), now_s)
+        self._apply(finding or Finding(VehicleEvent.CONFIRMED, ""), now_s)
 
     def _obstacles(self, now_s: float) -> List[str]:
         outranked = self.reports.commander()

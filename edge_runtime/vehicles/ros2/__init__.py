@@ -43,7 +43,7 @@ from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import Event, Speeds, State, StreamedCore
+from edge_runtime.vehicles.core import Speeds, State, StreamedCore, VehicleEvent
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 from edge_runtime.vehicles.stream import StreamedVehicle
@@ -124,7 +124,7 @@ def no_covariance() -> List[float]:
 
 
 @dataclass
-class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
+class RosTime(IdlStruct, typename="builtin_interfaces/msg/Time"):
     """Seconds and nanoseconds since 1970."""
 
     sec: int32 = 0
@@ -135,7 +135,7 @@ class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
 class Header(IdlStruct, typename="std_msgs/msg/Header"):
     """When, and in which coordinate frame."""
 
-    stamp: Time = field(default_factory=Time)
+    stamp: RosTime = field(default_factory=RosTime)
     frame_id: str = ""
 
 
@@ -189,7 +189,7 @@ class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
 
 
 @dataclass
-class Pose(IdlStruct, typename="geometry_msgs/msg/Pose"):
+class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
     """Where, and turned how."""
 
     position: Vector3 = field(default_factory=Vector3)
@@ -200,7 +200,7 @@ class Pose(IdlStruct, typename="geometry_msgs/msg/Pose"):
 class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
     """A pose, and the covariance of x, y, z and the rotations about them."""
 
-    pose: Pose = field(default_factory=Pose)
+    pose: RosPose = field(default_factory=RosPose)
     covariance: Covariance = field(default_factory=no_covariance)
 
 
@@ -276,7 +276,7 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
 def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
     """Speed and centre angle; no acceleration is given, because the speed is a ramp already."""
     return AckermannDriveStamped(
-        header=Header(Time(*divmod(time_ns, 10**9)), "base_link"),
+        header=Header(RosTime(*divmod(time_ns, 10**9)), "base_link"),
         drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
     )
 
@@ -409,7 +409,7 @@ class Ros2Core(StreamedCore):
 
     def close(self, now_s: float) -> None:
         """Nothing more is sent."""
-        self._apply(Finding(Event.CLOSE, ""), now_s)
+        self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
         """Finite odometry; it counts where it is newer than the last by its own stamp.
@@ -425,7 +425,7 @@ class Ros2Core(StreamedCore):
         self._heard.note(speed_mps, now_s)
         words = impossible(speed_mps, angular if self._is_angle else 0.0, self._spec)
         lie = Finding(Fault.LYING, f"the odometry says {words}") if words else None
-        self._apply(lie or Finding(Event.CONFIRMED, ""), now_s)
+        self._apply(lie or Finding(VehicleEvent.CONFIRMED, ""), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
         """What to publish now; None while DISABLED."""

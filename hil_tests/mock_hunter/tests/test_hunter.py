@@ -50,10 +50,10 @@ def test_these_and_no_others_lead_to_can_control_from_outside():
         and rules.advance(DRIVING._replace(control=state), event).control is rules.Control.CAN
     }
     assert found == {
-        (rules.Control.STANDBY, rules.Event.CAN_MODE),
-        (rules.Control.LINK_LOST, rules.Event.CAN_MODE),
-        (rules.Control.LINK_LOST, rules.Event.COMMAND),
-        (rules.Control.REMOTE_OVER_CAN, rules.Event.REMOTE_OFF),
+        (rules.Control.STANDBY, rules.ChassisEvent.CAN_MODE),
+        (rules.Control.LINK_LOST, rules.ChassisEvent.CAN_MODE),
+        (rules.Control.LINK_LOST, rules.ChassisEvent.COMMAND),
+        (rules.Control.REMOTE_OVER_CAN, rules.ChassisEvent.REMOTE_OFF),
     }
 
 
@@ -61,17 +61,17 @@ def test_these_and_no_others_lead_to_can_control_from_outside():
 @pytest.mark.parametrize("state", rules.Control)
 def test_the_remote_takes_over_from_anyone_and_no_frame_takes_control_from_it(state, event):
     after = rules.advance(DRIVING._replace(control=state), event)
-    if event in (rules.Event.REMOTE_ON, rules.Event.REMOTE_OFF) or state in REMOTE:
-        assert (after.control in REMOTE) == (event is not rules.Event.REMOTE_OFF)
+    if event in (rules.ChassisEvent.REMOTE_ON, rules.ChassisEvent.REMOTE_OFF) or state in REMOTE:
+        assert (after.control in REMOTE) == (event is not rules.ChassisEvent.REMOTE_OFF)
     assert after.control not in REMOTE or not rules.obeys(after)
 
 
 @pytest.mark.parametrize("control", rules.Control)
-@pytest.mark.parametrize("condition", rules.Condition)
+@pytest.mark.parametrize("condition", rules.ChassisCondition)
 @pytest.mark.parametrize("locked", [False, True])
 def test_the_bus_drives_only_in_can_control_without_errors_and_brake(control, condition, locked):
     chassis = rules.Chassis(control, condition, locked)
-    drives = control is rules.Control.CAN and condition is rules.Condition.OK and not locked
+    drives = control is rules.Control.CAN and condition is rules.ChassisCondition.OK and not locked
     assert rules.obeys(chassis) == drives
 
 
@@ -86,12 +86,12 @@ def test_can_mode_starts_its_own_time_and_does_not_prolong_it():
 
 
 def test_an_emergency_stop_and_errors_go_one_by_one():
-    chassis = rules.advance(rules.take_cause(DRIVING, "driver", True), rules.Event.ESTOP_ON)
-    assert chassis.condition is rules.Condition.ESTOP_AND_EXCEPTION
-    released = rules.advance(chassis, rules.Event.ESTOP_OFF)
-    assert released.condition is rules.Condition.EXCEPTION
+    chassis = rules.advance(rules.take_cause(DRIVING, "driver", True), rules.ChassisEvent.ESTOP_ON)
+    assert chassis.condition is rules.ChassisCondition.ESTOP_AND_EXCEPTION
+    released = rules.advance(chassis, rules.ChassisEvent.ESTOP_OFF)
+    assert released.condition is rules.ChassisCondition.EXCEPTION
     healed = rules.take_clear(rules.take_cause(chassis, "driver", False))
-    assert healed.condition is rules.Condition.ESTOP
+    assert healed.condition is rules.ChassisCondition.ESTOP
     both = rules.take_cause(rules.take_cause(DRIVING, "link_steer", True), "undervoltage", True)
     one = rules.take_cause(both, "link_steer", False)
     assert not rules.obeys(one)
@@ -99,10 +99,10 @@ def test_an_emergency_stop_and_errors_go_one_by_one():
 
 
 @pytest.mark.parametrize(
-    ("table", "kind"), [(rules.CONTROL, rules.Control), (rules.CONDITION, rules.Condition)]
+    ("table", "kind"), [(rules.CONTROL, rules.Control), (rules.CONDITION, rules.ChassisCondition)]
 )
 def test_the_tables_stand_in_the_readme_and_every_pair_of_state_and_event_in_one(table, kind):
-    assert [*rules.CONTROL, *rules.CONDITION] == list(rules.Event)
+    assert [*rules.CONTROL, *rules.CONDITION] == list(rules.ChassisEvent)
     states = list(kind)
     assert {len(row) for row in table.values()} == {len(states)}
     shown = render_table(table, states, lambda state, event: table[event][states.index(state)])
