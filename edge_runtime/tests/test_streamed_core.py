@@ -334,7 +334,8 @@ def be_astray(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Fault.SILENT), (command_no_more, VehicleEvent.COMMAND_LATE), (brake, VehicleEvent.BRAKE),
+        (fall_silent, Fault.SILENT), (command_no_more, VehicleEvent.COMMAND_LATE),
+        (brake, VehicleEvent.BRAKE),
         (lie, Fault.LYING), (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
     ],
 )  # fmt: skip

@@ -28,7 +28,6 @@ LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
 # At the end zeros go out for so long, unless it is known to stand before; and what is then not
 # known to stand gets the parking brake, where there is one.
 STOP_TAKES_S = 1.0
-
 STANDS_MPS = 0.02
 _WINDOW_S = 0.11
 
@@ -72,9 +71,7 @@ LEADS_TO: Dict[Enum, Dict[State, State]] = {
     VehicleEvent.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
     VehicleEvent.REMOTE: {_G: _X, _E: _X},
     VehicleEvent.ESTOP: {_G: _X, _E: _X},
-    VehicleEvent.STANDBY: {
-        _E: _X
-    },  # while ENABLING that is what is to be ended; so for the next three
+    VehicleEvent.STANDBY: {_E: _X},  # what ENABLING is to end; so are the next three
     VehicleEvent.LOCKED: {_E: _X},
     VehicleEvent.FAULT: {_E: _X},
     Fault.SILENT: {_E: _X},
@@ -89,7 +86,7 @@ LEADS_TO: Dict[Enum, Dict[State, State]] = {
 class Speeds:
     """The speeds that a vehicle reported in the last 0.1 s, and what follows from them.
 
-    After `silence_s` without feedback it counts as silent.
+    It counts as silent after `silence_s` without feedback.
     """
 
     def __init__(self) -> None:
@@ -97,18 +94,18 @@ class Speeds:
         self._noted: Deque[Tuple[float, float]] = deque()
 
     def note(self, speed_mps: float, now_s: float) -> None:
-        """The newest one."""
+        """Note the newest."""
         self._noted.append((now_s, speed_mps))
         while self._noted[0][0] < now_s - _WINDOW_S:
             self._noted.popleft()
 
     def forget(self) -> None:
-        """Those from before count no more."""
+        """Begin anew."""
         self._noted.clear()
 
     @property
     def speed_mps(self) -> float:
-        """The newest one, 0 before the first."""
+        """The newest speed, 0 before the first."""
         return self._noted[-1][1] if self._noted else 0.0
 
     @property
@@ -117,7 +114,7 @@ class Speeds:
         return abs(self.speed_mps) < STANDS_MPS
 
     def acceleration_mps2(self) -> float:
-        """Over the last 0.1 s; 0 while there is too little to tell."""
+        """Return the mean of the last 0.1 s; 0 while there is too little to tell."""
         if len(self._noted) < 2:
             return 0.0
         (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
@@ -133,9 +130,9 @@ class StreamedCore(abc.ABC):
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
-        self._reach = similarity.reach  # Worked out once: reports come with every frame.
+        self._reach = similarity.reach  # worked out once: reports come with every frame
         self.follow_period(MIN_PERIOD_S)
-        self._watch_anew()
+        self._drive_watch = DriveWatch(self._spec, heard.silence_s)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
@@ -147,20 +144,20 @@ class StreamedCore(abc.ABC):
 
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
-        self._watch_anew()  # a new chance to follow
+        self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)  # a new chance to follow
         self._apply(Finding(VehicleEvent.ENABLE, ""), now_s)
         self._since_s = now_s
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """The newest command; forgotten where it may not drive. ValueError: see `wish_of`."""
+        """Take the newest command; forget it where it may not drive. ValueError: see `wish_of`."""
         wish = wish_of(action, scenario_speed_mps)
         if self.state is State.ENABLED:
             self._wish, self._wished_s = wish, now_s
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
+        """Ask for speed 0 until the next command, or (latched) the next `enable`."""
         self._wish = None
         self.set_point.speed_mps = 0.0
         if latch:
@@ -168,11 +165,11 @@ class StreamedCore(abc.ABC):
 
     @property
     def late_at_s(self) -> float:
-        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+        """When the newest command becomes too old to be obeyed; inf where there is none."""
         return math.inf if self._wish is None else self._wished_s + self.command_timeout_s
 
     def report(self, now_s: float) -> VehicleReport:
-        """What the vehicle does, in the policy's terms and in its own."""
+        """Report what the vehicle does, in the policy's terms and in its own."""
         speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
         centre_rad = self._centre_rad()
         steering = self.similarity.steering(self._asked_rad() if centre_rad is None else centre_rad)
@@ -190,34 +187,31 @@ class StreamedCore(abc.ABC):
         )
 
     def standing(self, now_s: float) -> List[str]:
-        """What would make an `enable` now be in vain, in words."""
+        """Return in words what would make an `enable` now be in vain."""
         may_ask = self.state in (State.STOPPED, State.DISABLED)
         return self._obstacles(now_s) if may_ask else []
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or no more can be done about it."""
+        """Return whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
-        """SILENT where feedback is missing that was due since `since_s`."""
+        """Return SILENT where feedback is missing that was due since `since_s`."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:
-        """In words why the vehicle did not confirm an `enable` in time."""
+        """Return in words why the vehicle did not confirm an `enable` in time."""
 
     @abc.abstractmethod
     def _centre_rad(self) -> Optional[float]:
-        """The steering angle that the vehicle reports, not clamped; None where it is not known."""
+        """Return the steering angle that the vehicle reports; None where it is not known."""
 
     def _asked_rad(self) -> float:
         return self._spec.centre_rad(self.set_point.inner_rad)
 
-    def _watch_anew(self) -> None:
-        self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)
-
     def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands."""
+        """Return in words what stands between the vehicle and our commands."""
         silence = self._silence(-math.inf, now_s)
         return [silence.words] if silence else []
 
@@ -226,22 +220,21 @@ class StreamedCore(abc.ABC):
         if after is self.state:
             return
         self.state, self._since_s, self._wish = after, now_s, None
-        self.set_point.speed_mps = 0.0  # Whatever state comes next begins at a stand.
+        self.set_point.speed_mps = 0.0  # whatever state comes next begins at a stand
         self.cause, self.words = finding if after is State.STOPPED else (None, "")
 
-    def _watch(self, now_s: float) -> None:
-        """What time alone tells."""
+    def _look(self, now_s: float) -> None:
+        """Find what time alone tells."""
         if self.state is State.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
-            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
+            why = self._why_not_confirmed(now_s)
+            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, why), now_s)
         if self.state is not State.ENABLED:
             return
-        asked_mps = self.set_point.speed_mps
-        drives = asked_mps > 0.0 and not self._heard.stands  # a wheel need not turn at a stand
+        asked_mps, heard = self.set_point.speed_mps, self._heard
+        drives = asked_mps > 0.0 and not heard.stands  # a wheel need not turn at a stand
         stuck = self._drive_watch.stuck(
-            asked_mps,
-            self._heard.speed_mps,
-            self._asked_rad(),
-            self._centre_rad() if drives else None,
+            (asked_mps, self._asked_rad()),
+            (heard.speed_mps, self._centre_rad() if drives else None),
             now_s,
         )
         found = self._silence(self._since_s, now_s) or self._late(now_s) or stuck
@@ -249,9 +242,8 @@ class StreamedCore(abc.ABC):
             self._apply(found, now_s)
 
     def _late(self, now_s: float) -> Optional[Finding]:
-        if now_s <= self.late_at_s:
-            return None
-        return Finding(VehicleEvent.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
+        words = f"no command for {self.command_timeout_s:.2f} s"
+        return Finding(VehicleEvent.COMMAND_LATE, words) if now_s > self.late_at_s else None
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""
@@ -262,7 +254,7 @@ class StreamedCore(abc.ABC):
             self.set_point.speed_mps = 0.0
 
     def _pedal(self) -> float:
-        """From the measured acceleration; the brake where it stands and is to stand."""
+        """Return the pedal of the measured acceleration; the brake of a stand that was asked."""
         if self._heard.stands and self.set_point.speed_mps == 0.0:
             return -1.0
         return self.similarity.pedal(self._heard.acceleration_mps2())

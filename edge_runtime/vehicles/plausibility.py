@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from enum import Enum
-from typing import TYPE_CHECKING, Deque, Dict, Generic, List, NamedTuple, Optional, Tuple, TypeVar
+from typing import TYPE_CHECKING, Any, Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.controller import Limits
 from edge_runtime.safety import SILENCE_PERIODS
@@ -75,38 +75,27 @@ class Lasting:
         self.since_s = min(self.since_s, now_s) if holds else math.inf
 
 
-_V = TypeVar("_V")
-
-
-class Asked(Generic[_V]):
+class Asked:
     """What was asked within `window_s` of the newest, and what was in force when that began."""
 
     def __init__(self, window_s: float) -> None:
         self._window_s = window_s
-        self._noted: Deque[Tuple[float, _V]] = deque()
+        self.noted: Deque[Tuple[float, Any]] = deque()
 
-    def note(self, value: _V, now_s: float) -> None:
+    def note(self, asked: Any, now_s: float) -> None:
         """Note what is asked from now on."""
-        self._noted.append((now_s, value))
-        while len(self._noted) > 1 and self._noted[1][0] < now_s - self._window_s:
-            self._noted.popleft()
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._noted.clear()
+        self.noted.append((now_s, asked))
+        while len(self.noted) > 1 and self.noted[1][0] < now_s - self._window_s:
+            self.noted.popleft()
 
     def is_full(self, now_s: float) -> bool:
-        """Whether all of the window before now is known."""
-        return bool(self._noted) and self._noted[0][0] <= now_s - self._window_s
-
-    def age_s(self, now_s: float) -> float:
-        """Of the newest; 0 where there is none."""
-        return now_s - self._noted[-1][0] if self._noted else 0.0
+        """Return whether all of the window before now is known."""
+        return bool(self.noted) and self.noted[0][0] <= now_s - self._window_s
 
     @property
-    def values(self) -> List[_V]:
+    def values(self) -> List[Any]:
         """Oldest first."""
-        return [value for _, value in self._noted]
+        return [asked for _, asked in self.noted]
 
 
 class VehicleWatch:
@@ -117,7 +106,7 @@ class VehicleWatch:
         self._brakes_s = SILENCE_PERIODS * control_period_s
         self._drives, self._enabled_s = False, -math.inf
         self._braking, self._deviates = Lasting(), Lasting()
-        self._asked: Asked[Dict[str, float]] = Asked(LAG_S)
+        self._asked = Asked(LAG_S)
         self._reported_s: Optional[float] = None
         self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
         self._lies = False
@@ -203,16 +192,17 @@ class FollowWatch:
 
     def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
         self._tolerance, self._rate = tolerance, rate
-        self._asked: Asked[float] = Asked(follows_s)
+        self._asked = Asked(follows_s)
         self._low = self._high = 0.0  # a healthy one is in between
         self._deviates = Lasting()
 
     def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
         """Note what is asked and measured now, and judge; a None is not judged."""
         if measured is None:
-            self._asked.forget()
+            self._asked.noted.clear()
             return False
-        nearer = self._rate * self._asked.age_s(now_s)
+        noted = self._asked.noted
+        nearer = self._rate * (now_s - noted[-1][0]) if noted else 0.0
         self._asked.note(asked, now_s)
         if not self._asked.is_full(now_s):  # it has had no time to follow
             self._low = self._high = measured
@@ -238,14 +228,10 @@ class DriveWatch:
         self._steering = FollowWatch(DEVIATION * full_rad, steers_s, rate_radps)
 
     def stuck(
-        self,
-        asked_mps: float,
-        speed_mps: float,
-        asked_rad: float,
-        turned_rad: Optional[float],
-        now_s: float,
+        self, asked: Tuple[float, float], measured: Tuple[float, Optional[float]], now_s: float
     ) -> Optional[Finding]:
-        """Note speed and centre angle; a `turned_rad` of None is not judged."""
+        """Note speed (m/s) and centre angle (rad; measured: None is not judged), and judge."""
+        (asked_mps, asked_rad), (speed_mps, turned_rad) = asked, measured
         speed_is_stuck = self._speed.is_stuck(asked_mps, speed_mps, now_s)
         steering_is_stuck = self._steering.is_stuck(asked_rad, turned_rad, now_s)
         if speed_is_stuck:

@@ -429,7 +429,7 @@ class Ros2Core(StreamedCore):
 
     def tick(self, now_s: float) -> Optional[Motion]:
         """What to publish now; None while DISABLED."""
-        self._watch(now_s)
+        self._look(now_s)
         if self.state is State.DISABLED:
             return None
         self._step(now_s)
