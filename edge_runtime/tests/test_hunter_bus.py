@@ -19,7 +19,7 @@ from hil_tests.testing.vehicles import LEFT_TURN, PEDAL
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import hunter, stream
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter import (
     DEFAULT_BUS,
     BusName,
@@ -98,7 +98,7 @@ def drive(chassis, vehicle):
 
 def enable(vehicle):
     vehicle.enable(time.monotonic())
-    wait_until(lambda: vehicle.state is State.ENABLED, "the confirmation")
+    wait_until(lambda: vehicle.state is VehicleState.ENABLED, "the confirmation")
 
 
 def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
@@ -133,7 +133,7 @@ def test_commands_that_cease_latch_a_stop_before_the_next_period(chassis, vehicl
         time.sleep(0.05)  # one more period of before
         commanded_s = time.monotonic()
         vehicle.command(PEDAL, commanded_s)
-        wait_until(lambda: vehicle.state is State.STOPPED, "its own stop")
+        wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its own stop")
         wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
         assert time.monotonic() - commanded_s < 1.5
         if period_s < 3.0:  # in which nothing is heard of the chassis
@@ -143,7 +143,7 @@ def test_commands_that_cease_latch_a_stop_before_the_next_period(chassis, vehicl
 def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle):
     with can.Bus(interface="virtual", channel=channel, rx_queue_size=3) as crowd:
         vehicle.enable(time.monotonic())
-        wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
+        wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its stop")
         assert "the CAN bus fails: Could not send" in vehicle.feedback(time.monotonic()).faults[0]
         assert vehicle.feedback(time.monotonic()).standing
         began_s = time.monotonic()
@@ -161,13 +161,13 @@ def test_of_foreign_frames_bus_off_stops_it_and_it_listens_on(chassis, vehicle, 
     for kind in ("is_error_frame", "is_extended_id", "is_remote_frame", "is_fd"):
         foreign: Any = {"arbitration_id": 0x111, "is_extended_id": False, kind: True}
         vehicle._hear(can.Message(**foreign))
-    assert vehicle.state is State.ENABLED
+    assert vehicle.state is VehicleState.ENABLED
     vehicle._hear(can.Message(arbitration_id=0x40, is_error_frame=True))
     assert vehicle.feedback(time.monotonic()).faults == ["the CAN bus fails: bus-off"]
     enable(vehicle)
     with monkeypatch.context() as patch:
         patch.setattr(vehicle._bus, "recv", Mock(side_effect=OSError("Network is down")))
-        wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
+        wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its stop")
     enable(vehicle)
     monkeypatch.setattr(Gate, "send", Mock(side_effect=OSError("Network is down")))
     vehicle.close()  # raises nothing, and leaves the bus

@@ -12,7 +12,7 @@ from hil_tests.testing.vehicles import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, R
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.ros2_side import RosHunter
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.plausibility import Fault
 from edge_runtime.vehicles.ros2 import (
     STEERING,
@@ -33,7 +33,7 @@ def test_only_odometry_confirms_it_and_without_any_it_stops_and_says_so():
     rig.step(25, PEDAL)
     assert rig.sent[-1][1] == Motion(0.0, 0.0)
     rig.step(30)
-    assert rig.core.state is State.STOPPED
+    assert rig.core.state is VehicleState.STOPPED
     assert rig.words == ["no odometry on odom within 1 s", "no fresh odometry on odom"]
     assert rig.report.standing == ["no fresh odometry on odom"]
     rig.talks = True
@@ -56,7 +56,7 @@ def test_a_clock_set_back_counts_after_the_next_enable():
     assert rig.core.stale == 1
     rig.core.enable(rig.now_s)
     rig.core.hear(6, 0.0, 0.0, rig.now_s)
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
 
 
 def test_a_clock_set_back_is_believed_once_nothing_is_driven():
@@ -75,7 +75,7 @@ def test_odometry_without_stamps_is_believed_by_its_arrival():
     for tick in range(20):
         core.hear(0, 0.1, 0.0, tick * STREAM_S)
         core.tick(tick * STREAM_S)
-    assert core.state is State.ENABLED
+    assert core.state is VehicleState.ENABLED
 
 
 @pytest.mark.parametrize("angular", [YAW_RATE, STEERING])
@@ -94,7 +94,7 @@ def test_an_angle_that_no_wheel_has_is_not_believed():
         rig.core.enable(rig.now_s)
         rig.angular = angular
         rig.step(2)
-        assert rig.core.state is (State.ENABLED if believed else State.STOPPED)
+        assert rig.core.state is (VehicleState.ENABLED if believed else VehicleState.STOPPED)
         assert rig.core.cause is (None if believed else Fault.LYING)
 
 
@@ -137,7 +137,10 @@ def test_both_kinds_of_command_below_a_namespace_and_their_tokens(make):
         vehicle = make(CONGESTION, connect=endpoint, **topics)
 
         def turns():
-            if vehicle.state in (State.DISABLED, State.STOPPED):  # Or while this machine paused.
+            if vehicle.state in (
+                VehicleState.DISABLED,
+                VehicleState.STOPPED,
+            ):  # Or while this machine paused.
                 vehicle.enable(time.monotonic())
             vehicle.command({"steering": -1.0}, time.monotonic(), scenario_speed_mps=4.0)
             at_speed = hunter.drives and hunter.drives[-1]["drive"]["speed"] > 0.99
@@ -163,7 +166,7 @@ def test_it_closes_twice_and_without_having_been_enabled(make, enables):
     vehicle.close()
     vehicle.close()
     vehicle.enable(time.monotonic())
-    assert vehicle.state is State.DISABLED
+    assert vehicle.state is VehicleState.DISABLED
 
 
 def test_a_busy_port_is_one_line_with_the_settings_name(make):

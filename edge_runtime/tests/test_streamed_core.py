@@ -14,8 +14,8 @@ from edge_runtime.vehicles.core import (
     LEADS_TO,
     STANDS_MPS,
     Speeds,
-    State,
     VehicleEvent,
+    VehicleState,
 )
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S, Fault, Finding, FollowWatch
@@ -33,7 +33,7 @@ def rig(make):
 
 def test_a_new_core_knows_and_sends_nothing(rig):
     core, report = rig.core, rig.core.report(0.0)
-    assert (core.state, core.cause, core.words) == (State.DISABLED, None, "")
+    assert (core.state, core.cause, core.words) == (VehicleState.DISABLED, None, "")
     assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
@@ -41,7 +41,7 @@ def test_a_new_core_knows_and_sends_nothing(rig):
     core.brake(rig.now_s)
     rig.step(100, PEDAL)
     assert not core.close(rig.now_s)
-    assert (rig.sent, core.state) == ([], State.DISABLED)
+    assert (rig.sent, core.state) == ([], VehicleState.DISABLED)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig
     for _ in range(2):
         rig.core.enable(rig.now_s)
         rig.step(45)
-    assert rig.core.state is State.ENABLING
+    assert rig.core.state is VehicleState.ENABLING
 
 
 def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
@@ -87,7 +87,7 @@ def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
     rig.step(130, {"pedal": -1.0})
     assert rig.core.cause is Fault.STUCK
     rig.enabled().step(40, {"pedal": -1.0})
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
     rig.step(30, {"pedal": -1.0})
     assert rig.core.cause is Fault.STUCK
 
@@ -175,7 +175,7 @@ def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
 def test_a_wheel_need_not_turn_before_it_is_to_drive(rig):
     rig.jammed_rad = 0.5
     rig.enabled().step(200, {"pedal": -1.0, "steering": -1.0})
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
     rig.step(60, PEDAL)
     assert rig.core.cause is Fault.STEERING_STUCK
     assert 0.0 < max(rig.speeds()) < 0.75
@@ -199,7 +199,7 @@ def test_a_wheel_may_lag_behind_all_the_time(rig, period_s, lag_s):
         asked_rad.append(rig.core.set_point.inner_rad)
         rig.jammed_rad = asked_rad.pop(0)
         rig.step(1, {**PEDAL, "steering": 1.0 if tick // 75 % 2 else -1.0})
-        assert rig.core.state is State.ENABLED, rig.words
+        assert rig.core.state is VehicleState.ENABLED, rig.words
     assert max(asked_rad) > 0.5
 
 
@@ -228,7 +228,7 @@ def test_a_drive_with_a_lag_is_not_stuck(rig):
     for tick in range(1000):
         rig.step(1, {"pedal": 1.0 if (tick // 150) % 2 == 0 else -1.0})
         rig.speed_mps += (rig.core.set_point.speed_mps - rig.speed_mps) * STREAM_S / 0.3
-        assert rig.core.state is State.ENABLED, rig.words
+        assert rig.core.state is VehicleState.ENABLED, rig.words
 
 
 def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
@@ -269,7 +269,7 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig)
     count = len(rig.asked)
     rig.step(500)
     assert set(rig.speeds(count)) == {0.0}
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
     rig.step(20, PEDAL)
     assert rig.speed_mps > 0
 
@@ -314,7 +314,7 @@ def lie(rig):
     rig.speed_mps, rig.obeys = 3.0, False
     rig.step(2, PEDAL)
     rig.speed_mps, rig.obeys = 0.0, True
-    return rig.lie.split(" 3.")[0]
+    return rig.lie
 
 
 def be_stuck(rig):
@@ -361,17 +361,19 @@ def after(state, event):
 def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
     ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
     assert all(before is not then for _, before, then in ways)
-    assert {event for event, _, then in ways if then is State.ENABLED} == {VehicleEvent.CONFIRMED}
-    out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
+    assert {event for event, _, then in ways if then is VehicleState.ENABLED} == {
+        VehicleEvent.CONFIRMED
+    }
+    out_of_stopped = {event for event, before, _ in ways if before is VehicleState.STOPPED}
     assert out_of_stopped == {VehicleEvent.ENABLE, VehicleEvent.CLOSE}
 
 
 def test_the_readme_shows_the_table():
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
-    assert render_table(LEADS_TO, State, after) in readme
+    assert render_table(LEADS_TO, VehicleState, after) in readme
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", VehicleState)
 @pytest.mark.parametrize("event", LEADS_TO)
 def test_the_core_goes_where_the_table_says(rig, state, event):
     core = rig.core
@@ -381,7 +383,7 @@ def test_the_core_goes_where_the_table_says(rig, state, event):
     core._apply(Finding(event, "why"), rig.now_s)
     leads_to = after(state, event)
     assert core.state is leads_to
-    if leads_to is State.STOPPED and state is not State.STOPPED:
+    if leads_to is VehicleState.STOPPED and state is not VehicleState.STOPPED:
         assert (core.cause, core.words) == (event, "why")
         assert core.set_point.speed_mps == 0
         assert core._wish is None
@@ -416,7 +418,7 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(
                 rig.step()
                 for speed_mps in filter(None, rig.speeds(count)):
                     assert may_move
-                    assert rig.sent_in is State.ENABLED
+                    assert rig.sent_in is VehicleState.ENABLED
                     assert 0.0 < speed_mps <= SPEC.max_speed_mps
                     assert rig.now_s - commanded_s <= 0.25 + STREAM_S
         elif what == "command":

@@ -32,7 +32,7 @@ STANDS_MPS = 0.02
 _WINDOW_S = 0.11
 
 
-class State(str, Enum):
+class VehicleState(str, Enum):
     """DISABLED: nothing is sent. ENABLING and STOPPED: speed 0 is sent. ENABLED: commands are."""
 
     DISABLED = "disabled"
@@ -59,10 +59,15 @@ class VehicleEvent(str, Enum):
     FOREIGN = "foreign_command"  # somebody else commands the chassis
 
 
-_D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
+_D, _G, _E, _X = (
+    VehicleState.DISABLED,
+    VehicleState.ENABLING,
+    VehicleState.ENABLED,
+    VehicleState.STOPPED,
+)
 
 # By the state before. A state that is not named stays as it is.
-LEADS_TO: Dict[Enum, Dict[State, State]] = {
+LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
     VehicleEvent.ENABLE: {_D: _G, _E: _G, _X: _G},
     VehicleEvent.BRAKE: {_G: _X, _E: _X},
     VehicleEvent.CLOSE: {_G: _D, _E: _D, _X: _D},
@@ -125,7 +130,7 @@ class StreamedCore(abc.ABC):
     """The state machine, and what is asked for. `heard` is what the vehicle said of itself."""
 
     def __init__(self, similarity: Similarity, heard: Speeds) -> None:
-        self.state = State.DISABLED
+        self.state = VehicleState.DISABLED
         self.cause: Optional[Enum] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
@@ -153,7 +158,7 @@ class StreamedCore(abc.ABC):
     ) -> None:
         """Take the newest command; forget it where it may not drive. ValueError: see `wish_of`."""
         wish = wish_of(action, scenario_speed_mps)
-        if self.state is State.ENABLED:
+        if self.state is VehicleState.ENABLED:
             self._wish, self._wished_s = wish, now_s
 
     def brake(self, now_s: float, latch: bool = True) -> None:
@@ -179,8 +184,8 @@ class StreamedCore(abc.ABC):
             # A milliradian beyond its reach would count as a lie.
             action={"pedal": self._pedal(), "steering": clamp(steering, self._reach)},
             speed_mps=speed_mps,
-            self_braking=self.state is not State.ENABLED,
-            faults=faults if self.state is State.STOPPED else [],
+            self_braking=self.state is not VehicleState.ENABLED,
+            faults=faults if self.state is VehicleState.STOPPED else [],
             standing=standing,
             scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
@@ -188,7 +193,7 @@ class StreamedCore(abc.ABC):
 
     def standing(self, now_s: float) -> List[str]:
         """Return in words what would make an `enable` now be in vain."""
-        may_ask = self.state in (State.STOPPED, State.DISABLED)
+        may_ask = self.state in (VehicleState.STOPPED, VehicleState.DISABLED)
         return self._obstacles(now_s) if may_ask else []
 
     @abc.abstractmethod
@@ -221,14 +226,14 @@ class StreamedCore(abc.ABC):
             return
         self.state, self._since_s, self._wish = after, now_s, None
         self.set_point.speed_mps = 0.0  # whatever state comes next begins at a stand
-        self.cause, self.words = finding if after is State.STOPPED else (None, "")
+        self.cause, self.words = finding if after is VehicleState.STOPPED else (None, "")
 
     def _look(self, now_s: float) -> None:
         """Find what time alone tells."""
-        if self.state is State.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
+        if self.state is VehicleState.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
             why = self._why_not_confirmed(now_s)
             self._apply(Finding(VehicleEvent.NOT_CONFIRMED, why), now_s)
-        if self.state is not State.ENABLED:
+        if self.state is not VehicleState.ENABLED:
             return
         asked_mps, heard = self.set_point.speed_mps, self._heard
         drives = asked_mps > 0.0 and not heard.stands  # a wheel need not turn at a stand
@@ -248,7 +253,7 @@ class StreamedCore(abc.ABC):
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""
         step_s, self._ticked_s = now_s - self._ticked_s, now_s
-        if self.state is State.ENABLED and self._wish is not None:
+        if self.state is VehicleState.ENABLED and self._wish is not None:
             self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
         else:
             self.set_point.speed_mps = 0.0

@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.config import convert
 from edge_runtime.controller import Limits
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
-from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
+from edge_runtime.vehicles.core import STOP_TAKES_S, StreamedCore, VehicleState
 from edge_runtime.vehicles.mapping import RobotSettings
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class StreamedVehicle(Vehicle):
         return limits
 
     @property
-    def state(self) -> State:
+    def state(self) -> VehicleState:
         """Where its state machine stands."""
         return self._core.state
 

@@ -3,7 +3,7 @@
 import math
 
 from edge_runtime.manifest import Car, Manifest
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
@@ -71,7 +71,7 @@ class Rig:
     def enabled(self):
         self.core.enable(self.now_s)
         self.step(6)
-        assert self.core.state is State.ENABLED
+        assert self.core.state is VehicleState.ENABLED
         return self
 
     def driving(self, seconds=1.0):
@@ -138,7 +138,7 @@ class HunterRig(Rig):
 class Ros2Rig(Rig):
     """Odometry after each tick; `angular` is what it says of the wheels, None: what is true."""
 
-    silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.00 m/s", None
+    silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.0 m/s", None
 
     def __init__(self, scenario="left_turn", scale=None, **settings):
         self.settings = Ros2Settings(**settings)

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Dict, NamedTuple, Optional, Type
 from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import (
     BITRATE,
@@ -254,7 +254,7 @@ class HunterVehicle(StreamedVehicle):
         with self._lock:
             was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
-            stopped = self._core.state is State.STOPPED and was is not State.STOPPED
+            stopped = self._core.state is VehicleState.STOPPED and was is not VehicleState.STOPPED
         if stopped:
             self._stream.wake()
 

@@ -10,7 +10,13 @@ import math
 from typing import Dict, List, Optional
 
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.core import STOP_TAKES_S, Speeds, State, StreamedCore, VehicleEvent
+from edge_runtime.vehicles.core import (
+    STOP_TAKES_S,
+    Speeds,
+    StreamedCore,
+    VehicleEvent,
+    VehicleState,
+)
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, Similarity
@@ -154,7 +160,7 @@ class HunterCore(StreamedCore):
 
     def close(self, now_s: float) -> List[Sent]:
         """Return the last frames: stand, park, give control back; none if it was never taken."""
-        if self.state is State.DISABLED:
+        if self.state is VehicleState.DISABLED:
             return []
         self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
         park = [] if self.reports.remote_drives else [_LOCK]
@@ -162,7 +168,7 @@ class HunterCore(StreamedCore):
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """Take a frame of the bus, from any sender; never raises."""
-        if self.state is State.DISABLED:
+        if self.state is VehicleState.DISABLED:
             self.bus_works()  # nothing is sent then that it could take
         if can_id in protocol.COMMAND_IDS:
             words = f"somebody else sends 0x{can_id:x}"
@@ -190,7 +196,7 @@ class HunterCore(StreamedCore):
     def tick(self, now_s: float) -> List[Sent]:
         """Return the frames to send now; none while DISABLED."""
         self._look(now_s)
-        if self.state is State.DISABLED:
+        if self.state is VehicleState.DISABLED:
             return []
         parts = self._requests(now_s) if now_s >= self._ask_s else []
         self._step(now_s)
@@ -203,21 +209,25 @@ class HunterCore(StreamedCore):
 
     def is_at_rest(self, now_s: float) -> bool:
         """No more can be done about a dead bus or a remote control."""
-        blind = self.state is State.DISABLED or bool(self._bus_words) or self.reports.remote_drives
+        blind = (
+            self.state is VehicleState.DISABLED
+            or bool(self._bus_words)
+            or self.reports.remote_drives
+        )
         return blind or self.reports.is_known_to_stand(now_s)
 
     def _apply(self, finding: Finding, now_s: float) -> None:
         before = self.state
         super()._apply(finding, now_s)
-        if self.state is not before and self.state is State.STOPPED:
+        if self.state is not before and self.state is VehicleState.STOPPED:
             at_once = finding.event is Fault.STUCK  # no set-point will stop it: the brake must
             self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
-        elif self.state is State.ENABLED:
+        elif self.state is VehicleState.ENABLED:
             self._ask_s = math.inf
 
     def _judge(self, now_s: float) -> None:
         """Apply what the chassis's newest status means."""
-        if self.state is State.ENABLING and self.reports.status_s <= self._since_s:
+        if self.state is VehicleState.ENABLING and self.reports.status_s <= self._since_s:
             return  # from before it was asked
         self._apply(self.reports.finding() or Finding(VehicleEvent.CONFIRMED, ""), now_s)
 
@@ -237,7 +247,7 @@ class HunterCore(StreamedCore):
     def _requests(self, now_s: float) -> List[Sent]:
         """Return what goes beside the stream: for control if ENABLING, for the brake if STOPPED."""
         self._ask_s = now_s + ASK_AGAIN_S
-        if self.state is State.STOPPED:
+        if self.state is VehicleState.STOPPED:
             # A person with the remote control knows better than we do.
             is_over = self.reports.remote_drives or self.reports.is_known_to_stand(now_s)
             return [] if is_over else [_LOCK]

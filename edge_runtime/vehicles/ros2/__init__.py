@@ -43,7 +43,7 @@ from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import Speeds, State, StreamedCore, VehicleEvent
+from edge_runtime.vehicles.core import Speeds, StreamedCore, VehicleEvent, VehicleState
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 from edge_runtime.vehicles.stream import StreamedVehicle
@@ -419,7 +419,10 @@ class Ros2Core(StreamedCore):
         if 0 < stamp_ns <= self._stamp_ns:
             self.stale += 1
             # While nothing is driven, a clock set back is believed; a repetition is not.
-            if self.state in (State.ENABLING, State.ENABLED) or stamp_ns == self._stamp_ns:
+            if (
+                self.state in (VehicleState.ENABLING, VehicleState.ENABLED)
+                or stamp_ns == self._stamp_ns
+            ):
                 return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
@@ -430,7 +433,7 @@ class Ros2Core(StreamedCore):
     def tick(self, now_s: float) -> Optional[Motion]:
         """What to publish now; None while DISABLED."""
         self._look(now_s)
-        if self.state is State.DISABLED:
+        if self.state is VehicleState.DISABLED:
             return None
         self._step(now_s)
         return Motion(self.set_point.speed_mps, self._asked_rad())
@@ -438,7 +441,7 @@ class Ros2Core(StreamedCore):
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nothing was ever asked of it."""
         is_fresh = self._silence(-math.inf, now_s) is None
-        return self.state is State.DISABLED or (is_fresh and self._heard.stands)
+        return self.state is VehicleState.DISABLED or (is_fresh and self._heard.stands)
 
     def _why_not_confirmed(self, now_s: float) -> str:
         return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"

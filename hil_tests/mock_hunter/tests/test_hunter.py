@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter import open_bus, parse_bus, protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
@@ -519,7 +519,7 @@ def test_a_fault_stops_it_is_named_and_only_enabling_moves_it_again(name, phase_
     pair.pedal = -1.0 if name == "stuck" else 1.0
     fault_s = pair.now_s
     pair.run(STOPS_WITHIN_S.get(name, 0.35) + STANDS_WITHIN_S)
-    assert pair.core.state is State.STOPPED
+    assert pair.core.state is VehicleState.STOPPED
     assert pair.moving_set_point_s - fault_s <= STOPS_WITHIN_S.get(name, 0.35)
     assert pair.moved_s < pair.now_s
     assert any(WORDS[name] in words for words in pair.words)
@@ -540,7 +540,7 @@ def test_a_whole_drive_without_a_fault_is_never_stopped():
     for number in range(40):
         pair.pedal = (-1.0, 1.0, 0.3, -0.4, 1.0)[number % 5]
         pair.run(0.2 + 0.03 * (number % 7))
-        assert pair.core.state is State.ENABLED, pair.words
+        assert pair.core.state is VehicleState.ENABLED, pair.words
 
 
 class Manoeuvre(NamedTuple):
@@ -583,7 +583,7 @@ def test_no_steering_of_a_healthy_chassis_is_accused(pair, delays_s, parked, man
     pair.enabled().delays_s = delays_s
     for one in manoeuvres:
         one.drive(pair)
-        assert pair.core.state is State.ENABLED, pair.words
+        assert pair.core.state is VehicleState.ENABLED, pair.words
 
 
 FOUND_WITHIN_S = 0.8  # As by the core's own tests, and what a late bus adds.
@@ -605,7 +605,7 @@ def test_a_wheel_that_stays_anywhere_else_is_found(
     assume(wrong_rad > 0.001)
     pair.enabled().delays_s = delays_s
     pair.run(0.5 if at_once else 3.0)  # It moves
-    assert pair.core.state is State.ENABLED
+    assert pair.core.state is VehicleState.ENABLED
     pair.jammed_rad = jammed_rad
     turns_s = abs(pair.core.set_point.inner_rad - spec.inner_rad(asked_rad))  # at 1 rad/s
     pair.run(turns_s + FOUND_WITHIN_S)
@@ -619,7 +619,7 @@ def test_a_pause_of_the_edge_longer_than_the_chassiss_time_out_does_not_move_it_
     pair.mock.advance(pair.now_s)
     assert pair.mock.body.speed_mps < 0.5  # the chassis's own time-out
     pair.run(2.0)
-    assert pair.core.state is State.STOPPED
+    assert pair.core.state is VehicleState.STOPPED
     assert pair.asked[-1] == 0.0
     assert pair.mock.body.stands
 
