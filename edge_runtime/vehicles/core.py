@@ -59,12 +59,7 @@ class VehicleEvent(str, Enum):
     FOREIGN = "foreign_command"  # somebody else commands the chassis
 
 
-_D, _G, _E, _X = (
-    VehicleState.DISABLED,
-    VehicleState.ENABLING,
-    VehicleState.ENABLED,
-    VehicleState.STOPPED,
-)
+_D, _G, _E, _X = VehicleState
 
 # By the state before. A state that is not named stays as it is.
 LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
@@ -193,8 +188,7 @@ class StreamedCore(abc.ABC):
 
     def standing(self, now_s: float) -> List[str]:
         """Return in words what would make an `enable` now be in vain."""
-        may_ask = self.state in (VehicleState.STOPPED, VehicleState.DISABLED)
-        return self._obstacles(now_s) if may_ask else []
+        return [] if self._has_asked else self._obstacles(now_s)
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
@@ -211,6 +205,10 @@ class StreamedCore(abc.ABC):
     @abc.abstractmethod
     def _centre_rad(self) -> Optional[float]:
         """Return the steering angle that the vehicle reports; None where it is not known."""
+
+    @property
+    def _has_asked(self) -> bool:
+        return self.state in (VehicleState.ENABLING, VehicleState.ENABLED)
 
     def _asked_rad(self) -> float:
         return self._spec.centre_rad(self.set_point.inner_rad)

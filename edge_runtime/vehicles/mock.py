@@ -37,7 +37,7 @@ class MockParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class MockVehicle(Vehicle):
-    """Takes pedal and steering; brakes by itself when no command came for 2 T."""
+    """Obeys pedal and steering; brakes by itself when no command came for 2 T."""
 
     name: ClassVar[str] = "mock"
     # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
@@ -72,7 +72,7 @@ class MockVehicle(Vehicle):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """An action that a policy does not have is zero: no pedal, wheels straight."""
+        """Take an action; one that a policy does not have is zero: no pedal, wheels straight."""
         if not action.keys() & self.limits.keys():
             raise ValueError(f"a command that lacks an action: {action}")
         if not all(map(math.isfinite, action.values())):
@@ -85,7 +85,7 @@ class MockVehicle(Vehicle):
         self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Full brake without the dead time of the command's way."""
+        """Brake without the dead time of a command's way."""
         self._integrate(now_s)
         self._latched = self._latched or latch
         self._on_the_way.clear()
@@ -93,7 +93,7 @@ class MockVehicle(Vehicle):
         self._target = (-1.0, self._target[1])
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """Where the actuators are and how fast the body is."""
+        """Report where the actuators are and how fast the body is."""
         self._integrate(now_s)
         return VehicleReport(
             action={"pedal": self._pedal, "steering": self._steering},
@@ -103,7 +103,7 @@ class MockVehicle(Vehicle):
         )
 
     def close(self) -> None:
-        """Nothing to free; it stands, and stays so."""
+        """Stand, and stay so."""
         self._latched = True
         self._on_the_way.clear()
         self._target = (-1.0, self._target[1])
@@ -126,7 +126,7 @@ class MockVehicle(Vehicle):
             self._speed_mps = min(max(speed_mps, 0.0), car.max_speed_mps)
 
     def _follow(self, position: float, target: float, step_s: float) -> float:
-        """First-order lag towards the target, no faster than the actuator's rate."""
+        """Lag towards the target by the time constant, no faster than the actuator's rate."""
         change = (target - position) * (1.0 - math.exp(-step_s / self._parameters.time_constant_s))
         most = self._parameters.slew_per_s * step_s
         return position + min(max(change, -most), most)

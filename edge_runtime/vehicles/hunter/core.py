@@ -208,13 +208,10 @@ class HunterCore(StreamedCore):
         return super().report(now_s)._replace(battery_v=status.battery_v if status else None)
 
     def is_at_rest(self, now_s: float) -> bool:
-        """No more can be done about a dead bus or a remote control."""
-        blind = (
-            self.state is VehicleState.DISABLED
-            or bool(self._bus_words)
-            or self.reports.remote_drives
-        )
-        return blind or self.reports.is_known_to_stand(now_s)
+        """Return whether it is known to stand, or the bus is dead or the remote control drives."""
+        is_blind = bool(self._bus_words) or self.reports.remote_drives
+        is_off = self.state is VehicleState.DISABLED
+        return is_off or is_blind or self.reports.is_known_to_stand(now_s)
 
     def _apply(self, finding: Finding, now_s: float) -> None:
         before = self.state

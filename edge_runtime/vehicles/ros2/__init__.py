@@ -1,10 +1,9 @@
 """A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
 
-First the messages that we speak, in CDR, and a node without ROS 2; then names and settings; then
-what decides, pure: odometry in, motion out; then the session and two threads around it:
-- The stream's thread publishes what `tick` gives: the vehicle's ROS driver makes a frame of each
-  message, and has no stream of its own.
-- Zenoh's thread hands every odometry to `hear`.
+First the messages and a node without ROS 2; then what decides, pure: odometry in, motion out; then
+the session and two threads around it. The stream's thread publishes what `tick` gives: the ROS
+driver makes a frame of each message, and has no stream of its own. Zenoh's thread hands every
+odometry to `hear`.
 
 Field names, order and types are those of the packages' .msg files (common_interfaces and
 ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
@@ -12,8 +11,7 @@ the left, positive steering and yaw to the left (REP 103). On the wire they are 
 of four bytes that says plain CDR (XCDR version 1), little-endian: `00 01 00 00`; a big-endian one
 is read, too. Safe with several threads: pycdr2's own buffer, one for each type, is not used.
 
-The one file that imports pycdr2: a board without ROS 2 need not have it. No `from __future__ import
-annotations` here: pycdr2 reads the annotations, also on Python 3.8.
+No `from __future__ import annotations` here: pycdr2 reads the annotations, also on Python 3.8.
 """
 
 import math
@@ -71,7 +69,7 @@ STEERS_FROM_MPS = 0.2
 
 
 def topic_key(namespace: str, topic: str) -> str:
-    """The Zenoh key of a topic: below the namespace, or as it is where it begins with a slash.
+    """Return the Zenoh key of a topic: below the namespace unless it begins with a slash.
 
     Raises UserError for names that ROS would not take.
     """
@@ -107,7 +105,6 @@ TYPES: Dict[str, str] = {
 """The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery."""
 
 HEADER_BYTES = 4
-CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN = 0, 1
 MAX_PAYLOAD_BYTES = 1024 * 1024
 _ALIGNMENT = 4  # DDS fills a message up to this.
 # What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
@@ -118,23 +115,14 @@ else:
     Covariance = array[float64, 36]
 
 
-def no_covariance() -> List[float]:
-    """A 6x6 matrix of zeros, row by row: to ROS that means unknown."""
-    return [0.0] * 36
-
-
 @dataclass
 class RosTime(IdlStruct, typename="builtin_interfaces/msg/Time"):
-    """Seconds and nanoseconds since 1970."""
-
     sec: int32 = 0
     nanosec: uint32 = 0
 
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs/msg/Header"):
-    """When, and in which coordinate frame."""
-
     stamp: RosTime = field(default_factory=RosTime)
     frame_id: str = ""
 
@@ -155,8 +143,6 @@ class AckermannDrive(IdlStruct, typename="ackermann_msgs/msg/AckermannDrive"):
 
 @dataclass
 class AckermannDriveStamped(IdlStruct, typename="ackermann_msgs/msg/AckermannDriveStamped"):
-    """A drive command and its time."""
-
     header: Header = field(default_factory=Header)
     drive: AckermannDrive = field(default_factory=AckermannDrive)
 
@@ -172,8 +158,6 @@ class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
 
 @dataclass
 class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
-    """A rotation; the default is none."""
-
     x: float64 = 0.0
     y: float64 = 0.0
     z: float64 = 0.0
@@ -182,16 +166,12 @@ class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
 
 @dataclass
 class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
-    """Velocity in m/s and rad/s."""
-
     linear: Vector3 = field(default_factory=Vector3)
     angular: Vector3 = field(default_factory=Vector3)
 
 
 @dataclass
 class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
-    """Where, and turned how."""
-
     position: Vector3 = field(default_factory=Vector3)
     orientation: Quaternion = field(default_factory=Quaternion)
 
@@ -201,15 +181,13 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovarian
     """A pose, and the covariance of x, y, z and the rotations about them."""
 
     pose: RosPose = field(default_factory=RosPose)
-    covariance: Covariance = field(default_factory=no_covariance)
+    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
 
 
 @dataclass
 class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
-    """A velocity and its covariance."""
-
     twist: Twist = field(default_factory=Twist)
-    covariance: Covariance = field(default_factory=no_covariance)
+    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
 
 
 @dataclass
@@ -226,18 +204,17 @@ _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry)
 
 
 def encode(message: IdlStruct) -> bytes:
-    """The message in little-endian CDR; struct.error for a number that its field cannot hold."""
+    """Return little-endian CDR. Raises struct.error for a number that its field cannot hold."""
     return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
 
 
 def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Reason]:
-    """A message of that kind, all of whose numbers are finite, or why not. Never raises."""
+    """Return a message of the kind with finite numbers, or why it is none. Never raises."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         return Reason.OVERSIZED
     if len(payload) < HEADER_BYTES:
         return Reason.MALFORMED
-    (representation,) = struct.unpack_from(">H", payload)
-    if representation not in (CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN):
+    if payload[:2] not in (b"\0\0", b"\0\1"):  # big-endian, little-endian
         return Reason.SCHEMA
     buffer = Buffer(payload, align_offset=HEADER_BYTES)
     try:
@@ -274,7 +251,7 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
 
 
 def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
-    """Speed and centre angle; no acceleration is given, because the speed is a ramp already."""
+    """Return speed and centre angle; no acceleration: the speed is a ramp already."""
     return AckermannDriveStamped(
         header=Header(RosTime(*divmod(time_ns, 10**9)), "base_link"),
         drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
@@ -282,12 +259,12 @@ def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
 
 
 def member_token(zid: str) -> str:
-    """The token by which a bridge knows another one."""
+    """Return the token by which one bridge knows another."""
     return f"@/{zid}/@ros2_lv"
 
 
 def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
-    """The token of a PUBLISHER or SUBSCRIBER of a message, as zenoh-bridge-ros2dds has it.
+    """Return the token of a PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
     bridge would carry only what a ROS node beside it already wants. Its last part is
@@ -316,7 +293,7 @@ class Ros2Node:
         self._announce(member_token(self._zid))
 
     def publisher(self, topic: str, kind: Type[_M]) -> Callable[[_M], None]:
-        """What publishes messages of that kind on that topic. It never waits for a subscriber."""
+        """Return what publishes messages of a kind on a topic. It never waits for a subscriber."""
         key = topic_key(self._namespace, topic)
         publisher = self._session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.DROP
@@ -363,29 +340,24 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
     odometry_angular: str = YAW_RATE
 
     def __post_init__(self) -> None:
-        check_settings(self)
-
-
-def check_settings(settings: Ros2Settings) -> None:
-    """Raise UserError where the settings are not valid, or name nothing to be driven by."""
-    for name in ("twist_angular", "odometry_angular"):
-        check_choice(f"vehicle.ros2.{name}", getattr(settings, name), _ANGULAR)
-    if settings.listen is not None and settings.connect is not None:
-        raise UserError("ros2 has both listen and connect: give one of them")
-    for endpoint in (settings.listen, settings.connect):
+        for name in ("twist_angular", "odometry_angular"):
+            check_choice(f"vehicle.ros2.{name}", getattr(self, name), _ANGULAR)
+        if self.listen is not None and self.connect is not None:
+            raise UserError("ros2 has both listen and connect: give one of them")
+        endpoint = self.listen or self.connect
         if endpoint is not None and is_tls(check_endpoint(endpoint)):
             raise UserError(
                 f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
                 " use tcp/ or udp/ on one machine, or inside a tunnel"
             )
-    if not settings.twist_topic and not settings.ackermann_topic:
-        raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
-    if not settings.odometry_topic:
-        raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
-    topics = [settings.twist_topic, settings.ackermann_topic, settings.odometry_topic]
-    keys = [topic_key(settings.namespace, topic) for topic in topics if topic]
-    if len(set(keys)) < len(keys):
-        raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
+        if not self.twist_topic and not self.ackermann_topic:
+            raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
+        if not self.odometry_topic:
+            raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
+        topics = (self.twist_topic, self.ackermann_topic, self.odometry_topic)
+        keys = [topic_key(self.namespace, topic) for topic in topics if topic]
+        if len(set(keys)) < len(keys):
+            raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
 
 
 class Ros2Core(StreamedCore):
@@ -408,21 +380,18 @@ class Ros2Core(StreamedCore):
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
-        """Nothing more is sent."""
+        """Send nothing more."""
         self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
-        """Finite odometry; it counts where it is newer than the last by its own stamp.
+        """Take finite odometry; it counts where it is newer than the last by its own stamp.
 
         A sender that leaves its stamps at 0 is believed by the time of arrival alone.
         """
         if 0 < stamp_ns <= self._stamp_ns:
             self.stale += 1
             # While nothing is driven, a clock set back is believed; a repetition is not.
-            if (
-                self.state in (VehicleState.ENABLING, VehicleState.ENABLED)
-                or stamp_ns == self._stamp_ns
-            ):
+            if self._has_asked or stamp_ns == self._stamp_ns:
                 return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
@@ -431,7 +400,7 @@ class Ros2Core(StreamedCore):
         self._apply(lie or Finding(VehicleEvent.CONFIRMED, ""), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
-        """What to publish now; None while DISABLED."""
+        """Return what to publish now; None while DISABLED."""
         self._look(now_s)
         if self.state is VehicleState.DISABLED:
             return None
@@ -439,7 +408,7 @@ class Ros2Core(StreamedCore):
         return Motion(self.set_point.speed_mps, self._asked_rad())
 
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nothing was ever asked of it."""
+        """Return whether the vehicle is known to stand, or nothing was ever asked of it."""
         is_fresh = self._silence(-math.inf, now_s) is None
         return self.state is VehicleState.DISABLED or (is_fresh and self._heard.stands)
 
@@ -452,7 +421,7 @@ class Ros2Core(StreamedCore):
         return Finding(Fault.SILENT, f"no fresh odometry on {self._topic}")
 
     def _centre_rad(self) -> Optional[float]:
-        """From the odometry; None where a yaw rate tells nothing: it hardly moves."""
+        """Return the angle by the odometry; None where a yaw rate tells none: it hardly moves."""
         angular, speed_mps = self._angular, self._heard.speed_mps
         if angular is None or self._is_angle:
             return angular
@@ -473,8 +442,7 @@ class Ros2Vehicle(StreamedVehicle):
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
-        self._failing = False
-        self._publish: List[Callable[[Motion], None]] = []
+        self._fails = False
         # A router (by default on loopback), or a peer that goes on connecting to a bridge.
         connect, listen = settings.connect, None
         if connect is None:
@@ -485,19 +453,15 @@ class Ros2Vehicle(StreamedVehicle):
             raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
         try:
             self._node = node = Ros2Node(self._session, settings.namespace)
+            self._twist = self._drive = None
             if settings.twist_topic:
-                twist = node.publisher(settings.twist_topic, Twist)
-                self._publish.append(
-                    lambda motion: twist(
-                        twist_of(motion, settings.twist_angular, similarity.spec.wheelbase_m)
-                    )
-                )
+                self._twist = node.publisher(settings.twist_topic, Twist)
             if settings.ackermann_topic:
-                drive = node.publisher(settings.ackermann_topic, AckermannDriveStamped)
-                self._publish.append(lambda motion: drive(drive_of(motion, time.time_ns())))
+                self._drive = node.publisher(settings.ackermann_topic, AckermannDriveStamped)
+            self._angular = settings.twist_angular
             node.subscribe(settings.odometry_topic, Odometry, self._hear)
         except BaseException:
-            self._session.close()  # An open session would hang the process at its exit.
+            self._session.close()  # an open session would hang the process at its exit
             raise
         self._stream.start()
 
@@ -524,12 +488,15 @@ class Ros2Vehicle(StreamedVehicle):
         if motion is None:
             return False
         try:
-            for publish in self._publish:
-                publish(motion)
+            if self._twist:
+                wheelbase_m = self._core.similarity.spec.wheelbase_m
+                self._twist(twist_of(motion, self._angular, wheelbase_m))
+            if self._drive:
+                self._drive(drive_of(motion, time.time_ns()))
         except Exception as error:  # the vehicle stops by its own time-out, and the silence tells
-            if not self._failing:
+            if not self._fails:
                 log.event("error", "ros2_not_sent", detail=error)
-            self._failing = True
+            self._fails = True
             return False
-        self._failing = False
+        self._fails = False
         return True
