@@ -94,13 +94,11 @@ class Speeds:
         self._noted: Deque[Tuple[float, float]] = deque()
 
     def note(self, speed_mps: float, now_s: float) -> None:
-        """Note the newest."""
         self._noted.append((now_s, speed_mps))
         while self._noted[0][0] < now_s - _WINDOW_S:
             self._noted.popleft()
 
     def forget(self) -> None:
-        """Begin anew."""
         self._noted.clear()
 
     @property
@@ -143,7 +141,6 @@ class StreamedCore(abc.ABC):
         self._heard.silence_s = max(2 * control_period_s, LEAST_SILENCE_S)
 
     def enable(self, now_s: float) -> None:
-        """Ask for control, from now on until the vehicle confirms it."""
         self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)  # a new chance to follow
         self._apply(Finding(VehicleEvent.ENABLE, ""), now_s)
         self._since_s = now_s
@@ -169,7 +166,6 @@ class StreamedCore(abc.ABC):
         return math.inf if self._wish is None else self._wished_s + self.command_timeout_s
 
     def report(self, now_s: float) -> VehicleReport:
-        """Report what the vehicle does, in the policy's terms and in its own."""
         speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
         centre_rad = self._centre_rad()
         steering = self.similarity.steering(self._asked_rad() if centre_rad is None else centre_rad)

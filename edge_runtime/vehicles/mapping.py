@@ -29,7 +29,6 @@ _LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for
 
 
 def clamp(value: float, most: float) -> float:
-    """Return the value within -`most` to `most`."""
     return min(max(value, -most), most)
 
 
@@ -207,7 +206,6 @@ class SetPoint:
         self._similarity = similarity
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
-        """Move by one step of time towards a wish."""
         similarity, spec, speed_mps = self._similarity, self._similarity.spec, self.speed_mps
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:

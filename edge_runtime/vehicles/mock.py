@@ -93,7 +93,6 @@ class MockVehicle(Vehicle):
         self._target = (-1.0, self._target[1])
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """Report where the actuators are and how fast the body is."""
         self._integrate(now_s)
         return VehicleReport(
             action={"pedal": self._pedal, "steering": self._steering},

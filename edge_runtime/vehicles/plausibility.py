@@ -39,8 +39,6 @@ IMPOSSIBLE = 1.3  # times what the model can do
 
 
 class Fault(str, Enum):
-    """Why a vehicle is not believed."""
-
     SILENT = "feedback_silent"  # feedback that was due is missing, or repeats itself
     LYING = "feedback_impossible"
     STUCK = "speed_stuck"  # or an action of any driver
@@ -71,7 +69,6 @@ class Lasting:
         self.since_s = math.inf
 
     def note(self, holds: bool, now_s: float) -> None:
-        """Note whether it holds now."""
         self.since_s = min(self.since_s, now_s) if holds else math.inf
 
 
@@ -83,7 +80,6 @@ class Asked:
         self.noted: Deque[Tuple[float, Any]] = deque()
 
     def note(self, asked: Any, now_s: float) -> None:
-        """Note what is asked from now on."""
         self.noted.append((now_s, asked))
         while len(self.noted) > 1 and self.noted[1][0] < now_s - self._window_s:
             self.noted.popleft()
@@ -94,7 +90,6 @@ class Asked:
 
     @property
     def values(self) -> List[Any]:
-        """Oldest first."""
         return [asked for _, asked in self.noted]
 
 
@@ -130,7 +125,6 @@ class VehicleWatch:
         self._asked.note(action, now_s)
 
     def report(self, report: VehicleReport, now_s: float) -> None:
-        """Note what the vehicle says of itself."""
         self._lies = self._is_impossible(report, now_s)
         if not self._lies:
             self._believed = (now_s, report.speed_mps)
@@ -141,7 +135,6 @@ class VehicleWatch:
         self._braking.note(self._drives and report.self_braking, now_s)
 
     def fault(self, now_s: float) -> Optional[Fault]:
-        """Return the gravest fault."""
         if now_s > self.silent_at_s:
             return Fault.SILENT
         if self._lies:

@@ -46,19 +46,16 @@ class StreamedVehicle(Vehicle):
 
     @classmethod
     def arguments_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Mapping[str, Any]:
-        """Return the settings as their own type, and the similarity."""
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
         return {"settings": given, "similarity": given.similarity(cls.name, manifest)}
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        """Return the limits of the robot in the place of the policy's car."""
         limits: Limits = cls.arguments_of(settings, manifest)["similarity"].limits()
         return limits
 
     @property
     def state(self) -> VehicleState:
-        """Where its state machine stands."""
         return self._core.state
 
     def enable(self, now_s: float) -> None:
@@ -84,7 +81,6 @@ class StreamedVehicle(Vehicle):
         self._stream.wake()
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """Report by the newest that was heard of the vehicle."""
         with self._lock:
             self._core.follow_period(self.control_period_s)  # it listens before it is enabled
             report = self._core.report(now_s)
@@ -95,7 +91,6 @@ class StreamedVehicle(Vehicle):
         return report
 
     def close(self) -> None:
-        """Stand, send no more, give control back and free what the driver holds."""
         if self._closed:
             return
         self._closed = True
@@ -135,7 +130,6 @@ class Stream:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin to send."""
         self._thread.start()
 
     def wake(self) -> None:

@@ -141,7 +141,6 @@ class Chassis(NamedTuple):
 
 
 def advance(chassis: Chassis, event: ChassisEvent) -> Chassis:
-    """The state after an event."""
     if event in CONTROL:
         return chassis._replace(control=CONTROL[event][list(Control).index(chassis.control)])
     place = list(ChassisCondition).index(chassis.condition)

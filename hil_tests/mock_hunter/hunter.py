@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as codec
-from edge_runtime.vehicles.hunter.protocol import LINK_LOST, fault_bits
+from edge_runtime.vehicles.hunter.protocol import LINK_LOST, Sent, fault_bits
 from edge_runtime.vehicles.mapping import clamp
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import (
@@ -126,7 +126,6 @@ class Body(NamedTuple):
 
     @property
     def stands(self) -> bool:
-        """Whether it does not move."""
         return abs(self.speed_mps) < STANDS_MPS
 
 
@@ -166,13 +165,6 @@ def curvature(inner_rad: float, parameters: Parameters) -> float:
     return math.copysign(amount, inner_rad)
 
 
-class Wire(NamedTuple):
-    """A frame on the bus."""
-
-    can_id: int
-    data: bytes
-
-
 class MockHunter:
     """A chassis that was just switched on. Not thread-safe."""
 
@@ -186,9 +178,9 @@ class MockHunter:
         self._under_way: deque[tuple[float, Setpoint]] = deque()
         self._setpoint = Setpoint()
         self._tick = 0
-        self._fast: list[Wire] = []
-        self._slow: list[Wire] = []
-        self._outgoing: deque[tuple[float, Wire]] = deque()
+        self._fast: list[Sent] = []
+        self._slow: list[Sent] = []
+        self._outgoing: deque[tuple[float, Sent]] = deque()
 
     def describe(self) -> str:
         """Where it stands in one line that only changes when something happens."""
@@ -222,7 +214,6 @@ class MockHunter:
             self.chassis = rules.take_clear(self.chassis)
 
     def switch(self, name: str, on: bool, now_s: float) -> None:
-        """Switch one of FAULTS on or off."""
         self.advance(now_s)
         (self.faults.add if on else self.faults.discard)(name)
         if name in BITS:
@@ -231,7 +222,7 @@ class MockHunter:
             event = _OF_A_PERSON[name][0 if on else 1]
             self.chassis = rules.advance(self.chassis, event)
 
-    def due(self, now_s: float) -> list[Wire]:
+    def due(self, now_s: float) -> list[Sent]:
         """The frames to send now. After a pause one report, not one for each missed period."""
         self.advance(now_s)
         if now_s >= self.next_s:
@@ -245,7 +236,6 @@ class MockHunter:
         return found
 
     def advance(self, now_s: float) -> None:
-        """Integrate up to this time."""
         p = self._parameters
         self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
         while now_s - self._now_s > 1e-9:
@@ -276,11 +266,11 @@ class MockHunter:
         frames = self._fast + (self._slow if with_slow else [])
         self._outgoing.extend((release_s, frame) for frame in frames)
 
-    def _fast_frames(self) -> list[Wire]:
+    def _fast_frames(self) -> list[Sent]:
         """0x221 and 0x251 to 0x253: every 20 ms."""
         body, p = self.body, self._parameters
         speed_mps = body.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        found = [_frame(codec.MOTION_STATUS, codec.MotionStatus(speed_mps, body.inner_rad))]
+        found = [codec.MOTION_STATUS.sent(codec.MotionStatus(speed_mps, body.inner_rad))]
         half = curvature(body.inner_rad, p) * p.track_m / 2
         drive, steer = p.motor_revolutions_per_m, p.steer_revolutions_per_rad
         for row, turns, speed, way in (
@@ -291,10 +281,10 @@ class MockHunter:
             # As a 32-bit counter shows it after it has run over.
             pulses = round(way * turns * p.pulses_per_revolution)
             shown = (pulses + _INT32 // 2) % _INT32 - _INT32 // 2
-            found.append(_frame(row, codec.MotorFast(round(speed * turns * 60), _IDLE_A, shown)))
+            found.append(row.sent(codec.MotorFast(round(speed * turns * 60), _IDLE_A, shown)))
         return found
 
-    def _slow_frames(self) -> list[Wire]:
+    def _slow_frames(self) -> list[Sent]:
         """0x211 and 0x261 to 0x263: every 100 ms."""
         chassis, errors = self.chassis, self.chassis.errors
         words = [BITS[error].words for error in errors]
@@ -308,15 +298,11 @@ class MockHunter:
             brake=int(chassis.brake_locked),
             counter=self._tick // SLOW_EVERY % 256,
         )
-        found = [_frame(codec.SYSTEM_STATUS, status)]
+        found = [codec.SYSTEM_STATUS.sent(status)]
         for motor, row in enumerate(_SLOW):
             shown = (BITS[error].motor_bits for error in errors if motor in BITS[error].motors)
             hot = "overtemperature" in errors and motor != STEERING
             celsius = _HOT_C if hot else _COOL_C
             slow = codec.MotorSlow(volts, celsius, celsius, _ENABLED | sum(shown))
-            found.append(_frame(row, slow))
+            found.append(row.sent(slow))
         return found
-
-
-def _frame(row: codec.Frame, message: object) -> Wire:
-    return Wire(row.can_id, codec.encode(row, message))

@@ -34,15 +34,11 @@ ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
 
 
-def _sent(frame: protocol.Frame, message: object) -> Sent:
-    return Sent(frame, protocol.encode(frame, message))
-
-
-_TAKE = _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.CAN_CONTROL))
-_GIVE_BACK = _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.STANDBY))
-_RELEASE = _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(0))
-_LOCK = _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(1))
-_CLEAR = _sent(protocol.CLEAR_COMMAND, protocol.ClearCommand())
+_TAKE = protocol.MODE_COMMAND.sent(protocol.ModeCommand(protocol.CAN_CONTROL))
+_GIVE_BACK = protocol.MODE_COMMAND.sent(protocol.ModeCommand(protocol.STANDBY))
+_RELEASE = protocol.BRAKE_COMMAND.sent(protocol.BrakeCommand(0))
+_LOCK = protocol.BRAKE_COMMAND.sent(protocol.BrakeCommand(1))
+_CLEAR = protocol.CLEAR_COMMAND.sent(protocol.ClearCommand())
 
 
 class Reports(Speeds):
@@ -80,7 +76,6 @@ class Reports(Speeds):
         self._last_status_s = now_s
 
     def is_known_to_stand(self, now_s: float) -> bool:
-        """Return whether it says now that it stands."""
         return self.stands and now_s - self.motion_s <= self.silence_s
 
     @property
@@ -144,8 +139,6 @@ class Reports(Speeds):
 
 
 class HunterCore(StreamedCore):
-    """The state machine, what was heard, and what is asked for."""
-
     def __init__(self, similarity: Similarity, profile: str) -> None:
         self.reports = Reports(similarity.spec, profile)
         super().__init__(similarity, self.reports)
@@ -154,7 +147,6 @@ class HunterCore(StreamedCore):
         self._bus_fails = Lasting()
 
     def enable(self, now_s: float) -> None:
-        """Ask for control, from now on until the chassis confirms it."""
         super().enable(now_s)
         self._ask_s = now_s
 
@@ -203,7 +195,6 @@ class HunterCore(StreamedCore):
         return [*parts, self._motion()]
 
     def report(self, now_s: float) -> VehicleReport:
-        """Report what the vehicle does, with its battery."""
         status = self.reports.status
         return super().report(now_s)._replace(battery_v=status.battery_v if status else None)
 
@@ -251,9 +242,7 @@ class HunterCore(StreamedCore):
         return [*([_CLEAR] if self.reports.needs_clearing else []), _TAKE, _RELEASE]
 
     def _motion(self) -> Sent:
-        asked = self.set_point
-        data = protocol.encode_motion(asked.speed_mps, asked.inner_rad, self._spec)
-        return Sent(protocol.MOTION_COMMAND, data)
+        return protocol.motion(self.set_point.speed_mps, self.set_point.inner_rad, self._spec)
 
     def _centre_rad(self) -> Optional[float]:
         motion = self.reports.motion

@@ -99,8 +99,16 @@ class Frame(NamedTuple):
 
     @property
     def length(self) -> int:
-        """Of its data, in bytes."""
         return struct.calcsize(self.layout)
+
+    def sent(self, message: Any) -> Sent:
+        """Return the frame with the data of a message."""
+        return Sent(self, encode(self, message))
+
+
+class Sent(NamedTuple):
+    frame: Frame
+    data: bytes
 
 
 _MILLI, _TENTH = 0.001, 0.1
@@ -129,13 +137,6 @@ FRAMES: Dict[int, Frame] = {frame.can_id: frame for frame in COMMANDS + FEEDBACK
 MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTORS)}
 
 
-class Sent(NamedTuple):
-    """A frame to be sent."""
-
-    frame: Frame
-    data: bytes
-
-
 def encode(frame: Frame, message: Any) -> bytes:
     """Return the data of a message: rounded to counts, and clamped to what each field can hold.
 
@@ -152,11 +153,11 @@ def encode(frame: Frame, message: Any) -> bytes:
     return struct.pack(frame.layout, *counts)
 
 
-def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
+def motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> Sent:
     """Return 0x111 within the limits of the model. Raises ValueError for what is not finite."""
     speed_mps = clamp(speed_mps, spec.max_speed_mps)  # NaN passes, and encode refuses it
     inner_rad = clamp(inner_steering_rad, spec.max_inner_steering_rad)
-    return encode(MOTION_COMMAND, MotionCommand(speed_mps, inner_rad))
+    return MOTION_COMMAND.sent(MotionCommand(speed_mps, inner_rad))
 
 
 def decode(can_id: int, data: bytes) -> Any:

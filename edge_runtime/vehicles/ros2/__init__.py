@@ -259,7 +259,6 @@ def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
 
 
 def member_token(zid: str) -> str:
-    """Return the token by which one bridge knows another."""
     return f"@/{zid}/@ros2_lv"
 
 
@@ -319,7 +318,6 @@ class Ros2Node:
         self._announce(topic_token(self._zid, SUBSCRIBER, key, kind))
 
     def close(self) -> None:
-        """Withdraw everything; safe to call twice."""
         while self._declared:
             self._declared.pop().undeclare()
 
@@ -361,8 +359,6 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
 
 
 class Ros2Core(StreamedCore):
-    """The state machine, what was heard, and what is asked for."""
-
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         super().__init__(similarity, Speeds())
         self.stale = 0  # odometry that was repeated or came late: it shows nobody alive
@@ -380,7 +376,6 @@ class Ros2Core(StreamedCore):
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
-        """Send nothing more."""
         self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:

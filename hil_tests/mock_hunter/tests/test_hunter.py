@@ -229,7 +229,10 @@ class Bench:
                 self.send(frame)
             self.now_s = round(self.now_s + 0.005, 6)
             if self.now_s >= self.hunter.next_s:
-                self.seen += [(self.now_s, *sent) for sent in self.hunter.due(self.now_s)]
+                self.seen += [
+                    (self.now_s, sent.frame.can_id, sent.data)
+                    for sent in self.hunter.due(self.now_s)
+                ]
         return self
 
     def switch(self, name, on=True):
@@ -306,7 +309,7 @@ def test_after_a_pause_it_reports_once_and_keeps_its_grid():
     bench = enabled()
     grid_s = bench.hunter.next_s
     sent = bench.hunter.due(grid_s + 1.013)
-    assert len({frame.can_id for frame in sent}) == len(sent)
+    assert len({one.frame.can_id for one in sent}) == len(sent)
     assert bench.hunter.next_s == pytest.approx(grid_s + 1.02)
 
 
@@ -502,7 +505,8 @@ class Pair(Rig):
         delay_s = next(self.delays_s)
         self.coming += [(self.now_s + delay_s, each) for each in self.mock.due(self.now_s)]
         while self.coming and self.coming[0][0] <= self.now_s:  # A bus keeps their order.
-            self.core.hear(*self.coming.pop(0)[1], self.now_s)
+            frame, data = self.coming.pop(0)[1]
+            self.core.hear(frame.can_id, data, self.now_s)
         if not self.mock.body.stands:
             self.moved_s = self.now_s
 
