@@ -21,6 +21,7 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.edge import run_edge
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
+from hil_tests.testing.vehicles import BrokenVehicle
 
 from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, shared_limits
@@ -29,7 +30,6 @@ from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
 from edge_runtime.tests.test_commands import HOSTILE
-from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import Reason, Rejection, encode
 
@@ -287,7 +287,7 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     vehicle = BrokenVehicle()
     running(systemd.notifier(), vehicle)
     assert systemd.next() == "WATCHDOG=1"
-    vehicle.broken = "hang"
+    vehicle.hangs = "feedback"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
     vehicle.go_on()
     assert systemd.until("WATCHDOG") == "WATCHDOG=1"
@@ -297,9 +297,9 @@ def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
     vehicle = BrokenVehicle()
     control, link, _ = running(Notifier({}), vehicle)
     link.state_comes(encode(make_state(0)))
-    vehicle.says = ["the battery is hot"]
+    vehicle.odd = {"faults": ["the battery is hot"]}
     wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
-    vehicle.says = []
+    vehicle.odd = {}
     wait_until(lambda: not control._vehicle.fault(time.monotonic()), "the end of the fault")
     time.sleep(0.2)
     assert control.health().vehicle_fault == "the battery is hot"

@@ -18,7 +18,7 @@ from edge_runtime.vehicles.core import (
     VehicleState,
 )
 from edge_runtime.vehicles.mapping import wish_of
-from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S, Fault, Finding, FollowWatch
+from edge_runtime.vehicles.plausibility import Fault, Finding
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -90,61 +90,6 @@ def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
     assert rig.core.state is VehicleState.ENABLED
     rig.step(30, {"pedal": -1.0})
     assert rig.core.cause is Fault.STUCK
-
-
-def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_while():
-    watch = FollowWatch(1.0, FOLLOWS_S)
-    for now_s, asked_mps, measured_mps, stuck in [
-        (-3.0, 9.0, 0.0, False),  # it has had no time to follow
-        (-2.0625, 9.0, 0.0, False),
-        (-2.0, 9.0, 0.0, False),
-        (-1.9375, 9.0, 0.0, False),
-        (-1.875, 9.0, 0.0, True),
-        (-1.5, 2.0, 9.0, False),
-        (-0.5, 2.0, 10.0, False),  # as was asked for a second ago
-        (-0.375, 2.0, 9.0, False),  # no more
-        (-0.25, 2.0, 9.0, True),
-        (-0.125, 2.0, 3.0, False),  # the highest that counts as 2 m/s
-        (-0.0625, 2.0, 9.0, False),
-        (-0.03125, 2.0, 1.0, False),  # the lowest
-        (0.0, 2.0, 0.5, False),
-        (DEVIATES_S, 2.0, 9.0, False),
-        (DEVIATES_S + 0.001, 2.0, 0.5, True),
-    ]:
-        assert watch.is_stuck(asked_mps, measured_mps, now_s) is stuck, now_s
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_wheel_from_elsewhere_has_the_time_to_come_at_its_rate(sign):
-    """0.1 rad to each side, 0.5 s to follow, 1 rad/s."""
-    watch = FollowWatch(0.1, 0.5, 1.0)
-    for now_s, asked, measured, stuck in [
-        (0.0, 0.0, 1.0, False),
-        (0.4375, 0.0, 1.0, False),
-        (0.5, 0.0, 1.0, False),  # it may begin to turn now
-        (0.5, 0.0, 1.0, False),  # twice in one moment
-        (0.75, 0.0, 0.78, False),
-        (1.0, 0.0, 0.53, False),
-        (1.25, 0.0, 0.29, False),  # too slow, but only just now
-        (1.3125, 0.0, 0.29, False),
-        (1.375, 0.0, 0.29, True),
-        (1.5, 0.0, 0.09, False),
-        (1.625, 1.0, -0.09, False),
-        (2.0, 1.0, -0.09, False),
-        (2.0625, 1.0, 0.0, False),  # it has stuck
-        (2.125, 1.0, 0.0, False),  # 0.0 was asked for 0.625 s ago, and still 0.5 s ago
-        (2.1875, 1.0, 0.0, False),  # no more: now it turns by 1 rad/s
-        (2.25, 1.0, 0.0, False),
-        (2.375, 1.0, 0.0, True),
-        (2.625, 1.0, None, False),  # nothing is asked of it, or known
-        (2.75, 0.0, 1.0, False),  # anew
-        (3.1875, 0.0, 1.0, False),
-        (3.25, 0.0, 1.2, False),
-        (3.3125, 0.0, 1.0, False),
-        (3.375, 0.0, 1.0, True),
-    ]:
-        measured = None if measured is None else sign * measured
-        assert watch.is_stuck(sign * asked, measured, now_s) is stuck, now_s
 
 
 TOLERANCE_RAD = 0.1 * SPEC.centre_rad(SPEC.max_inner_steering_rad)
@@ -272,24 +217,6 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig)
     assert rig.core.state is VehicleState.ENABLED
     rig.step(20, PEDAL)
     assert rig.speed_mps > 0
-
-
-@pytest.mark.parametrize(
-    ("action", "speed_mps", "words"),
-    [
-        *(({"pedal": value}, None, "not finite") for value in (math.nan, math.inf)),
-        *(({"steering": value}, 1.0, "not finite") for value in (math.nan, math.inf)),
-        *(({}, value, "not finite") for value in (math.nan, math.inf)),
-        # No pedal means the speed of the scenario's car only where there is a steering beside it.
-        *((lacks, speed, "lacks an action") for lacks, speed in (({}, 6.0), ({}, None))),
-        ({"steering": 0.1}, None, "lacks an action"),
-    ],
-)
-def test_a_command_that_is_not_finite_or_lacks_an_action_is_refused(rig, action, speed_mps, words):
-    with pytest.raises(ValueError, match=words):
-        rig.enabled().core.command(action, rig.now_s, speed_mps)
-    rig.step(10)
-    assert rig.speed_mps == 0
 
 
 def fall_silent(rig):

@@ -12,12 +12,11 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.commands import run_command
 from hil_tests.testing.edge import Simulator
 from hil_tests.testing.messages import make_state
-from hil_tests.testing.vehicles import CAR, a_manifest
+from hil_tests.testing.vehicles import CAR, BrokenVehicle, a_manifest
 
 import edge_runtime
 from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mock import MockVehicle
