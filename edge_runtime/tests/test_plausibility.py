@@ -84,6 +84,29 @@ def test_silence_after_two_periods_also_before_the_first_report():
     assert watch.silent_at_s == pytest.approx(10.3 + 2 * T)
 
 
+FOLLOWING = [  # time, asked from then on, reported pedal, whether it brakes by itself, fault
+    (0.0, 1.0, -1.0, False, None),  # it has had no time to follow
+    (0.25, 1.0, -1.0, False, None),
+    (0.5, 1.0, 1.0, False, None),
+    (1.0, 0.0, 1.0, False, None),
+    (1.25, 0.0, 1.0, False, None),
+    (1.296875, 0.0, 1.0, False, None),  # 1.0 was still in force 0.3 s ago
+    (1.3125, 0.0, 1.0, False, None),  # no more
+    (1.40625, 0.0, 1.0, False, None),
+    (1.421875, 0.0, 1.0, False, Fault.STUCK),
+    (1.4375, 0.0, 1.0, True, None),  # it obeys no command: that is another fault, later
+    (1.453125, 0.0, 1.0, False, None),
+]
+
+
+def test_an_actuator_has_its_time_to_follow_and_none_while_it_brakes_by_itself():
+    watch = VehicleWatch(T, MockVehicle.limits)
+    for now_s, asked, pedal, brakes, fault in FOLLOWING:
+        watch.command({"pedal": asked}, now_s)
+        watch.report(report(pedal=pedal, self_braking=brakes), now_s)
+        assert watch.fault(now_s) is fault, now_s
+
+
 def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
     watch, now_s = watched(asked=0.6, pedal=0.6)
     watch.report(report(pedal=-1.0), now_s + TICK_S)
@@ -95,7 +118,7 @@ def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while()
 
 @pytest.mark.parametrize(
     ("reached", "fault"),
-    [(60.0, None), (45.1, None), (44.9, Fault.STUCK), (80.05, None), (81.0, Fault.LYING)],
+    [(60.0, None), (45.1, None), (44.9, Fault.STUCK), (80.05, None), (80.07, Fault.LYING)],
 )
 def test_what_is_far_from_what_was_asked_depends_on_the_actions_range(reached, fault):
     """An eighth of -40 to 80 is 15; a hundred revolutions are no lie of a wheel that makes them."""
