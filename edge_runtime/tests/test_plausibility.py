@@ -57,20 +57,29 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
     assert watch.fault(now_s + TICK_S) is fault
 
 
-def test_one_that_brakes_by_itself_while_it_is_to_drive_is_at_fault_once_it_could_be_enabled():
-    def live(braking, drives):
-        watch, said = VehicleWatch(T, MockVehicle.limits), {}
-        watch.enable(0.0)
-        for now_s in [round(tick * TICK_S, 3) for tick in range(60)]:
-            watch.command({"pedal": 0.0}, now_s, drives)
-            watch.report(report(self_braking=braking(now_s)), now_s)
-            said[now_s] = watch.fault(now_s)
-        return said
-
-    said = live(lambda now_s: True, True)
-    assert (said[1.2], said[1.25]) == (None, Fault.SELF_BRAKING)
-    assert set(live(lambda now_s: True, False).values()) == {None}
-    assert set(live(lambda now_s: now_s % 0.2 < 0.1, True).values()) == {None}
+@pytest.mark.parametrize(
+    ("brakes", "drives", "found_s"),
+    [
+        (lambda now_s: True, True, 1.75),  # from its 1 s to be enabled on
+        (lambda now_s: not 0.6 < now_s < 0.8, True, 1.05),  # it had been, from 0.8 s on
+        (lambda now_s: True, False, None),  # it is to brake
+        (lambda now_s: True, None, None),  # nobody has asked for anything yet
+        (lambda now_s: now_s % 0.2 < 0.1, True, None),
+    ],
+)
+def test_one_that_brakes_by_itself_while_it_is_to_drive_is_at_fault_once_it_could_be_enabled(
+    brakes, drives, found_s
+):
+    watch, said = VehicleWatch(T, MockVehicle.limits), []
+    for now_s in [round(tick * TICK_S, 3) for tick in range(60)]:
+        if now_s == 0.5:
+            watch.enable(now_s)
+        if drives is not None:
+            watch.command({"pedal": 0.0}, now_s, drives and now_s >= 0.5)
+        watch.report(report(self_braking=brakes(now_s)), now_s)
+        if watch.fault(now_s):
+            said.append((now_s, watch.fault(now_s)))
+    assert said[:1] == ([(found_s, Fault.SELF_BRAKING)] if found_s else [])
 
 
 def test_silence_after_two_periods_also_before_the_first_report():
