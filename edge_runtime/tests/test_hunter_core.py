@@ -200,17 +200,6 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
     assert (driving.core.cause, driving.core.words) == (None, "")
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("field", protocol.MotionStatus._fields)
-def test_no_more_than_the_model_can_do_with_three_tenths_is_believed(rig, field, sign):
-    most = {"speed_mps": SPEC.max_speed_mps, "inner_steering_rad": SPEC.max_inner_steering_rad}
-    for excess, lies in ((-0.001, False), (0.001, True)):
-        message = protocol.MotionStatus(0.0, 0.0)
-        message = message._replace(**{field: sign * (1.3 * most[field] + excess)})
-        rig.tell(protocol.MOTION_STATUS, message)
-        assert (rig.core.reports.lie() is not None) is lies
-
-
 def test_no_more_steering_is_reported_than_the_wheels_reach():
     rig = HunterRig("congestion", scale=0.02)
     rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(0.1, -0.7))

@@ -168,14 +168,6 @@ def test_a_runaway_is_found_at_any_scale_and_throttle(make, scale, pedal):
     assert rig.core.cause is Fault.STUCK
 
 
-def test_a_drive_with_a_lag_is_not_stuck(rig):
-    rig.enabled().obeys = False
-    for tick in range(1000):
-        rig.step(1, {"pedal": 1.0 if (tick // 150) % 2 == 0 else -1.0})
-        rig.speed_mps += (rig.core.set_point.speed_mps - rig.speed_mps) * STREAM_S / 0.3
-        assert rig.core.state is VehicleState.ENABLED, rig.words
-
-
 def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
     """Full throttle: 3 m/s2 of the car, a quarter of it on the Hunter; its top speed in the end."""
     report = rig.driving(1.0).report
@@ -207,16 +199,6 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(m
     rig.step(100, {"steering": 1.0}, scenario_speed_mps=0.0)
     assert rig.speed_mps == 0.0
     assert rig.inner_rad < -0.05
-
-
-def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig):
-    rig.driving().core.brake(rig.now_s, latch=False)
-    count = len(rig.asked)
-    rig.step(500)
-    assert set(rig.speeds(count)) == {0.0}
-    assert rig.core.state is VehicleState.ENABLED
-    rig.step(20, PEDAL)
-    assert rig.speed_mps > 0
 
 
 def fall_silent(rig):
