@@ -139,6 +139,13 @@ def test_what_is_far_from_what_was_asked_depends_on_the_actions_range(reached, f
     assert watch.fault(19 * TICK_S) is fault
 
 
+@pytest.mark.parametrize("reached", [1.0, -1.0, 1.1, -1.1])
+def test_an_action_that_the_vehicle_reports_beyond_its_limits_is_between_minus_one_and_one(reached):
+    watch, now_s = watched()
+    watch.report(VehicleReport({"pedal": 0.0, "lamp": reached}, 1.0, False, []), now_s)
+    assert watch.fault(now_s) is (Fault.LYING if abs(reached) > 1.0 else None)
+
+
 def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     watch, now_s = watched(speed_mps=1.0)
     # 0.5 m/s and 15 m/s2: up to 4.5, then 6.0
