@@ -67,21 +67,23 @@ class Vehicle(abc.ABC):
 
         Raises UserError for settings that are not valid, and where a port cannot be opened.
         """
-        return cls(**cls.arguments_of(settings, manifest))
+        bound = cls.arguments_of(settings, manifest)
+        return cls(*bound.args, **bound.kwargs)
 
     @classmethod
-    def arguments_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Mapping[str, Any]:
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
         """Return the constructor's arguments; by default the settings. Opens nothing.
 
         Raises UserError for settings that are not valid.
         """
         known = inspect.signature(cls)
         try:
-            known.bind(**settings)
+            return known.bind(**settings)
         except TypeError as error:
             names = ", ".join(known.parameters) or "none"
             raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
-        return settings
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> dict[str, ActionLimit]:

@@ -6,6 +6,7 @@ test with made-up times sees exactly what a process sees.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
@@ -54,7 +55,9 @@ class MockVehicle(Vehicle):
         self._latched = True  # until it is enabled
 
     @classmethod
-    def arguments_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Mapping[str, Any]:
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
         """Be as quick as the policy's car, where that is known and the settings do not say."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
@@ -62,7 +65,7 @@ class MockVehicle(Vehicle):
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
-        return {"parameters": parameters}
+        return inspect.signature(cls).bind(parameters)
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""

@@ -9,6 +9,7 @@ inherits the priority that the runtime gave the process.
 from __future__ import annotations
 
 import abc
+import inspect
 import threading
 import time
 from typing import TYPE_CHECKING, Any, Callable, ClassVar, Dict, Mapping, Optional, Type
@@ -45,13 +46,16 @@ class StreamedVehicle(Vehicle):
         self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
 
     @classmethod
-    def arguments_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Mapping[str, Any]:
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return {"settings": given, "similarity": given.similarity(cls.name, manifest)}
+        return inspect.signature(cls).bind(given, given.similarity(cls.name, manifest))
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        limits: Limits = cls.arguments_of(settings, manifest)["similarity"].limits()
+        _, similarity = cls.arguments_of(settings, manifest).args
+        limits: Limits = similarity.limits()
         return limits
 
     @property
