@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 import edge_runtime
 from edge_runtime.vehicles.core import (
     LEADS_TO,
-    STANDS_MPS,
     Speeds,
     VehicleEvent,
     VehicleState,
@@ -351,9 +350,9 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(
 def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
-    for speed_mps in (3.0, STANDS_MPS, -STANDS_MPS):
+    for speed_mps in (3.0, 0.02, -0.02, 0.0199):
         speeds.note(speed_mps, 0.0)
-        assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
+        assert (speeds.stands, speeds.acceleration_mps2()) == (speed_mps == 0.0199, 0.0)
 
 
 periods = st.floats(0.005, 0.1)

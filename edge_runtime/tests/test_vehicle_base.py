@@ -197,7 +197,7 @@ deeds = st.one_of(
 )
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(st.lists(deeds, max_size=20))
 def test_whatever_a_driver_raises_it_gets_no_drive_that_no_enable_has_allowed(story):
     vehicle = BrokenVehicle()
