@@ -171,7 +171,7 @@ class VehicleWatch:
         return False
 
     def _range(self, name: str) -> Tuple[float, float]:
-        """The range of an action; a vehicle may report more than it takes, in -1 to 1."""
+        """Return the range of an action; one that the vehicle does not take lies in -1 to 1."""
         limit = self._limits.get(name)
         return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
 

@@ -148,37 +148,37 @@ def advance(chassis: Chassis, event: ChassisEvent) -> Chassis:
 
 
 def take_can_mode(chassis: Chassis, now_s: float) -> Chassis:
-    """0x421 = 1. The time-out counts from the moment in which control changes hands."""
+    """Take 0x421 = 1: the time-out counts from the moment in which control changes hands."""
     after = advance(chassis, ChassisEvent.CAN_MODE)
     taken = after.control is Control.CAN and chassis.control is not Control.CAN
     return after._replace(commanded_s=now_s) if taken else after
 
 
 def take_command(chassis: Chassis, now_s: float) -> Chassis:
-    """0x111: noted whoever drives, obeyed where `obeys` says so."""
+    """Take 0x111: note it whoever drives; it is obeyed where `obeys` says so."""
     return advance(chassis, ChassisEvent.COMMAND)._replace(commanded_s=now_s)
 
 
 def take_time(chassis: Chassis, now_s: float, timeout_s: float) -> Chassis:
-    """What time alone does: the link counts as lost after ``timeout_s`` without a command."""
+    """Let time pass: the link counts as lost after ``timeout_s`` without a command."""
     late = now_s - chassis.commanded_s > timeout_s
     return advance(chassis, ChassisEvent.TIMEOUT) if late else chassis
 
 
 def take_cause(chassis: Chassis, name: str, present: bool) -> Chassis:
-    """The cause of an error comes or goes; an error that does not latch goes with it."""
+    """Let the cause of an error come or go; an error that does not latch goes with it."""
     causes = chassis.causes | {name} if present else chassis.causes - {name}
     kept = {error for error in chassis.errors if BITS[error].latches or error in causes}
     return _settle(chassis._replace(causes=causes, errors=causes | kept))
 
 
 def take_clear(chassis: Chassis) -> Chassis:
-    """0x441: forget every error whose cause is gone."""
+    """Take 0x441: forget every error whose cause is gone."""
     return _settle(chassis._replace(errors=chassis.causes))
 
 
 def obeys(chassis: Chassis) -> bool:
-    """Whether the body follows the set-point of the bus."""
+    """Return whether the body follows the set-point of the bus."""
     return (
         chassis.control is Control.CAN
         and chassis.condition is ChassisCondition.OK

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as codec
-from edge_runtime.vehicles.hunter.protocol import LINK_LOST, Sent, fault_bits
+from edge_runtime.vehicles.hunter.protocol import LINK_LOST, MotionCommand, Sent, fault_bits
 from edge_runtime.vehicles.mapping import clamp
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import (
@@ -97,7 +97,7 @@ TUNABLE = [field.name for field in fields(Parameters)]
 
 
 def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
-    """A model's row with some numbers replaced; UserError for a number that cannot be."""
+    """Return a model's row with some numbers replaced. Raises UserError for bad numbers."""
     for name, value in changes.items():
         if name not in TUNABLE:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
@@ -106,13 +106,6 @@ def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
             least = "at least" if may_be_zero else "above"
             raise UserError(f"parameter {name} must be {least} 0 and finite, not {value}")
     return replace(MODELS[model], **changes)
-
-
-class Setpoint(NamedTuple):
-    """What is asked of the body: speed, and the angle of the inner front wheel."""
-
-    speed_mps: float = 0.0
-    inner_rad: float = 0.0
 
 
 class Body(NamedTuple):
@@ -129,8 +122,10 @@ class Body(NamedTuple):
         return abs(self.speed_mps) < STANDS_MPS
 
 
-def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Parameters) -> Body:
-    """One integration step towards the set-point; None: the brake, with the steering held."""
+def advance(
+    body: Body, setpoint: MotionCommand | None, step_s: float, parameters: Parameters
+) -> Body:
+    """Integrate one step towards the set-point; None: brake, with the steering held."""
     p, inner_rad = parameters, body.inner_rad
     if setpoint is None:
         change_mps, rate_mps2 = -body.speed_mps, p.braking_mps2
@@ -138,7 +133,7 @@ def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Pa
         gap_mps = clamp(setpoint.speed_mps, p.max_speed_mps) - body.speed_mps
         change_mps = gap_mps * (1 - math.exp(-step_s / p.speed_time_constant_s))
         rate_mps2 = p.braking_mps2 if body.speed_mps * change_mps < 0 else p.acceleration_mps2
-        turn_rad = clamp(setpoint.inner_rad, p.max_inner_rad) - body.inner_rad
+        turn_rad = clamp(setpoint.inner_steering_rad, p.max_inner_rad) - body.inner_rad
         inner_rad += clamp(turn_rad, p.steering_rate_radps * step_s)
     speed_mps = body.speed_mps + clamp(change_mps, rate_mps2 * step_s)
     steering_radps = (inner_rad - body.inner_rad) / step_s
@@ -147,7 +142,7 @@ def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Pa
 
 
 def roll(body: Body, step_s: float, parameters: Parameters) -> Body:
-    """The way of the rear wheels at the present speed; in a turn the outer one covers more."""
+    """Roll at the present speed; in a turn the outer rear wheel covers more."""
     half = curvature(body.inner_rad, parameters) * parameters.track_m / 2
     way_m = body.speed_mps * step_s
     return body._replace(
@@ -156,7 +151,7 @@ def roll(body: Body, step_s: float, parameters: Parameters) -> Body:
 
 
 def curvature(inner_rad: float, parameters: Parameters) -> float:
-    """Of the rear axle's middle, 1/m: the inner wheel's radius is half a track shorter (Ackermann).
+    """Return the curvature of the rear axle's middle, 1/m, for an inner wheel's angle (Ackermann).
 
     radius = wheelbase / tan(inner) + track / 2
     """
@@ -175,15 +170,15 @@ class MockHunter:
         self.next_s = now_s  # When `due` must be called next
         self._parameters, self._profile = parameters, profile
         self._now_s = now_s
-        self._under_way: deque[tuple[float, Setpoint]] = deque()
-        self._setpoint = Setpoint()
+        self._under_way: deque[tuple[float, MotionCommand]] = deque()
+        self._setpoint = MotionCommand(0.0, 0.0)
         self._tick = 0
         self._fast: list[Sent] = []
         self._slow: list[Sent] = []
         self._outgoing: deque[tuple[float, Sent]] = deque()
 
     def describe(self) -> str:
-        """Where it stands in one line that only changes when something happens."""
+        """Describe its state in a line that only changes when something happens."""
         return (
             f"control={self.chassis.control.value} condition={self.chassis.condition.value}"
             f" brake={'locked' if self.chassis.brake_locked else 'released'}"
@@ -192,15 +187,15 @@ class MockHunter:
         )
 
     def receive(self, can_id: int, data: bytes, now_s: float) -> None:
-        """A frame of the bus; one that the chassis does not know, or of a wrong length, is none."""
+        """Take a frame of the bus; ignore unknown ones, and those of a wrong length."""
         self.advance(now_s)
         message = codec.decode(can_id, data)
         if message is None or "bus_off" in self.faults:
             return
-        if isinstance(message, codec.MotionCommand):
+        if isinstance(message, MotionCommand):
             right_rad = -self._parameters.max_inner_rad
             inner_rad = right_rad if "full_lock" in self.faults else message.inner_steering_rad
-            asked = Setpoint(message.speed_mps, inner_rad)
+            asked = MotionCommand(message.speed_mps, inner_rad)
             self.chassis = rules.take_command(self.chassis, now_s)
             self._under_way.append((now_s + self._parameters.dead_time_s, asked))
         elif isinstance(message, codec.ModeCommand):
@@ -223,7 +218,7 @@ class MockHunter:
             self.chassis = rules.advance(self.chassis, event)
 
     def due(self, now_s: float) -> list[Sent]:
-        """The frames to send now. After a pause one report, not one for each missed period."""
+        """Return the frames to send now; after a pause one report, not one a missed period."""
         self.advance(now_s)
         if now_s >= self.next_s:
             self._report(now_s)
@@ -246,7 +241,7 @@ class MockHunter:
                 self._setpoint = self._under_way.popleft()[1]
             if not rules.obeys(self.chassis):
                 # Where control comes back, it does so from a stand, not with what was asked before.
-                self._setpoint = Setpoint(0.0, self.body.inner_rad)
+                self._setpoint = MotionCommand(0.0, self.body.inner_rad)
                 self.body = advance(self.body, None, step_s, p)
             elif "stuck" in self.faults:
                 self.body = roll(self.body, step_s, p)
@@ -267,7 +262,7 @@ class MockHunter:
         self._outgoing.extend((release_s, frame) for frame in frames)
 
     def _fast_frames(self) -> list[Sent]:
-        """0x221 and 0x251 to 0x253: every 20 ms."""
+        """Make 0x221 and 0x251 to 0x253: every 20 ms."""
         body, p = self.body, self._parameters
         speed_mps = body.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
         found = [codec.MOTION_STATUS.sent(codec.MotionStatus(speed_mps, body.inner_rad))]
@@ -285,7 +280,7 @@ class MockHunter:
         return found
 
     def _slow_frames(self) -> list[Sent]:
-        """0x211 and 0x261 to 0x263: every 100 ms."""
+        """Make 0x211 and 0x261 to 0x263: every 100 ms."""
         chassis, errors = self.chassis, self.chassis.errors
         words = [BITS[error].words for error in errors]
         words += [LINK_LOST] if chassis.control is Control.LINK_LOST else []

@@ -240,7 +240,7 @@ def _floats(value: Any) -> Iterator[float]:
 
 
 def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
-    """`linear.x` in m/s; `angular.z` is the yaw rate (rad/s), or the steering angle (rad).
+    """Return `linear.x` in m/s, and `angular.z` as yaw rate (rad/s) or steering angle (rad).
 
     A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
     """

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter.protocol import MotionCommand
 from edge_runtime.vehicles.mapping import SPECS
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import ChassisCondition, ChassisEvent, Control
@@ -17,7 +18,6 @@ from hil_tests.mock_hunter.hunter import (
     MODELS,
     Body,
     MockHunter,
-    Setpoint,
     advance,
     curvature,
     make_parameters,
@@ -86,7 +86,7 @@ def test_the_tables_stand_in_the_readme_and_every_pair_of_state_and_event_in_one
 
 
 P = MODELS["hunter-2.0"]
-setpoints = st.builds(Setpoint, st.floats(-3, 3), st.floats(-1, 1))
+setpoints = st.builds(MotionCommand, st.floats(-3, 3), st.floats(-1, 1))
 bodies = st.builds(
     Body, st.floats(-P.max_speed_mps, P.max_speed_mps), st.floats(-P.max_inner_rad, P.max_inner_rad)
 )
@@ -118,9 +118,9 @@ def settle(setpoint, seconds, body=None, step_s=0.005):
 
 def test_speed_covers_63_percent_in_its_time_constant_and_the_steering_turns_at_its_rate():
     small = 0.05  # below the rate limit, so that the lag alone is seen
-    slow = settle(Setpoint(small), P.speed_time_constant_s)
+    slow = settle(MotionCommand(small, 0.0), P.speed_time_constant_s)
     assert slow.speed_mps == pytest.approx(small * (1 - math.exp(-1)), rel=1e-9)
-    turned_rad = settle(Setpoint(0.0, 0.5), 0.3).inner_rad
+    turned_rad = settle(MotionCommand(0.0, 0.5), 0.3).inner_rad
     assert turned_rad == pytest.approx(0.3 * P.steering_rate_radps, rel=1e-9)
 
 
@@ -129,7 +129,7 @@ def test_the_path_of_an_inner_angle_by_hand_and_its_outer_wheel_covers_more():
     radius_m, half_m = 1.83990, P.track_m / 2
     assert 1 / curvature(0.4, P) == pytest.approx(radius_m, abs=1e-4)
     assert (curvature(-0.4, P), curvature(0.0, P)) == (-curvature(0.4, P), 0.0)
-    body = settle(Setpoint(1.0, 0.4), 2.0, settle(Setpoint(0.0, 0.4), 1.0))
+    body = settle(MotionCommand(1.0, 0.4), 2.0, settle(MotionCommand(0.0, 0.4), 1.0))
     assert body.right_m > body.left_m > 0  # a turn to the left
     ratio = (radius_m + half_m) / (radius_m - half_m)
     assert body.right_m / body.left_m == pytest.approx(ratio, abs=1e-4)
