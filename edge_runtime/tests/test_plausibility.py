@@ -148,9 +148,9 @@ def test_an_action_that_the_vehicle_reports_beyond_its_limits_is_between_minus_o
 
 def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     watch, now_s = watched(speed_mps=1.0)
-    # 0.5 m/s and 15 m/s2: up to 4.5, then 6.0
-    for after_s, fault in ((0.2, Fault.LYING), (0.3, None)):
-        watch.report(report(speed_mps=5.0), now_s + after_s)
+    # 0.5 m/s and 15 m/s2 from the last speed that was believed: up to 4.5, 7.5, then 9.75
+    for after_s, fault in ((0.2, Fault.LYING), (0.4, Fault.LYING), (0.55, None)):
+        watch.report(report(speed_mps=9.0), now_s + after_s)
         assert watch.fault(now_s + after_s) is fault
 
 
