@@ -51,7 +51,7 @@ _LOOPBACK = "lo"
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 _SYNTAX = {
     "socketcan": f"{DEFAULT_BUS}; its bit rate is set by `ip link`",
-    UDP: f"{MULTICAST_BUS}, an IPv4 multicast group and a port",
+    UDP: MULTICAST_BUS,
     "": "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0",
 }
 _ADVICE = {
@@ -87,7 +87,8 @@ def parse_bus(text: str) -> BusName:
     elif interface != "socketcan" and interface and name and count:
         return BusName(interface, name, count)
     syntax = _SYNTAX.get(interface, _SYNTAX[""])
-    raise UserError(f"bus {text!r} is no CAN bus: write it as {syntax}")
+    kind = "IPv4 multicast group and port" if interface == UDP else "CAN bus"
+    raise UserError(f"bus {text!r} is no {kind}: write it as {syntax}")
 
 
 def open_bus(name: BusName) -> Any:
