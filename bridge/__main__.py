@@ -13,7 +13,7 @@ COMMANDS = {
     "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
     "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and go on in another way"),
     "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
-    "view": ("bridge.rerun.command:view", "show the wire in rerun, live or in a file"),
+    "view": ("bridge.rerun:view", "show the wire in rerun, live or in a file"),
 }
 main = program(
     "python -m bridge",
