@@ -27,7 +27,7 @@ from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import trained_in
 from trainer.human.guide import Action, Driver, Observation
 from trainer.options import set_threads
-from trainer.person.coach import Coach, Episode
+from trainer.person.coach import Coach, SittingEpisode
 from trainer.person.controls import controls_of
 from trainer.person.interface import (
     Amount,
@@ -265,7 +265,7 @@ class Sitting:
         period_s = self.env.control_period_s
         driven_s = self._human_steps * period_s
         since_s = (self._number - self._taken_over_at) * period_s
-        episode = Episode(self.episode, told, driven_s, self._interventions, since_s)
+        episode = SittingEpisode(self.episode, told, driven_s, self._interventions, since_s)
         self.coach.episodes.append(episode)
         if self._discard:
             self.discarded += 1

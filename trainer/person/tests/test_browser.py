@@ -24,7 +24,7 @@ from hil_tests.testing.browser import (
 )
 from hil_tests.testing.environments import ROVER
 from hil_tests.testing.people import LET_GO
-from trainer.person.coach import Coaching, Episode, advise
+from trainer.person.coach import Coaching, SittingEpisode, advise
 from trainer.person.web import VIEWS_UNDERWAY, Cockpit
 
 pytestmark = pytest.mark.usefixtures("opened")
@@ -182,7 +182,7 @@ async def test_a_finger_on_the_pad_drives(browser, cockpit):
 
 TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 768), (768, 1024)]
 """Phones and tablets, either way up."""
-LONG_ADVICE = advise([Episode(0, "collision", 0.0, 0)] * 10, None, {})
+LONG_ADVICE = advise([SittingEpisode(0, "collision", 0.0, 0)] * 10, None, {})
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
@@ -343,7 +343,7 @@ async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpi
     coach = Coaching(
         advice="Watch only.", said="42 s at the wheel", alone="94%", human_s=42.0,
         curve=[(5.0, 0.2), (30.0, 0.94)], typical=[(10.0, 0.5), (28.0, 0.9)],
-        episodes=[Episode(6, "collision", 0.0, 0), Episode(7, "goal", 2.25, 1, 1.5)],
+        episodes=[SittingEpisode(6, "collision", 0.0, 0), SittingEpisode(7, "goal", 2.25, 1, 1.5)],
     )  # fmt: skip
     cockpit.show(replace(first_view(), coach=coach))
     await until(browser, "document.getElementById('advice').textContent === 'Watch only.'")
