@@ -287,7 +287,7 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
         else:
             time.sleep(0.3)
             assert not recording.exists()
-            view.process.send_signal(signal.SIGTERM)
+            view.send(signal.SIGTERM)
         assert view.wait(20) == 0, view.errors
     found = verify(recording)
     entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
