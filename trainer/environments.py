@@ -23,7 +23,7 @@ from bridge.report import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason
-from trainer.learner.replay import Layout
+from trainer.learner.replay import ReplayLayout
 from trainer.scenarios import SCENARIOS, Scene
 from trainer.util import PERIOD_S
 
@@ -312,7 +312,7 @@ def _said(info: Mapping[str, Any]) -> dict[str, Any]:
     return unknown | {key: value for key, value in info.items() if value is not None}
 
 
-def _layout(task: Task, several: bool) -> Layout:
+def _layout(task: Task, several: bool) -> ReplayLayout:
     entries = [(name, np.dtype(e.dtype), tuple(e.shape)) for name, e in task.observation.items()]
     (_, dtype, shape), *_ = entries
-    return Layout((), np.dtype(entries)) if several else Layout(shape, dtype)
+    return ReplayLayout((), np.dtype(entries)) if several else ReplayLayout(shape, dtype)

@@ -41,7 +41,7 @@ from trainer.human.config import HumanModelConfig
 from trainer.human.model import HumanModel
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
-from trainer.learner.replay import Layout, ReplayBuffer
+from trainer.learner.replay import ReplayBuffer, ReplayLayout
 from trainer.learner.td3 import TD3Learner
 from trainer.person import session
 from trainer.person.controls import controls_of
@@ -174,7 +174,7 @@ def test_an_observation_is_one_array_and_an_action_has_one_scale():
 def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space):
     env: Any = Rover()
     env.observation_space = space
-    layout: Layout = Adapted(env, "any").layout
+    layout: ReplayLayout = Adapted(env, "any").layout
     random, buffer = np.random.default_rng(0), ReplayBuffer(50, 2, steps=3, layout=layout)
     size = layout.dtype.itemsize * int(np.prod(layout.shape))
     seen = np.frombuffer(random.bytes(41 * size), np.uint8) & 63  # no float that is not finite

@@ -19,7 +19,7 @@ from edge_runtime.util import UserError
 from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.networks import FRAMES_SPACE
-from trainer.learner.replay import FRAMES_LAYOUT, Batch, Layout, ReplayBuffer
+from trainer.learner.replay import FRAMES_LAYOUT, Batch, ReplayBuffer, ReplayLayout
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.util import Purpose, random_stream
 
@@ -46,7 +46,7 @@ class LearningThread:
         action_size: int,
         device: str = "cpu",
         space: Space[Any] = FRAMES_SPACE,
-        layout: Layout = FRAMES_LAYOUT,
+        layout: ReplayLayout = FRAMES_LAYOUT,
     ) -> None:
         self.config = config
         self.learner = TD3Learner(config, algorithm, seed, action_size, device, space)
