@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,6 +113,7 @@ class ShownEpisode(NamedTuple):
 
     last_step: int
     metrics: EpisodeMetrics
+    has_road: bool = True
 
 
 Entry = ShownStep | ShownEpisode
@@ -141,78 +142,67 @@ def run(arguments: argparse.Namespace) -> int:
         next(read_steps(path), None)
     blueprint = make_blueprint(None, SITTINGS)
     with open_sink(sink, SITTING_APPLICATION, blueprint, arguments.port) as recording:
-        log, shown = TrainingLog(recording, SITTINGS), Sittings()
-        for entry in shown.entries(paths):
+        log, ends = TrainingLog(recording, SITTINGS), list[ShownEpisode]()
+        for entry in sitting_entries(paths):
             log.draw(entry)
+            if isinstance(entry, ShownEpisode):
+                ends.append(entry)
         flush(recording)
-        road = f"; {shown.without_road} without their road" if shown.without_road else ""
-        print(
-            f"{counted(shown.episodes, 'episode')}, {counted(shown.steps, 'step')}, "
-            f"{shown.human_steps} of them the person's{road}",
-            flush=True,
-        )
+        steps = sum(end.metrics.steps for end in ends)
+        human_steps = sum(end.metrics.human_steps for end in ends)
+        line = f"{counted(len(ends), 'episode')}, {counted(steps, 'step')}, "
+        line += f"{human_steps} of them the person's"
+        if roadless := sum(not end.has_road for end in ends):
+            line += f"; {roadless} without their road"
+        print(line, flush=True)
         with suppress(KeyboardInterrupt):
             while sink == SERVE:
                 time.sleep(LOOK_S)
     return 0
 
 
-class Sittings:
-    """The entries of recorded sittings, and what they amount to."""
-
-    def __init__(self) -> None:
-        self.steps = self.human_steps = self.episodes = 0
-        self.without_road = 0
-        """Episodes whose scenario drives differently today: their road is not shown."""
-        self._environment = cache(make_environment)
-
-    def entries(self, paths: Iterable[Path]) -> Iterator[Entry]:
-        """Yield everything in these recordings, end to end."""
-        for path in paths:
-            for _, steps in groupby(read_steps(path), key=lambda step: step.episode):
-                yield from self._episode(list(steps))
-
-    def _episode(self, episode: list[Step]) -> Iterator[Entry]:
-        road = self._drive_again(episode)
-        for number, step in enumerate(episode):
-            scene = road[number] if road else None
-            yield of_sitting(self.steps, step)._replace(frames=step.observation, scene=scene)
-            self.steps += 1
-        human_steps = sum(step.human for step in episode)
+def sitting_entries(paths: Iterable[Path]) -> Iterator[Entry]:
+    """Yield everything in these recordings, end to end."""
+    environment, total_steps = cache(make_environment), 0
+    recorded = (groupby(read_steps(path), key=lambda step: step.episode) for path in paths)
+    for number, (_, steps) in enumerate(chain.from_iterable(recorded)):
+        episode = list(steps)
+        road = _drive_again(episode, environment)
+        for step, scene in zip(episode, road or [None] * len(episode), strict=True):
+            yield of_sitting(total_steps, step)._replace(frames=step.observation, scene=scene)
+            total_steps += 1
         known: dict[str, Any] = {
-            "episode": self.episodes,
-            "total_steps": self.steps,
+            "episode": number,
+            "total_steps": total_steps,
             "steps": len(episode),
             "episode_return": sum(step.reward for step in episode),
             "outcome": episode[-1].outcome or "cut off",
             "interventions": sum(step.first for step in episode),
-            "human_steps": human_steps,
+            "human_steps": sum(step.human for step in episode),
         }
         # What only a learner knows is nan.
         metrics = EpisodeMetrics(**{**dict.fromkeys(NAMES, math.nan), **known})
-        yield ShownEpisode(self.steps - 1, metrics)
-        self.human_steps += human_steps
-        self.without_road += not road
-        self.episodes += 1
+        yield ShownEpisode(total_steps - 1, metrics, bool(road))
 
-    def _drive_again(self, episode: list[Step]) -> list[Any]:
-        """Drive with the same seed and actions; the scene at each step, none where it differs."""
-        first, scenes = episode[0], []
-        module = first.scenario.rpartition(":")[0]
-        # Its beginning was in another file, which is gone; or no file decides what is imported.
-        if first.step != 0 or (module and module not in sys.modules):
+
+def _drive_again(episode: list[Step], environment: Callable[[str], Any]) -> list[Any]:
+    """Drive with the same seed and actions; the scene at each step, none where it differs."""
+    first, scenes = episode[0], []
+    module = first.scenario.rpartition(":")[0]
+    # Its beginning was in another file, which is gone; or no file decides what is imported.
+    if first.step != 0 or (module and module not in sys.modules):
+        return []
+    try:
+        env = environment(first.scenario)
+    except UserError:  # It is not installed here.
+        return []
+    observation, _ = env.reset(seed=first.seed)
+    for step in episode:
+        if not np.array_equal(observation, step.observation):
             return []
-        try:
-            env = self._environment(first.scenario)
-        except UserError:  # It is not installed here.
-            return []
-        observation, _ = env.reset(seed=first.seed)
-        for step in episode:
-            if not np.array_equal(observation, step.observation):
-                return []
-            scenes.append(_scene(env))
-            observation, *_ = env.step(vector(step.action))
-        return scenes
+        scenes.append(_scene(env))
+        observation, *_ = env.step(vector(step.action))
+    return scenes
 
 
 def _scene(env: Any) -> Any:

@@ -50,7 +50,7 @@ from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting, drive
 from trainer.person.web import encode_view
 from trainer.training.delayed import VehicleEnd
-from trainer.view import ShownStep, Sittings
+from trainer.view import ShownStep, sitting_entries
 
 
 @pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
@@ -442,7 +442,7 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
     assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
     assert np.isfinite(model.learn(2))
-    first, *_ = Sittings().entries([sitting.recorder.path])
+    first, *_ = sitting_entries([sitting.recorder.path])
     assert isinstance(first, ShownStep)
     assert isinstance(first.scene, np.ndarray)
     assert first.scene.shape == (8, 8, 3)

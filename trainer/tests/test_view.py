@@ -260,11 +260,11 @@ def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_p
     steps = list(read_steps(drive(tmp_path)))
     for number in range(7 if "seen" in change else 0, 15):
         steps[number] = msgspec.structs.replace(steps[number], **change)
-    shown = view.Sittings()
-    entries = list(shown.entries([record(tmp_path, steps)]))
+    entries = list(view.sitting_entries([record(tmp_path, steps)]))
     scenes = [entry.scene is not None for entry in entries if isinstance(entry, ShownStep)]
     assert scenes == [False] * 15 + [True] * 15
-    assert shown.without_road == 1
+    roads = [entry.has_road for entry in entries if isinstance(entry, view.ShownEpisode)]
+    assert roads == [False, True]
 
 
 def test_a_scene_that_is_no_longer_known_is_cleared(monkeypatch):
@@ -278,7 +278,7 @@ def test_a_scene_that_is_no_longer_known_is_cleared(monkeypatch):
 
 
 def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
-    entries: list[Any] = list(view.Sittings().entries([drive(tmp_path, (4,), policy=None)]))
+    entries: list[Any] = list(view.sitting_entries([drive(tmp_path, (4,), policy=None)]))
     *steps, end = entries
     assert all(math.isnan(step.policy_action) for step in steps)
     found = end.metrics
