@@ -216,18 +216,6 @@ def _scene(env: Any) -> Any:
 @contextmanager
 def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], None]]:
     """Show a run for as long as it lasts; call what is yielded after each episode."""
-    number, pace = run.steps - 1, Pace(draw.PICTURE_INTERVAL_S)
-
-    def on_step(seen: Seen) -> None:
-        nonlocal number
-        number += 1
-        step = of_training(number, seen)
-        if pace.due(time.monotonic()):
-            step = step._replace(frames=seen.observation, scene=_scene(run.env))
-        background.put(step)
-
-    def on_episode(metrics: EpisodeMetrics) -> None:
-        background.put(ShownEpisode(max(number, 0), metrics))
 
     @contextmanager
     def opened() -> Iterator[Draw]:
@@ -238,14 +226,35 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
 
     with sigterm_as_interrupt():  # Here, as signals are the main thread's.
         background = Background(opened)
-        run.on_step = on_step
+        watcher = Watcher(run, background.put)
+        run.on_step = watcher.on_step
         try:
-            yield on_episode
+            yield watcher.on_episode
         finally:
             run.on_step = None
             background.close()
             if background.dropped:
                 print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
+
+
+class Watcher:
+    """Watches one run; ``put`` takes what is to be drawn, and must not block."""
+
+    def __init__(self, run: TrainingRun, put: Draw) -> None:
+        self._run, self._put, self._steps = run, put, run.steps
+        self._pace = Pace(draw.PICTURE_INTERVAL_S)
+
+    def on_step(self, seen: Seen) -> None:
+        """Hand a step over, with pictures where they are due."""
+        step = of_training(self._steps, seen)
+        self._steps += 1
+        if self._pace.due(time.monotonic()):
+            step = step._replace(frames=seen.observation, scene=_scene(self._run.env))
+        self._put(step)
+
+    def on_episode(self, metrics: EpisodeMetrics) -> None:
+        """Hand an episode's end over."""
+        self._put(ShownEpisode(max(self._steps - 1, 0), metrics))
 
 
 class Background:

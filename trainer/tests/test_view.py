@@ -97,15 +97,9 @@ def test_the_view_holds_the_run(shown):
     assert {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)} == view.DRIVERS
 
 
-@pytest.fixture
-def watching(monkeypatch):
-    """What a view is handed, and the run that hands it over; its environment has no scene."""
-    handed: list[Any] = []
-    background = SimpleNamespace(put=handed.append, close=Mock(), dropped=0)
-    monkeypatch.setattr(view, "Background", lambda opened: background)
-    run: Any = SimpleNamespace(steps=40, env=SimpleNamespace(scene=lambda: {"roads": []}))
-    with view.watched(run, "unused.rrd"):
-        yield handed, run
+def looking_on(handed, scene=lambda: {"roads": []}):
+    run: Any = SimpleNamespace(steps=40, env=SimpleNamespace(scene=scene))
+    return view.Watcher(run, handed.append)
 
 
 def control_period():
@@ -116,20 +110,19 @@ def control_period():
 @pytest.mark.parametrize(
     "scene", [lambda: 1 / 0, lambda: {"path": [[1.0]]}, lambda: {"road_width_m": float("nan")}]
 )
-def test_a_scene_that_fails_is_not_shown_and_ends_no_training(scene, watching):
-    handed, run = watching
-    run.env.scene = scene
-    run.on_step(control_period())
+def test_a_scene_that_fails_is_not_shown_and_ends_no_training(scene):
+    handed: list[Any] = []
+    looking_on(handed, scene).on_step(control_period())
     assert handed[0].frames is not None
     assert handed[0].scene is None
 
 
-def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(watching, monkeypatch):
-    handed, run = watching
-    now_s = [100.0]
+def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
+    handed: list[Any] = []
+    watcher, now_s = looking_on(handed), [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     for _ in range(1007):  # Two seconds at 500 steps a second.
-        run.on_step(control_period())
+        watcher.on_step(control_period())
         now_s[0] += 0.002
     assert [step.number for step in handed] == list(range(40, 1047))
     assert sum(step.frames is not None for step in handed) == pytest.approx(20, abs=2)
