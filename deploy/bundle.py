@@ -118,11 +118,12 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
     check_writable(out / "bundle.tar")
     collect(inputs, target)
     with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         if more:  # pip refuses those that do not fit the target.
-            _download(target, Path(place), "--no-index", *map(str, more))
-        wheels = gather(target, lock_path(target), arguments.wheels / target.name)
-        edge = build_edge_wheel(Path(place))
-        path, manifest = make_bundle(inputs._replace(wheels=[*more, *wheels, edge]), target, out)
+            _download(target, folder, "--no-index", *map(str, more))
+        build_edge_wheel(folder)
+        wheels = gather(target, lock_path(target), arguments.wheels / target.name, folder)
+        path, manifest = make_bundle(inputs._replace(wheels=wheels), target, out)
     print(f"{path}  ({path.stat().st_size / 1e6:.1f} MB), signed by {path.name}.sig")
     print(f"version {manifest.version}, for {manifest.vehicle_id}, {target} or newer")
     return 0
@@ -289,30 +290,23 @@ def lock_path(target: Target) -> Path:
     return ROOT / f"requirements/bundle-{target.name}.txt"
 
 
-def read_lock(path: Path) -> dict[str, str]:
-    """The SHA-256 of each wheel of a lock, by NAME==VERSION."""
-    lines = read_bytes(path, "lock").decode().splitlines()
-    pins = [line for line in lines if line.strip() and not line.startswith("#")]
-    return dict(line.strip().split(" --hash=sha256:") for line in pins)
+def gather(target: Target, lock: Path, kept: Path, place: Path) -> list[Path]:
+    """Bring the lock's wheels to `place`, by way of the folder where they are kept.
 
-
-def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
-    """The lock's wheels in `folder`, in the lock's order; pip fetches what is missing."""
-    pins = read_lock(lock)
-    if not set(pins.values()) <= _by_hash(folder).keys():
-        _download(target, folder, "--require-hashes", "--requirement", str(lock))
-    found = _by_hash(folder)
-    return [found[sha256] for sha256 in pins.values()]
-
-
-def _by_hash(folder: Path) -> dict[str, Path]:
-    wheels = folder.glob("*.whl")
-    return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
+    pip checks every hash, and asks an index only where a wheel is missing.
+    """
+    make_directory(kept)
+    locked = ("--require-hashes", "--requirement", str(lock), "--find-links", str(kept))
+    try:
+        _download(target, place, "--no-index", *locked)
+    except UserError:
+        _download(target, kept, *locked)
+        _download(target, place, "--no-index", *locked)
+    return sorted(place.glob("*.whl"))
 
 
 def _download(target: Target, folder: Path, *wanted: str) -> None:
     """Let pip bring wheels for another computer. Raises UserError with pip's own line."""
-    make_directory(folder)
     newest = int(target.glibc.split(".")[1])
     tags = [*(f"manylinux_2_{minor}" for minor in range(newest + 1)), "manylinux1", "manylinux2010",
             "manylinux2014", "linux"]  # fmt: skip
@@ -357,14 +351,18 @@ def _add_lock_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_lock(arguments: argparse.Namespace) -> int:
     """Download each NAME==VERSION of the lock and write the hash of its wheel beside it."""
-    path = lock_path(TARGETS[arguments.target])
-    text = path.read_text()
-    for pin, sha256 in read_lock(path).items():
-        with tempfile.TemporaryDirectory() as place:
-            _download(TARGETS[arguments.target], Path(place), pin)
-            (found,) = _by_hash(Path(place))
-        text = text.replace(f"{pin} --hash=sha256:{sha256}", f"{pin} --hash=sha256:{found}")
-    write_atomic(path, text.encode())
+    target = TARGETS[arguments.target]
+    path = lock_path(target)
+    lines = path.read_text().splitlines()
+    for number, line in enumerate(lines):
+        if "==" in line and not line.startswith("#"):
+            pin = line.split()[0]
+            with tempfile.TemporaryDirectory() as place:
+                _download(target, Path(place), pin)
+                (wheel,) = Path(place).iterdir()
+                digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+            lines[number] = f"{pin} --hash=sha256:{digest}"
+    write_atomic(path, ("\n".join(lines) + "\n").encode())
     print(path)
     return 0
 

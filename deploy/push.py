@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
     # What the board would refuse is not sent.
     key = read_public_key(arguments.trust)
-    manifest = read_bundle(arguments.bundle, key).manifest
+    manifest, _ = read_bundle(arguments.bundle, key)
     python, folder = f"python{manifest.target.python}", f"phil-push-{manifest.version}"
     install = [
         *([] if arguments.no_sudo else ["sudo", "-n"]),

@@ -167,15 +167,15 @@ class Installer:
         """
         releases = self._releases
         key = trusted_key(releases, trust)
-        bundle = read_bundle(bundle_path, key)
-        version = bundle.manifest.version
-        _say(f"verified {version} for {bundle.manifest.vehicle_id}")
-        check_fits(bundle.manifest.target)
+        manifest, files = read_bundle(bundle_path, key)
+        version = manifest.version
+        _say(f"verified {version} for {manifest.vehicle_id}")
+        check_fits(manifest.target)
         with releases.locked():
             if not releases.trusted.exists():
                 write_atomic(releases.trusted, key)
             if releases.damage(version):
-                releases.unpack(bundle)
+                releases.unpack(version, files)
                 _say(f"unpacked {releases.folder(version)}")
             self.activate(version, limits)
         return version

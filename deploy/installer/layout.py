@@ -35,7 +35,6 @@ import zipfile
 from pathlib import Path
 from typing import Iterator
 
-from deploy.installer.verify import Bundle
 from edge_runtime.util import UserError, read_json
 
 DEFAULT_ROOT = "/opt/phil"
@@ -171,11 +170,11 @@ class Releases:
         found = hashes(self.folder(version))
         return sorted(p for p in wanted.keys() | found.keys() if wanted.get(p) != found.get(p))
 
-    def unpack(self, bundle: Bundle) -> None:
-        """Make a release: its folder gets its name when all of it is on the disk."""
-        folder = self.folder(bundle.manifest.version)
+    def unpack(self, version: str, files: dict[str, bytes]) -> None:
+        """Make a release of a bundle's files: it gets its name when all of it is on the disk."""
+        folder = self.folder(version)
         draft, damaged = (folder.with_name(f".{kind}") for kind in ("draft", "damaged"))
-        _fill(bundle, draft, folder)
+        _fill(files, draft, folder)
         _write(draft / CONTENTS, json.dumps(hashes(draft), indent=0).encode())
         os.sync()
         if folder.exists():
@@ -218,10 +217,10 @@ def hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def _fill(bundle: Bundle, draft: Path, folder: Path) -> None:
+def _fill(files: dict[str, bytes], draft: Path, folder: Path) -> None:
     """Write all files of a release into `draft`, which will be called `folder`."""
     draft.mkdir(mode=0o755)
-    for path, data in bundle.files.items():
+    for path, data in files.items():
         if path.startswith(WHEELS):
             unpack_wheel(data, draft / SITE)
         else:

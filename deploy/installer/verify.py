@@ -59,15 +59,8 @@ class BundleManifest(NamedTuple):
     policy_id: str
 
 
-class Bundle(NamedTuple):
-    """A verified bundle: its manifest, and the bytes of each file by its path."""
-
-    manifest: BundleManifest
-    files: dict[str, bytes]
-
-
-def read_bundle(path: str, public_key: bytes) -> Bundle:
-    """Read a bundle that the owner of `public_key` (PEM) has signed.
+def read_bundle(path: str, public_key: bytes) -> tuple[BundleManifest, dict[str, bytes]]:
+    """Read a bundle that the owner of `public_key` (PEM) has signed: manifest, and files by path.
 
     It is read once, verified and used from memory, so nobody can change it in between.
     Raises UserError, having written nothing.
@@ -77,7 +70,7 @@ def read_bundle(path: str, public_key: bytes) -> Bundle:
     try:
         _check_signature(data, signature, ssh_key(public_key))
         files = _unpack(data)
-        return Bundle(parse_manifest(files.get(MANIFEST, b"")), files)
+        return parse_manifest(files.get(MANIFEST, b"")), files
     except UserError as error:
         raise UserError(f"bundle {path} is refused: {error}") from None
 

@@ -1,6 +1,8 @@
 """What goes into a bundle, that it is the same again, and its wheels."""
 
+import hashlib
 import os
+import re
 import shutil
 import stat
 import tarfile
@@ -23,7 +25,6 @@ from deploy.bundle import (
     lock_path,
     make_bundle,
     pip,
-    read_lock,
 )
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
@@ -78,7 +79,7 @@ def test_a_whole_bundle_is_the_same_again_and_the_boards_is_small(workshop, tmp_
     """With every wheel: pip's index is needed the first time."""
     target, policy = TARGETS[name], ROOT / "results/policies/left_turn.onnx"
     try:
-        wheels = gather(target, lock_path(target), ROOT / DEFAULT_FOLDER / name)
+        wheels = gather(target, lock_path(target), ROOT / DEFAULT_FOLDER / name, tmp_path)
     except UserError as error:
         if "No matching distribution" in str(error):
             pytest.skip("no package index can be reached")
@@ -214,30 +215,34 @@ def test_a_bundle_that_is_not_finished_leaves_no_signature_and_no_key(
     assert list((tmp_path / "out").iterdir()) == []
 
 
+LOCKED = re.compile(r"(?m)^([\w.-]+)==([\w.]+) --hash=sha256:[0-9a-f]{64}$")
+
+
 @pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
 def test_every_target_is_locked_by_hash_and_the_twin_has_the_boards_versions(target):
-    pins = read_lock(lock_path(target))
-    names = {pin.split("==")[0] for pin in pins}
+    lock = LOCKED.findall(lock_path(target).read_text())
+    names = {name for name, _ in lock}
     assert {"numpy", "onnxruntime", "eclipse-zenoh", "msgspec", "cryptography", "tomli"} <= names
-    assert {len(sha256) for sha256 in pins.values()} == {64}
     if target.name == "jetpack5":
-        assert list(pins) == list(read_lock(lock_path(TARGETS["linux-x86_64"])))
+        assert lock == LOCKED.findall(lock_path(TARGETS["linux-x86_64"]).read_text())
 
 
 EMPTY = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 
 
-def test_a_full_folder_needs_no_network_and_another_hash_is_not_taken(tmp_path, monkeypatch):
-    wheel, lock = tmp_path / "phil_edge_runtime-0.0.1-py3-none-any.whl", tmp_path / "lock.txt"
-    wheel.write_bytes(b"")
-    lock.write_text(f"# a lock\n\nphil-edge-runtime==0.0.1 --hash=sha256:{EMPTY}\n")
-    with monkeypatch.context() as patch:
-        patch.setattr(bundle_module, "pip", lambda *_: pytest.fail("pip was asked"))
-        assert gather(HERE, lock, tmp_path) == [wheel]
-    wheel.write_bytes(b"changed")
+def test_a_full_folder_needs_no_network_and_another_hash_is_not_taken(
+    workshop, tmp_path, monkeypatch
+):
+    lock, kept, place = (tmp_path / name for name in ("lock.txt", "kept", "place"))
+    digest = hashlib.sha256(workshop.edge_wheel.read_bytes()).hexdigest()
+    lock.write_text(f"# a lock\n\nphil-edge-runtime==0.1.0 --hash=sha256:{digest}\n")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
+    kept.mkdir()
+    shutil.copy(workshop.edge_wheel, kept)
+    assert [path.name for path in gather(HERE, lock, kept, place)] == [workshop.edge_wheel.name]
+    lock.write_text(lock.read_text().replace(digest, EMPTY))
     with pytest.raises(UserError, match="pip download: ERROR"):
-        gather(HERE, lock, tmp_path)
+        gather(HERE, lock, kept, tmp_path / "other")
 
 
 def test_a_lock_is_written_anew_with_the_hash_of_what_comes(tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from deploy.installer import __main__ as installer
 from deploy.installer.layout import CURRENT, PREVIOUS, Releases
 from deploy.installer.systemd import Limits, Systemd, UnhealthyError
-from deploy.installer.verify import Bundle, BundleManifest, to_json
+from deploy.installer.verify import BundleManifest, to_json
 from deploy.tests.boards import HERE
 from edge_runtime.files import write_atomic
 from hil_tests.testing.policies import public_pem
@@ -71,9 +71,9 @@ def board(tmp_path, monkeypatch):
     key = tmp_path / "key.pub"
     key.write_bytes(public_pem(Ed25519PrivateKey.generate()))
 
-    def read_bundle(version: str, key: bytes) -> Bundle:
+    def read_bundle(version: str, key: bytes) -> tuple[BundleManifest, dict[str, bytes]]:
         manifest = BundleManifest(version, HERE, "hunter01", "policy")
-        return Bundle(manifest, {"manifest.json": to_json(manifest)})
+        return manifest, {"manifest.json": to_json(manifest)}
 
     monkeypatch.setattr(installer, "read_bundle", read_bundle)
     monkeypatch.setattr(installer, "choose", lambda *_: service)
