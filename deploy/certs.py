@@ -50,11 +50,10 @@ MAX_MESSAGE_BYTES = 2 * MAX_STATE_BYTES
 """Twice what any edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
-_NO_USE = dict.fromkeys(
-    ("digital_signature", "content_commitment", "key_encipherment", "data_encipherment",
-     "key_agreement", "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
-    False,
-)  # fmt: skip
+_KEY_USES = (
+    *("digital_signature", "content_commitment", "key_encipherment", "data_encipherment"),
+    *("key_agreement", "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
+)
 
 
 def _add_keys_arguments(parser: argparse.ArgumentParser) -> None:
@@ -204,51 +203,37 @@ def read_authority(folder: Path) -> CertificatePair:
 
 def make_authority(now: datetime.datetime) -> CertificatePair:
     """Make an authority that may issue certificates of parties and no further authorities."""
-    return _certify(
-        "PHIL-TD3 hardware-in-the-loop authority", None, now, CA_DAYS,
-        (x509.BasicConstraints(ca=True, path_length=0), True),
-        (x509.KeyUsage(**_NO_USE | {"key_cert_sign": True, "crl_sign": True}), True),
-    )  # fmt: skip
+    return issue(None, "PHIL-TD3 hardware-in-the-loop authority", "", (), now, CA_DAYS)
 
 
 def issue(
-    authority: CertificatePair,
+    authority: CertificatePair | None,
     party: str,
     role: str,
     hosts: Sequence[x509.GeneralName],
     now: datetime.datetime,
     days: int,
 ) -> CertificatePair:
-    """Make a party's certificate; `hosts` are the names under which a listener is reached."""
-    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    names: list[tuple[x509.ExtensionType, bool]] = []
-    if tls.ROLES[role].listens:
-        purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
-        names.append((x509.SubjectAlternativeName(hosts), False))
-    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
-    return _certify(
-        party, authority, now, days,
-        (x509.BasicConstraints(ca=False, path_length=None), True),
-        (x509.KeyUsage(**_NO_USE | {"digital_signature": True}), True),
-        (x509.ExtendedKeyUsage(purposes), False),
-        (issuer, False),
-        *names,
-    )  # fmt: skip
+    """Make a party's key and certificate; without an authority, those of an authority.
 
-
-def _certify(
-    common: str,
-    authority: CertificatePair | None,
-    now: datetime.datetime,
-    days: int,
-    *extensions: tuple[x509.ExtensionType, bool],
-) -> CertificatePair:
-    """Make a key and its certificate, signed by the authority or, without one, by itself.
-
-    `extensions` come with whether a reader that does not know them must refuse the certificate.
+    `hosts` are the names under which a party that listens is reached.
     """
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+    uses = ("digital_signature",) if authority else ("key_cert_sign", "crl_sign")
+    # Each with whether a reader that does not know it must refuse the certificate.
+    extensions: list[tuple[x509.ExtensionType, bool]] = [
+        (x509.BasicConstraints(ca=not authority, path_length=None if authority else 0), True),
+        (x509.KeyUsage(**{use: use in uses for use in _KEY_USES}), True),
+        (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False),
+    ]
+    if authority:
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        if tls.ROLES[role].listens:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+            extensions.append((x509.SubjectAlternativeName(hosts), False))
+        issuer_key = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
+        extensions += [(x509.ExtendedKeyUsage(purposes), False), (issuer_key, False)]
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, party)])
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -257,7 +242,6 @@ def _certify(
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCK_SLACK)
         .not_valid_after(now + datetime.timedelta(days=days))
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
     for extension, is_critical in extensions:
         builder = builder.add_extension(extension, is_critical)

@@ -9,13 +9,14 @@ the work.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Iterator
 
 from deploy.installer.layout import (
     BEFORE,
@@ -262,32 +263,30 @@ class Installer:
                 signal.signal(one, signal.SIG_IGN)
             why = str(error) or "interrupted"
             _say(f"{version} is not healthy: {why}")
-            wrong = self._go_back(service, good, limits)
+            wrong: list[str] = []
+            with _noted(wrong):
+                service.stop()
+            with _noted(wrong):
+                if good:
+                    service.prepare(releases.folder(good))
+                else:
+                    service.remove()
+            with _noted(wrong):
+                releases.go_back()
+                if good:
+                    service.start(limits)
             now = f"went back to {good}" if good else "nothing is installed"
-            now += f", not as before ({wrong})" if wrong else ""
+            now += f", not as before ({'; '.join(wrong)})" if wrong else ""
             raise UnhealthyError(f"release {version} was not healthy, {now}: {why}") from None
 
-    def _go_back(self, service: Systemd, good: str | None, limits: Limits) -> str:
-        """Let the good release run again, or none; return what went wrong, empty for nothing."""
-        releases, errors = self._releases, []
 
-        def undo() -> None:
-            if good is None:
-                service.remove()
-            else:
-                service.prepare(releases.folder(good))
-
-        def restart() -> None:
-            releases.go_back()
-            if good is not None:
-                service.start(limits)
-
-        for step in (service.stop, undo, restart):  # whatever became of the step before
-            try:
-                step()
-            except Exception as error:
-                errors.append(str(error))
-        return "; ".join(errors)
+@contextlib.contextmanager
+def _noted(errors: list[str]) -> Iterator[None]:
+    """Go on after an error in this block, and keep its text."""
+    try:
+        yield
+    except Exception as error:
+        errors.append(str(error))
 
 
 def trusted_key(releases: Releases, trust: str | None) -> bytes:
