@@ -114,15 +114,16 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
     target, out, more = TARGETS[arguments.target], arguments.out, arguments.more
     given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
     inputs = Inputs(**given, wheels=more)
+    kept = arguments.wheels / target.name
     # All that can be wrong, before minutes of downloads.
-    check_writable(out / "bundle.tar")
+    for folder in (out, kept):
+        check_writable(folder / "file")
     collect(inputs, target)
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
         if more:  # pip refuses those that do not fit the target.
-            _download(target, folder, "--no-index", *map(str, more))
-        build_edge_wheel(folder)
-        wheels = gather(target, lock_path(target), arguments.wheels / target.name, folder)
+            _download(target, Path(place), "--no-index", *map(str, more))
+        build_edge_wheel(Path(place))
+        wheels = gather(target, lock_path(target), kept, Path(place))
         path, manifest = make_bundle(inputs._replace(wheels=wheels), target, out)
     print(f"{path}  ({path.stat().st_size / 1e6:.1f} MB), signed by {path.name}.sig")
     print(f"version {manifest.version}, for {manifest.vehicle_id}, {target} or newer")
@@ -188,10 +189,11 @@ def collect(inputs: Inputs, target: Target) -> tuple[dict[str, bytes], BundleMan
 def _check_vehicle(config: Config, manifest: Manifest, wheels: list[Path]) -> None:
     """Raise UserError for a vehicle that no wheel brings, or settings that do not hold."""
     name, colon, _ = config.vehicle.partition(":")
+    brought = set().union(*map(_drivers_in, wheels))
     if name in (NONE, *BUILT_IN):
         limits = vehicle_limits(config.vehicle, config.vehicle_settings, manifest)
         shared_limits(manifest.action, limits)
-    elif name + colon not in set().union(*map(_drivers_in, wheels)):
+    elif (name.split(".")[0] if colon else name) + colon not in brought:
         known = ", ".join((NONE, *BUILT_IN))
         raise UserError(
             f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
@@ -213,9 +215,9 @@ def _drivers_in(path: Path) -> set[str]:
 
 def _settings(inputs: Inputs) -> tuple[Config, bytes]:
     """The settings, checked as `run` checks them, and the file that the board gets."""
-    flags = {"policy": str(inputs.policy), **({"tls": str(inputs.tls)} if inputs.tls else {})}
+    flags = {"policy": str(inputs.policy), "tls": inputs.tls and str(inputs.tls)}
     config = load_config(inputs.config, flags)
-    given = inputs.config.read_text() if inputs.config else ""
+    given = inputs.config.read_text("utf-8") if inputs.config else ""
     keys = read_toml(inputs.config, "config file") if inputs.config else {}
     for name in _OF_THE_BUNDLE:
         if name in keys:

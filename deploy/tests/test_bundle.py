@@ -18,7 +18,6 @@ from deploy.bundle import (
     ROOT,
     TARGETS,
     Inputs,
-    _drivers_in,
     build_edge_wheel,
     build_installer,
     gather,
@@ -139,7 +138,6 @@ def test_settings_that_do_not_hold_are_refused(workshop, driver, tmp_path, text)
 def test_a_drivers_wheel_is_installed_with_the_rest(workshop, board, driver, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text(f'connect = "{workshop.endpoint}"\nvehicle = "my_vehicle:Rover"\n')
-    assert {"rover", "my_vehicle:"} <= _drivers_in(driver)
     wheels = [workshop.edge_wheel, workshop.host, driver]
     assert board.install(workshop.make(wheels=wheels, config=config).path).returncode == 0
     assert (board.root / "current/site-packages/my_vehicle.py").exists()
@@ -185,9 +183,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(workshop, tmp_path, capsys
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "tags", ["cp311-cp311-manylinux_2_17_aarch64", "cp38-cp38-manylinux_2_35_aarch64", ""]
-)
+@pytest.mark.parametrize("tags", ["cp38-cp38-manylinux_2_35_aarch64", ""])
 def test_a_wheel_that_the_board_cannot_run_is_refused(workshop, tmp_path, driver, capsys, tags):
     wheel = tmp_path / f"my_vehicle-0.1.0-{tags}.whl"
     shutil.copy(driver, wheel)
