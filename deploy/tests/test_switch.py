@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -135,6 +136,14 @@ def kill(event: str) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def in_a_child(run: Callable[[], int]) -> int:
+    """The status of a process that may be killed, as of `os.waitpid`."""
+    child = os.fork()
+    if child == 0:
+        os._exit(run())
+    return os.waitpid(child, 0)[1]
+
+
 @pytest.mark.parametrize(("words", "target"), [(["install", NEW], NEW), (["rollback"], EARLIER)])
 def test_killed_before_any_step_a_whole_release_is_current_and_the_same_command_completes(
     board, words, target
@@ -142,11 +151,8 @@ def test_killed_before_any_step_a_whole_release_is_current_and_the_same_command_
     releases, status, number = board.releases, -1, 0
     while status != 0:
         number += 1
-        child = os.fork()
-        if child == 0:
-            with at_step(number, releases.root, kill):
-                os._exit(board.run(*words))
-        status = os.waitpid(child, 0)[1]
+        with at_step(number, releases.root, kill):
+            status = in_a_child(lambda: board.run(*words))
         current = releases.linked(CURRENT)
         assert current in (OLD, target)
         assert releases.damage(current) == []
@@ -201,31 +207,54 @@ def test_a_first_release_that_is_bad_leaves_nothing(board):
     assert list((board.releases.root / "releases").iterdir()) == []
 
 
-def test_a_bad_release_is_not_kept_though_its_first_installation_was_killed(board):
-    assert board.run("uninstall") == 0
-    board.service.start = lambda limits: kill("")
-    child = os.fork()
-    if child == 0:
-        board.run("install", NEW)
-    os.waitpid(child, 0)
+@pytest.fixture
+def cut_off(board, monkeypatch):
+    """The same board, after an upgrade that was killed as it started the new release."""
+    with monkeypatch.context() as patch:
+        patch.setattr(board.service, "start", lambda limits: kill(""))
+        in_a_child(lambda: board.run("install", NEW))
     assert board.releases.linked(CURRENT) == NEW
-    del board.service.start
+    return board
+
+
+def test_an_upgrade_that_was_cut_off_can_be_undone(cut_off):
+    assert cut_off.run("rollback") == 0
+    assert cut_off.releases.linked(CURRENT) == OLD
+    assert cut_off.releases.linked(PREVIOUS) == EARLIER
+
+
+def test_what_was_good_is_known_however_often_it_is_cut_off(cut_off):
+    releases, number = cut_off.releases, 0
+    while releases.linked(PREVIOUS) != OLD:
+        number += 1
+        with at_step(number, releases.root, kill):
+            in_a_child(lambda: cut_off.run("install", NEW))
+        assert OLD in (releases.good(), releases.linked(PREVIOUS))
+    assert number > 10
+
+
+def test_a_bad_upgrade_goes_back_though_it_was_cut_off(cut_off):
+    cut_off.service.bad = NEW
+    assert cut_off.run("install", NEW) == 1
+    assert cut_off.releases.linked(CURRENT) == cut_off.service.running == OLD
+
+
+def test_a_bad_first_release_is_not_kept_though_its_installation_was_cut_off(board, monkeypatch):
+    assert board.run("uninstall") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(board.service, "start", lambda limits: kill(""))
+        in_a_child(lambda: board.run("install", NEW))
     board.service.bad = NEW
     assert board.run("install", NEW) == 1
     assert board.releases.linked(CURRENT) is None
 
 
-def test_an_upgrade_that_was_killed_can_be_undone(board):
-    board.service.start = lambda limits: kill("")
-    child = os.fork()
-    if child == 0:
-        board.run("install", NEW)
-    os.waitpid(child, 0)
-    del board.service.start
-    assert board.releases.linked(CURRENT) == NEW
-    assert board.run("rollback") == 0
-    assert board.releases.linked(CURRENT) == OLD
-    assert board.releases.linked(PREVIOUS) == EARLIER
+def test_a_service_that_cannot_be_stopped_does_not_keep_it_from_going_back(board, monkeypatch):
+    stop = mock.Mock(side_effect=[None, UnhealthyError("it does not stop")])
+    monkeypatch.setattr(board.service, "stop", stop)
+    board.service.bad = NEW
+    assert board.run("install", NEW) == 1
+    assert board.releases.linked(CURRENT) == board.service.running == OLD
 
 
 @pytest.mark.parametrize("error", [UnhealthyError("it ended"), KeyboardInterrupt()], ids=type)
