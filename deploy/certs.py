@@ -104,15 +104,15 @@ class CertificatePair(NamedTuple):
 
 
 def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
-    vehicle = "a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+    vehicle = "vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
-    host = "a name or address at which simulator or router are reached; may be repeated"
+    host = "name or address at which the simulator or router is reached; may be repeated"
     host += f" (always: {', '.join(LOOPBACK_HOSTS)})"
     add, days = parser.add_argument, whole_number(1, CA_DAYS)
-    add("--out", metavar="DIR", default="certs", help="directory of all folders")
+    add("--out", metavar="DIR", default="certs", help="folder for the parties' folders")
     add("--vehicle-id", metavar="ID", action="append", help=vehicle)
     add("--host", metavar="NAME", action="append", default=[], help=host)
-    add("--days", metavar="N", type=days, default=365, help="how long they are valid, days")
+    add("--days", metavar="N", type=days, default=365, help="lifetime of the certificates, days")
 
 
 def _run_certs(arguments: argparse.Namespace) -> int:
@@ -250,14 +250,14 @@ def issue(
 
 
 def _add_router_arguments(parser: argparse.ArgumentParser) -> None:
-    listen = "where all others connect to, as tls/0.0.0.0:7447; may be repeated"
-    files = "the router's folder of `deploy certs`, as certs/router; zenohd opens its files"
-    vehicle = "a vehicle whose parties have rights at this router; may be repeated"
+    listen = "endpoint that all others connect to, such as tls/0.0.0.0:7447; may be repeated"
+    files = "the router's folder of `deploy certs`, such as certs/router; zenohd opens its files"
+    vehicle = "vehicle whose parties have rights at this router; may be repeated"
     add, append = parser.add_argument, functools.partial(parser.add_argument, action="append")
     append("--listen", metavar="tls/HOST:PORT", required=True, help=listen)
     add("--tls", metavar="DIR", required=True, help=files)
     append("--vehicle-id", metavar="ID", default=[], help=vehicle)
-    add("--vehicles", metavar="FILE", help="a file with one vehicle id a line; # begins a comment")
+    add("--vehicles", metavar="FILE", help="file with one vehicle id a line; # begins a comment")
     add("--out", metavar="FILE.json5", required=True, help="file for the router's settings")
 
 

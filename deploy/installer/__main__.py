@@ -104,13 +104,13 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text, epilog=example + words)
         add = command.add_argument
         add("--root", metavar="DIR", default=DEFAULT_ROOT, help="folder of the installation")
-        who = "who runs it (default: as installed; at first systemd where it runs this computer)"
+        who = "who runs the release; none: somebody else (default: as before, at first systemd if any)"
         add("--service", choices=SERVICES, help=who)
         if name in ("install", "rollback"):
             limits = Limits()
-            text = "go back unless it is healthy within this time, s"
+            text = "go back unless the release is ready within this time, s"
             add("--health-limit", metavar="S", type=seconds, default=limits.within_s, help=text)
-            text = "time that it must then stay healthy, s"
+            text = "time for which it must then stay healthy, s"
             add("--settle", metavar="S", type=seconds, default=limits.settle_s, help=text)
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
