@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text, epilog=example + words)
         add = command.add_argument
         add("--root", metavar="DIR", default=DEFAULT_ROOT, help="folder of the installation")
-        who = "who runs the release; none: somebody else (default: as before, at first systemd if any)"
+        who = "who runs the release, none for somebody else (default: as before, or systemd)"
         add("--service", choices=SERVICES, help=who)
         if name in ("install", "rollback"):
             limits = Limits()
