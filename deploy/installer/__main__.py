@@ -108,9 +108,9 @@ def _parser() -> argparse.ArgumentParser:
         add("--service", choices=SERVICES, help=who)
         if name in ("install", "rollback"):
             limits = Limits()
-            text = "go back unless the release is ready within this time, s"
+            text = "refuse a release whose trial is not ready within this time, s"
             add("--health-limit", metavar="S", type=seconds, default=limits.within_s, help=text)
-            text = "time for which it must then stay healthy, s"
+            text = "time for which trial and service must then stay healthy, s"
             add("--settle", metavar="S", type=seconds, default=limits.settle_s, help=text)
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
