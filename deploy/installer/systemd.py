@@ -161,7 +161,8 @@ def _require_active(unit: str, settle_s: float) -> None:
     time.sleep(settle_s)
     shown = _show(unit)
     if shown.get("ActiveState") != "active" or shown.get("NRestarts", "0") != "0":
-        raise UnhealthyError(f"{unit} ended: {shown.get('Result')} (journalctl --unit {unit})")
+        state = f"{shown.get('ActiveState')}, {shown.get('Result')}"
+        raise UnhealthyError(f"{unit} does not stay up: {state} (journalctl --unit {unit})")
 
 
 def _show(unit: str) -> dict[str, str]:
