@@ -29,7 +29,7 @@ from deploy.installer.layout import (
     TLS,
     Releases,
 )
-from deploy.installer.systemd import SERVICES, Limits, Systemd, UnhealthyError, choose
+from deploy.installer.systemd import SERVICES, HealthLimits, Systemd, UnhealthyError, choose
 from deploy.installer.verify import (
     MANIFEST,
     BundleManifest,
@@ -78,7 +78,7 @@ def _run(argv: list[str]) -> int:
         installer.uninstall()
         print(f"removed from {releases.root}")
         return 0
-    limits = Limits(arguments.health_limit, arguments.settle)
+    limits = HealthLimits(arguments.health_limit, arguments.settle)
     try:
         if arguments.command == "install":
             version = installer.install(arguments.bundle, arguments.trust, limits)
@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         who = "who runs the release, none for somebody else (default: as before, or systemd)"
         add("--service", choices=SERVICES, help=who)
         if name in ("install", "rollback"):
-            limits = Limits()
+            limits = HealthLimits()
             text = "refuse a release whose trial is not ready within this time, s"
             add("--health-limit", metavar="S", type=seconds, default=limits.within_s, help=text)
             text = "time for which trial and service must then stay healthy, s"
@@ -160,7 +160,7 @@ class Installer:
         self._releases = releases
         self._service = service
 
-    def install(self, bundle_path: str, trust: str | None, limits: Limits) -> str:
+    def install(self, bundle_path: str, trust: str | None, limits: HealthLimits) -> str:
         """Install or upgrade; return the version. Nothing is written before the bundle is verified.
 
         `trust` is the path of a public key. Raises UserError where the bundle may not be installed
@@ -181,7 +181,7 @@ class Installer:
             self.activate(version, limits)
         return version
 
-    def rollback(self, limits: Limits) -> str:
+    def rollback(self, limits: HealthLimits) -> str:
         """Go back to the release before; return its version."""
         releases = self._releases
         self._require_any()
@@ -209,7 +209,7 @@ class Installer:
         if not self._releases.trusted.exists():
             raise UserError(f"nothing is installed in {self._releases.root}")
 
-    def activate(self, version: str, limits: Limits) -> None:
+    def activate(self, version: str, limits: HealthLimits) -> None:
         """Prove a release and switch to it. UnhealthyError where the board stays or is as before.
 
         With a service the vehicle hears nothing of a release that is being judged.
@@ -228,7 +228,7 @@ class Installer:
                 self._switch(service, version, limits)
         releases.accept()
 
-    def _prove(self, version: str, limits: Limits) -> None:
+    def _prove(self, version: str, limits: HealthLimits) -> None:
         """`edge_runtime check` by the release's own runtime, then its trial; or UnhealthyError."""
         folder = self._releases.folder(version)
         command = [str(folder / LAUNCHER), "check", POLICY, "--public-key", PUBLIC_KEY]
@@ -249,7 +249,7 @@ class Installer:
             self._service.try_release(folder, policy_id, limits)
             _say("trial: healthy, in a network of its own")
 
-    def _switch(self, service: Systemd, version: str, limits: Limits) -> None:
+    def _switch(self, service: Systemd, version: str, limits: HealthLimits) -> None:
         """Stop, switch and start; whatever goes wrong, start what was good."""
         releases, good = self._releases, self._releases.good()
         try:

@@ -34,7 +34,7 @@ class UnhealthyError(UserError):
     """A release may not run here. Its text says why, on one line."""
 
 
-class Limits(NamedTuple):
+class HealthLimits(NamedTuple):
     """How soon a trial must be ready, and how long a release must then stay healthy, s."""
 
     within_s: float = 10.0
@@ -56,7 +56,7 @@ class Systemd:
             _run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
             return pwd.getpwnam(USER).pw_gid
 
-    def try_release(self, folder: Path, policy_id: str, limits: Limits) -> None:
+    def try_release(self, folder: Path, policy_id: str, limits: HealthLimits) -> None:
         """Run a release heard by nobody. Raises UnhealthyError where it does not run well.
 
         It must say READY=1 within the limit, go on with WATCHDOG=1, and log this policy's name.
@@ -114,7 +114,7 @@ class Systemd:
         _run("systemctl", "daemon-reload")
         _run("systemctl", "enable", MAIN_UNIT, CAN_UNIT)
 
-    def start(self, limits: Limits) -> None:
+    def start(self, limits: HealthLimits) -> None:
         """Start the release that `current` names. Raises UnhealthyError where it does not run well.
 
         `systemctl start` waits for READY=1 as long as the unit and what it comes after allow.

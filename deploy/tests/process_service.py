@@ -13,7 +13,7 @@ from pathlib import Path
 
 from deploy.installer import __main__ as installer
 from deploy.installer.layout import CONFIG, CURRENT, LAUNCHER
-from deploy.installer.systemd import Limits, Systemd, UnhealthyError
+from deploy.installer.systemd import HealthLimits, Systemd, UnhealthyError
 
 
 class ProcessService(Systemd):
@@ -27,13 +27,13 @@ class ProcessService(Systemd):
     def group(self) -> int:
         return os.getgid()
 
-    def try_release(self, folder: Path, policy_id: str, limits: Limits) -> None:
+    def try_release(self, folder: Path, policy_id: str, limits: HealthLimits) -> None:
         pass
 
     def prepare(self, folder: Path) -> None:
         pass
 
-    def start(self, limits: Limits) -> None:
+    def start(self, limits: HealthLimits) -> None:
         with open(self._log, "wb") as log:
             run = subprocess.Popen(
                 [self._current / LAUNCHER, "run", "--config", CONFIG], cwd=self._current.resolve(),

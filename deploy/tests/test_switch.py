@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from deploy.installer import __main__ as installer
 from deploy.installer.layout import CURRENT, PREVIOUS, Releases
-from deploy.installer.systemd import Limits, Systemd, UnhealthyError
+from deploy.installer.systemd import HealthLimits, Systemd, UnhealthyError
 from deploy.installer.verify import BundleManifest, to_json
 from deploy.tests.boards import HERE
 from edge_runtime.files import write_atomic
@@ -51,7 +51,7 @@ class Service(Systemd):
     def prepare(self, folder: Path) -> None:
         write_atomic(self.releases.root / "unit", folder.name.encode())
 
-    def start(self, limits: Limits) -> None:
+    def start(self, limits: HealthLimits) -> None:
         self.told, self.running = self.told + 1, self.releases.linked(CURRENT)
         with open(self.releases.hold) as hold, contextlib.suppress(BlockingIOError):
             fcntl.flock(hold, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -17,7 +17,7 @@ from deploy.installer.systemd import (
     CAN_UNIT,
     MAIN_UNIT,
     TRIAL_UNIT,
-    Limits,
+    HealthLimits,
     Systemd,
     UnhealthyError,
 )
@@ -116,7 +116,7 @@ if words[0] in ("start", "systemd-run"):
     sys.exit("Job failed." if "refuse" in state else 0)
 """
 ACTIVE = "ActiveState=active\nSubState=running\nNRestarts=0\nResult=success\nStatusText=standby"
-LIMITS = Limits(1.0, 0.1)
+LIMITS = HealthLimits(1.0, 0.1)
 
 
 class Board:
@@ -191,7 +191,7 @@ def test_units_are_installed_enabled_started_and_taken_away(board):
 def test_a_service_that_does_not_get_well_is_unhealthy(board, state):
     board.state(state)
     with pytest.raises(UnhealthyError):
-        board.systemd.start(Limits(0.3, 0.1))
+        board.systemd.start(HealthLimits(0.3, 0.1))
 
 
 def test_a_trial_runs_without_vehicle_and_network_and_is_taken_away(board):
