@@ -5,10 +5,10 @@ That takes seconds; ``--help`` need not wait for it.
 
 import argparse
 
-from bridge.environments import CONDITIONS, NOMINAL
+from bridge.environments import NOMINAL
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
-from trainer.environments import CONDITIONS as TEST_CONDITIONS
+from trainer.environments import CONDITIONS
 from trainer.options import add_scenario
 
 
@@ -18,7 +18,7 @@ from trainer.options import add_scenario
     "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
 )
 def campaign(parser: argparse.ArgumentParser) -> None:
-    out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
+    out = "the report; R.md and a picture go beside it"
     parser.add_argument("--out", required=True, metavar="R.json", help=out)
     default = "policy file (default: results/policies/SCENARIO.onnx)"
     parser.add_argument("--policy", metavar="P.onnx", help=default)
@@ -53,7 +53,7 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
     add_public_key(parser)
     add("--env", help="scenario, gymnasium id or module:id (default: the file's, else left_turn)")
-    add("--condition", choices=TEST_CONDITIONS, default="nominal", help="of the scene")
+    add("--condition", choices=CONDITIONS, default="nominal", help="of the scene")
     add("--promise", type=inner, default=0.95, help="share of successes")
     add("--confidence", type=inner, default=0.95, help="of each axis's limit")
     add("--seed", type=count, default=0, help="of the first drive")

@@ -20,8 +20,8 @@ from hil_tests import doctor
 from hil_tests.__main__ import main
 from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from hil_tests.sweep import simulate
 from hil_tests.testing.commands import exit_status
+from hil_tests.testing.drives import read, start_simulate
 
 ROOT = Path(__file__).parents[2]
 
@@ -76,15 +76,6 @@ def test_scripts_and_versions_are_tried(monkeypatch, tmp_path):
 VEHICLE = "hunter01"
 
 
-def left_turn_over_tls(certificates, endpoint):
-    """The report of one left turn in real time, driven by whoever connects with a certificate."""
-    return simulate(
-        endpoint, certificates / "episode.json", 120.0, "--env", "left_turn", "--clock", "realtime",
-        "--episodes", "1", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
-        "--tls", str(certificates / f"simulator-{VEHICLE}"),
-    )  # fmt: skip
-
-
 @pytest.mark.board
 @pytest.mark.timeout(600)
 def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path):
@@ -117,7 +108,11 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
     words = [opt / "current/bin/phil-edge", "run", "--config", "config.toml"]
     with subprocess.Popen(words, cwd=opt / "current", stderr=subprocess.DEVNULL) as runtime:
         try:
-            episode = left_turn_over_tls(certificates, endpoint)
+            drive = ("--clock", "realtime", "--wait-edge-s", "120", "--vehicle-id", VEHICLE,
+                     "--tls", str(certificates / f"simulator-{VEHICLE}"))  # fmt: skip
+            with start_simulate(endpoint, tmp_path / "r.json", "left_turn", *drive) as simulator:
+                simulator.succeed(120.0)
+            episode = read(tmp_path / "r.json")
         finally:
             runtime.terminate()
     run("uninstall")
