@@ -295,13 +295,15 @@ def in_parallel(
             raise
 
 
-def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+def wait_until(
+    condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S, poll_s: float = POLL_S
+) -> Any:
     """Poll until the condition is true and return its value; CommandTimeoutError otherwise."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
         if value := condition():
             return value
-        time.sleep(POLL_S)
+        time.sleep(poll_s)
     raise CommandTimeoutError(f"not within {timeout_s:g} s: {what}")
 
 
