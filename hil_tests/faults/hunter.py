@@ -23,9 +23,9 @@ from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
+    BusFrame,
     CanMonitor,
     CommandSeen,
-    Heard,
     drives_between,
 )  # fmt: skip
 from hil_tests.faults.rig import Rig
@@ -52,10 +52,10 @@ class Expect(NamedTuple):
 
     name: str
     says: str
-    shown: Callable[[Heard], bool] | None = None
+    shown: Callable[[BusFrame], bool] | None = None
 
 
-def speed_mps(frame: Heard) -> float:
+def speed_mps(frame: BusFrame) -> float:
     """Of 0x111 and 0x221, by hand."""
     return _number(frame.data[:2])
 
@@ -163,7 +163,7 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
 
 
-def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
+def _status(test: Callable[[bytes], bool]) -> Callable[[BusFrame], bool]:
     return lambda frame: frame.can_id == 0x211 and test(frame.data)
 
 

@@ -18,9 +18,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -68,7 +67,7 @@ DoFault = Callable[[Rig, int], Try]
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table."""
+    """A row of the table of faults."""
 
     name: str
     done: str
@@ -95,10 +94,9 @@ ROWS: list[Row] = []
 def fault(
     expected: str, measured: str, name: str = "", done: str = "", **options: Any
 ) -> Callable[[DoFault], DoFault]:
-    """Put a function into the table.
+    """Put a function into the table, under its name and docstring or ``name`` and ``done``.
 
-    Its own name and its docstring stand there, or ``name`` and ``done`` where several rows share
-    it; ``options`` are those of `Row`.
+    ``options`` are those of `Row`.
     """
 
     def add(run: DoFault) -> DoFault:
@@ -110,34 +108,13 @@ def fault(
 
 
 def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
-    """As `fault`, for one through which the drive goes on.
+    """Put a fault into the table through which the drive goes on.
 
     The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
     rejected.
     """
     through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True, **options}
     return fault(expected, GAP, **through)
-
-
-def do_fault(row: Row, rig: Rig, number: int) -> Try:
-    """Do the fault of a row once, and judge it where the drive was to go on."""
-    before = rig.edge_counts() if row.counted == "edge" else Counter()
-    begin_s = time.monotonic()
-    done = row.run(rig, number)
-    if not row.goes_on:
-        return done
-    end_s = time.monotonic()
-    wanted = counted = Counter(done.rejected)
-    if row.counted == "edge":
-        counted = rig.edge_counts() - before
-    if row.counted == "simulator":
-        rig.end_drive()  # It writes its counts at its end.
-        counted = rig.simulator_counts()
-    wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
-    # Safe stops come as steadily as drives: the gaps alone would not tell.
-    wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *done.wrong]
-    gap_s = rig.longest_gap(begin_s, end_s)
-    return replace(done, reaction_s=gap_s, rejected=dict(counted), wrong=wrong)
 
 
 def at_any_phase(number: int) -> None:
@@ -209,32 +186,32 @@ def simulator_killed(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
 def link_cut(rig: Rig, number: int) -> Try:
     """TCP cut for 1 s and restored."""
     begin_s, drive_s = time.monotonic(), rig.last_drive_s()
-    rig.link.cut()
-    last_s = rig.link.last_state_s
+    rig.relay.cut()
+    last_s = rig.relay.last_state_s
     stop = rig.logged_stop(begin_s)
     brake_s = rig.own_brake_s(begin_s) - max(drive_s, rig.last_drive_s())
     sleep_until(begin_s + LASTS_S)
     ended_s = time.monotonic()
-    rig.link.restore()
+    rig.relay.restore()
     recovered_s = rig.recovered_after_s(ended_s)
     figures = {"simulator brakes, ms": brake_s * 1e3}
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, figures=figures)
 
 
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
 def link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.6 s, then all at once."""
     begin_s = time.monotonic()
-    rig.link.stall()
+    rig.relay.stall()
     stop = rig.logged_stop(begin_s)
-    last_s = rig.link.last_state_s
+    last_s = rig.relay.last_state_s
     sleep_until(begin_s + max(STALLED_S, 2.5 * rig.period_s))  # longer than silence
     ended_s = time.monotonic()
-    rig.link.restore()
+    rig.relay.restore()
     recovered_s = rig.recovered_after_s(ended_s)
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=rig.must_stop_first(ended_s))
 
@@ -432,11 +409,11 @@ def _link_slows(periods: float, rig: Rig, number: int) -> Try:
     begin_s, task = time.monotonic(), rig.task
     entries = task.observation.values()
     state_bytes = sum(math.prod(e.shape) * np.dtype(e.dtype).itemsize for e in entries)
-    rig.link.throttle(state_bytes / (periods * rig.period_s))
+    rig.relay.throttle(state_bytes / (periods * rig.period_s))
     stop = rig.logged_stop(begin_s)
     time.sleep(LASTS_S)
     late = drives_between(rig.timeline.commands, stop.seen_s)
-    rig.link.restore()
+    rig.relay.restore()
     ended_s = time.monotonic()
     recovered_s = rig.drive_again() if rig.has_vehicle else rig.recovered_after_s(ended_s)
     return Try(None, recovered_s, stop.reason, wrong=late)
@@ -448,7 +425,7 @@ for _name, _periods, _rig in (
     fault("edge sends safe_stop: no_fresh_state", "none", _name,
           f"TCP slower than the states: one comes each {_periods:g} T, ever later",
           reaction_limit_s=None, policy="steady",
-          rig={**_rig, "between": "link"})(partial(_link_slows, _periods))  # fmt: skip
+          rig={**_rig, "between": "relay"})(partial(_link_slows, _periods))  # fmt: skip
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
@@ -463,14 +440,14 @@ def ride_states_lost(rig: Rig, number: int) -> Try:
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, policy="steady",
-       rig={**_VEHICLE, "between": "link"})  # fmt: skip
+       rig={**_VEHICLE, "between": "relay"})  # fmt: skip
 def ride_link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.4 s, both ways, then all at once."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
-    rig.link.stall()
+    rig.relay.stall()
     sleep_until(begin_s + SHORT_S)
-    rig.link.restore()
+    rig.relay.restore()
     return _rode(rig, begin_s)
 
 

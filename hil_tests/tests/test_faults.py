@@ -97,7 +97,7 @@ def test_a_process_that_is_gone_is_a_failed_try_and_ends_no_campaign():
 
 
 def test_what_a_rig_saw_counts(tmp_path, monkeypatch):
-    seen = observe.Timeline(states=STATES, commands=[command(action=[1.01])], unreadable=1)
+    seen = observe.DriveTimeline(states=STATES, commands=[command(action=[1.01])], unreadable=1)
     rig = MagicMock(timeline=seen, crashes=["edge"])
     rig.__enter__.return_value = rig
     monkeypatch.setattr("hil_tests.faults.run.Rig", Mock(return_value=rig))
@@ -204,7 +204,7 @@ def monitor(request):
 
 
 def asked(*frames):
-    return [observe.Heard(seen_s, 0x111, data) for seen_s, data in frames]
+    return [observe.BusFrame(seen_s, 0x111, data) for seen_s, data in frames]
 
 
 def test_the_set_point_counts_from_where_it_stays_zero(monitor):
@@ -220,10 +220,10 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
     monitor.heard += asked((1.0, FAST))
     assert hunter._kept_to_its_own(monitor) == []
     monitor.heard += asked((1.0, bytes.fromhex("06 40 00 00 00 00 00 00")))  # 1.6 m/s
-    monitor.strange.append(observe.Heard(1.0, 0x7DF, b""))
+    monitor.strange.append(observe.BusFrame(1.0, 0x7DF, b""))
     assert hunter._kept_to_its_own(monitor) == ["0x7df was on the bus", "asked for 1.60 m/s"]
     backwards = bytes.fromhex("FF 6A 00 00 00 00 00 00")
-    speeds = [hunter.speed_mps(observe.Heard(0.0, 0x221, data)) for data in (FAST, backwards)]
+    speeds = [hunter.speed_mps(observe.BusFrame(0.0, 0x221, data)) for data in (FAST, backwards)]
     assert speeds == pytest.approx([1.0, -0.15])
 
 
