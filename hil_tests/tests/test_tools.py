@@ -1,13 +1,11 @@
-"""The doctor, a bundle under Python 3.8, the bench's table, and mistakes."""
+"""The doctor, a bundle under Python 3.8, the bench's table, and mistakes in commands."""
 
 import json
 import os
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests import doctor
 from hil_tests.__main__ import main
-from hil_tests.bench_loop import MEMORY_SAMPLES, compare, memory, rows
+from hil_tests.bench_loop import compare, rows
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.commands import exit_status
 from hil_tests.testing.drives import read, start_simulate
@@ -27,10 +25,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_the_basics_work_where_the_tests_run(capsys):
-    assert main(["doctor", "--only", "basics", "vehicle"]) == 0
-    said = capsys.readouterr().out
-    assert "  missing  " not in said.partition("vehicle")[0]
-    assert "  ok       CAN over UDP: a frame" in said
+    assert main(["doctor", "--only", "basics"]) == 0
+    assert "  missing  " not in capsys.readouterr().out
+    assert "a frame went" in doctor._can_over_udp()
 
 
 def test_without_packages_it_still_runs_and_says_what_is_missing():
@@ -136,39 +133,21 @@ def test_ratios_have_an_interval_that_widens_where_blocks_differ():
     assert 1.0 < low < compare(ours, floor)["p50"]["ratio"] < high < 2.0
 
 
-@pytest.mark.parametrize("steps", [5, 10, 23])
-def test_the_memory_is_that_of_as_many_steps_as_are_reported(steps):
-    process, contender = Mock(), Mock()
-    assert len(memory(process, contender, steps)) == MEMORY_SAMPLES + 1
-    assert contender.ask.call_count == steps
-
-
-def report(ratio=1.1, end_mb=100.0, grown_mb=0.1, idle=0.01, start_s=1.0):
-    quantile = {"ours": 0.3, "floor": 0.25, "ratio": ratio, "interval": [ratio, ratio]}
-    process = {"memory_mb": end_mb, "grown_mb": grown_mb, "idle_load": idle}
-    return {
-        "latency": {"latency_ms": {"p50": quantile}},
-        "process": {**process, "first_command_s": start_s},
-    }
-
-
 def test_every_bar_is_met_or_missed_by_its_own_figure():
-    met = [row[-1] for row in rows(report()) if row[-1]]
-    assert len(met) == 5
-    assert all(bar.endswith("met") for bar in met)
-    for missed in (
-        {"ratio": 1.26}, {"end_mb": 110.1}, {"grown_mb": 1.1}, {"idle": 0.021}, {"start_s": 1.6},
-    ):  # fmt: skip
-        bars = [row[-1] for row in rows(report(**missed))]
-        assert sum(bar.endswith("MISSED") for bar in bars) == 1
-
-
-def test_what_the_mutations_settings_name_is_there():
-    for path in (ROOT / "hil_tests/mutation").glob("*.toml"):
-        settings = tomllib.loads(path.read_text())["cosmic-ray"]
-        tests = [word for word in settings["test-command"].split() if ".py" in word]
-        named = [*settings["module-path"], *tests]
-        assert [each for each in named if not (ROOT / each).is_file()] == []
+    good = {"ratio": 1.1, "memory_mb": 100.0, "grown_mb": 0.1, "idle_load": 0.01}
+    good["first_command_s"] = 1.0
+    worse = {"ratio": 1.26, "memory_mb": 110.1, "grown_mb": 1.1, "idle_load": 0.021}
+    worse["first_command_s"] = 1.6
+    for missed in (None, *worse):
+        process = {**good, **({missed: worse[missed]} if missed else {})}
+        ratio = process.pop("ratio")
+        quantile = {"ours": 0.3, "floor": 0.25, "ratio": ratio, "interval": [ratio, ratio]}
+        bars = [
+            row[-1]
+            for row in rows({"latency": {"latency_ms": {"p50": quantile}}, "process": process})
+        ]
+        assert sum(bar.endswith("MISSED") for bar in bars) == (missed is not None)
+        assert len(bars) == 5
 
 
 MISTAKES = {
