@@ -172,7 +172,7 @@ class Contender:
 
 
 def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
-    """Drive blocks in turns, and so who begins a pair; the first pair is a warm-up."""
+    """Ask both in blocks by turns; who begins a pair changes, and the first pair is a warm-up."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
     with ProgressBar("pairs of blocks", blocks + 1) as bar:
         for number in range(blocks + 1):

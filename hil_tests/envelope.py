@@ -74,7 +74,7 @@ Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
 
 
 def network(at: Point) -> LatencySpec:
-    """The network of a point, the same each way."""
+    """Return the network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
     outage_s = min(outage_s, OUTAGE_EVERY_S - AXES["outage_s"][1])  # One must end.
     spread_ms, has_bursts, loss = jitter_ms or tail_ms, burst >= 1.0, min(loss, MOST_LOSS_PERCENT)
@@ -95,7 +95,7 @@ def network(at: Point) -> LatencySpec:
 
 
 class SequentialTest:
-    """Whether the share of successes is above or below a promise, by as few drives as decide it.
+    """Decides by few drives whether the share of successes is above or below a promise.
 
     Two of Wald's sequential probability ratio tests (1945, Sequential tests of statistical
     hypotheses, Annals of Mathematical Statistics 16(2)) on the same drives, as Sobel and Wald
@@ -116,7 +116,7 @@ class SequentialTest:
         self.drives = self.successes = 0
 
     def add(self, success: bool) -> str | None:
-        """Count a drive; the verdict, None while there is none."""
+        """Count a drive; return the verdict, None while there is none."""
         self.drives += 1
         self.successes += success
         for which, verdict in enumerate((HOLDS, BREAKS)):
@@ -129,7 +129,7 @@ class SequentialTest:
 
 
 class Search:
-    """Looks for edges, and keeps what was found at every point that was tried.
+    """Looks for edges, and keeps the verdict of every point that was tried.
 
     ``drive`` is called with the next seeds, from ``seed`` on and ``at_once`` at a time, until a
     point is decided. ``confidence`` is that of a statement about an axis.
@@ -143,7 +143,7 @@ class Search:
         self.tried: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
-        """HOLDS, BREAKS or BETWEEN."""
+        """Drive a point until it is decided; return HOLDS, BREAKS or BETWEEN."""
         spec = network(at)
         if str(spec) not in self.tried:
             test, verdict = self._new_test(), None
@@ -157,9 +157,9 @@ class Search:
         return str(self.tried[str(spec)]["verdict"])
 
     def holds_up_to(self, ray: Ray, most: int) -> int:
-        """The largest step up to which every tried one holds, by bisection; 0 is not tried.
+        """Return the largest step up to which every tried one holds, by bisection from 0.
 
-        That less is no worse is not taken for granted: half of it is tried, too.
+        Less may be worse: half of it is tried, too.
         """
         edge = self._bisect(ray, 0, most, (HOLDS,))[0]
         if edge > 1 and self.verdict(ray(edge // 2)) != HOLDS:
@@ -167,9 +167,9 @@ class Search:
         return edge
 
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
-        """The largest step that holds, the smallest beyond it that breaks, and both networks.
+        """Return the largest step that holds, the smallest beyond it that breaks, both networks.
 
-        None where none breaks. It lies below the least step known to break.
+        None where none breaks. The edge lies below the least step known to break.
         """
         inside = self.holds_up_to(ray, most)
         names = {k: str(network(ray(k))) for k in range(inside + 1, most + 1)}
@@ -180,7 +180,7 @@ class Search:
         return {**found, "outside": None if outside is None else str(network(ray(outside)))}
 
     def _bisect(self, ray: Ray, low: int, most: int, is_low: tuple[str, ...]) -> tuple[int, int]:
-        """Neighbours of which the lower is low; the most is tried first, ``low`` is not tried."""
+        """Return neighbours of which the lower is low; the most is tried first, ``low`` never."""
         middle, high = most, most + 1
         while high - low > 1:
             low, high = (middle, high) if self.verdict(ray(middle)) in is_low else (low, middle)
@@ -189,7 +189,10 @@ class Search:
 
 
 def find_region(search: Search) -> dict[str, Any]:
-    """The limits, ``joint`` and ``box`` (module docstring), and the edges; UserError: none."""
+    """Return limits, ``joint`` and ``box`` (module docstring), and the edges.
+
+    Raises UserError where the promise is not kept without a network.
+    """
     if search.verdict({}) != HOLDS:
         raise UserError("the promise is not kept even on a perfect network: lower --promise")
 
@@ -222,7 +225,7 @@ def find_region(search: Search) -> dict[str, Any]:
 
 
 def _side_by_side(work: Sequence[Callable[[], Any]]) -> list[Any]:
-    """Do all in threads, which wait for drives. After ^C none is waited for: drives end first."""
+    """Do all in threads, which wait for drives. After ^C no thread is waited for."""
     threads = ThreadPoolExecutor(len(work))
     try:
         return [future.result() for future in [threads.submit(one) for one in work]]

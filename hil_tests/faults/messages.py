@@ -170,7 +170,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
 
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
-    """(reason, payload) of what must not reach the policy, around the newest step."""
+    """Yield (reason, payload) of states that must be rejected, around the newest step."""
     state, (name, *_) = noisy_state(step + 1, task), task.observation
     large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
     valid = encode(state)
@@ -186,7 +186,7 @@ def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
-    """A drive command to the newest state, or to one ``ahead`` of it."""
+    """Make a drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
     middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
     command = Command(
@@ -197,7 +197,7 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
 
 
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
-    """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
+    """Yield ``count`` mutations, the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
     names = sorted(msgspec.msgpack.decode(valid))
 
@@ -229,12 +229,12 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
-    """The same MessagePack map with fields replaced by values of any type."""
+    """Replace fields of a MessagePack map by values of any type."""
     return msgspec.msgpack.encode({**msgspec.msgpack.decode(valid), **changes})
 
 
 def without(valid: bytes, name: str) -> bytes:
-    """The same map without one of its fields."""
+    """Remove a field of a MessagePack map."""
     fields = msgspec.msgpack.decode(valid)
     del fields[name]
     return msgspec.msgpack.encode(fields)

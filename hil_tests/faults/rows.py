@@ -123,7 +123,6 @@ def at_any_phase(number: int) -> None:
 
 
 def sleep_until(time_s: float) -> None:
-    """Sleep until a moment of the monotonic clock."""
     time.sleep(max(0.0, time_s - time.monotonic()))
 
 
@@ -286,7 +285,7 @@ def cpu_starved(rig: Rig, number: int) -> Try:
 
 
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
-    """Stops for the fault, stays stopped when it is over, and drives again once re-armed."""
+    """Judge that it stops for the fault, stays stopped after it, and drives once re-armed."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.switch(VEHICLE, word)
@@ -387,7 +386,7 @@ def recorder_killed(rig: Rig, number: int) -> Try:
 
 
 def states_in(path: Path) -> list[State]:
-    """The states that can be read from a recording, whole or torn."""
+    """Return the states that can be read from a recording, whole or torn."""
     wire = heard_of(Recording(path), VEHICLE_ID)
     states = (decode_state(heard.payload) for heard in wire if heard.topic == "state")
     return [state for state in states if isinstance(state, State)]
@@ -404,7 +403,7 @@ _VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
 
 
 def _link_slows(periods: float, rig: Rig, number: int) -> Try:
-    """It stops though states go on coming, each a little later, and none too late is driven on."""
+    """Judge that it stops though states go on coming, and that no late one is driven on."""
     time.sleep(SETTLED_S)
     begin_s, task = time.monotonic(), rig.task
     entries = task.observation.values()
@@ -452,7 +451,7 @@ def ride_link_stalled(rig: Rig, number: int) -> Try:
 
 
 def _rode(rig: Rig, begin_s: float) -> Try:
-    """Nobody braked since a moment, and from now on it drives."""
+    """Judge that nobody braked since a moment and that it drives on."""
     recovered_s = rig.recovered_after_s(time.monotonic())
     end_s = time.monotonic() + SETTLED_S
     sleep_until(end_s)
@@ -478,7 +477,7 @@ def _is_ended(rig: Rig) -> float:
 
 
 def _stops(reason: str, do: Callable[[Rig], float], rig: Rig, number: int) -> Try:
-    """It stops after what is done while it rides, and stays stopped."""
+    """Judge that it stops for what is done while it rides, and stays stopped."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.simulator.send(signal.SIGSTOP)
