@@ -128,18 +128,20 @@ class Bench:
         except queue.Empty:
             self.hangs = True
             raise TimeoutError(f"{name}() has not come back after {HANG_S:g} s") from None
-        self.longest_s = max(self.longest_s, time.monotonic() - now_s)
         if error is not None:
             raise error
         return answer
 
     def _work(self) -> None:
         while True:
-            do = self._asked.get()
+            do, answer, failure = self._asked.get(), None, None
+            begun_s = time.monotonic()
             try:
-                self._answers.put((do(), None))
+                answer = do()
             except BaseException as error:
-                self._answers.put((None, error))
+                failure = error
+            self.longest_s = max(self.longest_s, time.monotonic() - begun_s)
+            self._answers.put((answer, failure))
 
     def report(self, after_s: float = 0.0) -> VehicleReport:
         """Return its report, after a time in which it is asked for nothing else."""

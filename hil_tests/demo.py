@@ -22,6 +22,7 @@ GOOD_SUCCESS = 0.8  # What the drives without latency should reach
 RECORDED_RUNS = 2
 TRAINING_STEPS, HUMAN_MINUTES, TRAINING_MINUTES = 1500, 2.5, 4.5
 """With them, a demo takes nine minutes at most, on a slow machine, too."""
+REFINING_UPDATES = 1000
 SETTINGS = (
     "batch_size=64", "evaluate_every_steps=500", "evaluation_runs=30",
     # Within so few steps a fast actor learns more than it unlearns.
@@ -113,7 +114,7 @@ class Demo:
                 "1  A person drives and takes over; the human model learns to imitate that",
                 "trainer", "human", "--out", self.human_dir, *seed,
                 "--episodes", arguments.human_episodes, "--frames", "2", "--label-every-step",
-                "--refining-updates", "1000", "--max-minutes", arguments.human_minutes,
+                "--refining-updates", REFINING_UPDATES, "--max-minutes", arguments.human_minutes,
             )  # fmt: skip
         settings = [word for setting in SETTINGS for word in ("--set", setting)]
         command(
