@@ -18,8 +18,8 @@ from bridge.report import markdown_table
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.faults.rows import ROWS, Row
 from hil_tests.faults.run import run_faults
+from hil_tests.faults.table import ROWS, Row
 from hil_tests.sweep import NETWORK_AXES, Axis, draw_axes, render_latency, run_latency
 from trainer.pictures import write_figure
 from trainer.util import cores, kept

@@ -29,7 +29,8 @@ from hil_tests.faults.observe import (
     drives_between,
 )  # fmt: skip
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import Try, at_any_phase, fault
+from hil_tests.faults.rows import at_any_phase
+from hil_tests.faults.table import Try, fault
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
 from hil_tests.mock_hunter.hunter import MODELS
 

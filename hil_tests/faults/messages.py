@@ -16,7 +16,7 @@ from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, noisy_state
-from hil_tests.faults.rows import GAP, Try, drives_on, fault
+from hil_tests.faults.table import GAP, Try, drives_on, fault
 from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0

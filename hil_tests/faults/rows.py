@@ -1,4 +1,4 @@
-"""Rows of the fault table: what a row is, and the faults of both ends and of what is between them.
+"""Faults of both ends, and of the link between them.
 
 A new row is a function that takes a driving rig and the number of its try, does the fault once,
 undoes it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it
@@ -18,113 +18,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from bridge.recording import Recording, heard_of
 from edge_runtime.wire import SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
-from hil_tests.faults.observe import (
-    REACTION_LIMIT_S,
-    RECOVERY_LIMIT_S,
-    drives_between,
-    stops_between,
-)  # fmt: skip
+from hil_tests.faults.observe import REACTION_LIMIT_S, drives_between, stops_between
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig
+from hil_tests.faults.table import GAP, Try, drives_on, fault
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing.policies import T
-
-GAP = "longest gap between commands"
-
-
-@dataclass(frozen=True)
-class Try:
-    """One fault, done and undone.
-
-    ``reaction_s``: from the last good state to the safe stop on the wire (in the log where the
-    wire is cut), or to the other end's own brake; None where nothing was to react.
-    ``recovery_s``: from the fault's end to the first drive command; None where none is due.
-    """
-
-    reaction_s: float | None = None
-    recovery_s: float | None = None
-    reason: str = ""
-    wrong: list[str] = field(default_factory=list)
-    """What was not as the row expects, beside the times."""
-    rejected: Mapping[str, int] = field(default_factory=dict)
-    figures: Mapping[str, float] = field(default_factory=dict)
-    """Further figures of the row, by name with unit."""
-
-
-DoFault = Callable[[Rig, int], Try]
-"""Called with a rig that drives and the number of the try, which is its seed, too."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of the table of faults."""
-
-    name: str
-    done: str
-    expected: str
-    measured: str
-    run: DoFault
-    reaction_limit_s: float | None = REACTION_LIMIT_S
-    recovery_limit_s: float | None = RECOVERY_LIMIT_S
-    rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
-    policy: str = "given"  # ``given``, or one of `run.POLICIES`.
-    flows: bool = False
-    """Whether the simulator's states go on through the fault: where they do not, the machine stood
-    still, and the try is done again (and counted as disturbed)."""
-    alone: bool = False  # Whether it needs the machine for itself
-    goes_on: bool = False  # Whether the drive goes on through the fault
-    counted: Literal["", "edge", "simulator"] = ""
-    """Who must have counted just the messages that a try sent to be rejected. The simulator tells
-    when the drive has ended: each try then has a rig of its own."""
-
-
-ROWS: list[Row] = []
-
-
-def fault(
-    expected: str, measured: str, name: str = "", done: str = "", **options: Any
-) -> Callable[[DoFault], DoFault]:
-    """Put a function into the table, under its name and docstring or ``name`` and ``done``.
-
-    ``options`` are those of `Row`.
-    """
-
-    def add(run: DoFault) -> DoFault:
-        said = done or " ".join((run.__doc__ or "").split()).rstrip(".")
-        ROWS.append(Row(name or run.__name__, said, expected, measured, run, **options))
-        return run
-
-    return add
-
-
-def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
-    """Put a fault into the table through which the drive goes on.
-
-    The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
-    rejected.
-    """
-    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True, **options}
-    return fault(expected, GAP, **through)
-
-
-def at_any_phase(number: int) -> None:
-    """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
-
-
-def sleep_until(time_s: float) -> None:
-    time.sleep(max(0.0, time_s - time.monotonic()))
-
 
 LASTS_S = 1.0
 STALLED_S = 0.6
@@ -144,6 +51,15 @@ _EXPECT_OWN = "simulator brakes by itself: no_command"
 _EXPECT_BOTH = "both ends stop, each by itself"
 _TO_BRAKE = "last drive command to the simulator's brake"
 _THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
+
+
+def at_any_phase(number: int) -> None:
+    """Wait a part of the control period, so that faults do not all come at the same moment."""
+    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
+
+
+def sleep_until(time_s: float) -> None:
+    time.sleep(max(0.0, time_s - time.monotonic()))
 
 
 @fault(_EXPECT_OWN, _TO_BRAKE)

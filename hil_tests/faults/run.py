@@ -24,7 +24,8 @@ from hil_tests.faults.observe import (
     unsafe_commands,
 )
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import Row, Try, at_any_phase
+from hil_tests.faults.rows import at_any_phase
+from hil_tests.faults.table import Row, Try
 from hil_tests.processes import POLICY, in_parallel, trusting
 from hil_tests.testing.policies import TASK, write_policy
 

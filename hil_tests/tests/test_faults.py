@@ -16,8 +16,8 @@ from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
 from hil_tests.faults.rig import ChassisProcess, Rig, Truth, noisy_state
-from hil_tests.faults.rows import ROWS, Row, Try
 from hil_tests.faults.run import Outcome, report_row, run_faults, run_row
+from hil_tests.faults.table import ROWS, Row, Try
 from hil_tests.mock_hunter.chassis import FAULTS
 from hil_tests.testing.policies import TASK
 
