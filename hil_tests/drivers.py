@@ -23,8 +23,6 @@ from trainer.evaluation import drive_episodes, trained_in
 from trainer.options import set_threads
 from trainer.util import cores, die_with_parent
 
-CHUNK = 8  # Drives of one task of a process
-
 
 class Drivers(ProcessPoolExecutor):
     """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
@@ -53,7 +51,7 @@ class Drivers(ProcessPoolExecutor):
 
         Raises UserError where the environment does not report of each drive how it ended.
         """
-        results = list(self.map(partial(_drive, spec), seeds, chunksize=CHUNK))
+        results = list(self.map(partial(_drive, spec), seeds))
         self.driven += len(results)
         self._ends.update(result.outcome for result in results)
         # A step limit is a timeout as soon as the end of any other drive was reported.

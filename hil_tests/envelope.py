@@ -28,7 +28,6 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
 from typing import Annotated, Any
@@ -40,7 +39,7 @@ from bridge.report import GOAL
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json
-from hil_tests.drivers import CHUNK, Drivers
+from hil_tests.drivers import Drivers
 from trainer.environments import CONDITIONS
 from trainer.experiments.data import success_estimate
 from trainer.util import kept
@@ -51,6 +50,7 @@ ZONE = 0.7
 98.5 % and from 91.5 %."""
 TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
 MOST_FAILURES = 50  # At the promise: a point is left undecided after the drives that have so many
+AT_ONCE = 16  # Drives between two looks at whether a point is decided
 FRESH = 1_000_000  # So far from the seeds of the search are those that confirm it
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
 BURST_PERCENT = 5.0  # Share of the messages in bad stretches
@@ -136,7 +136,7 @@ class Search:
     """
 
     def __init__(
-        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = CHUNK
+        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = AT_ONCE
     ) -> None:
         self._drive, self._seed, self._at_once = drive, seed, at_once
         self._new_test = partial(SequentialTest, promise, confidence)
@@ -202,35 +202,21 @@ def find_region(search: Search) -> dict[str, Any]:
         limit, breaks_at = (k and round(k * step, 6) for k in found.pop("steps"))
         return {"limit": limit, "breaks_at": breaks_at, **found}
 
-    edges = dict(zip(AXES, _side_by_side([partial(of_axis, name) for name in AXES]), strict=True))
+    edges = {name: of_axis(name) for name in AXES}
     limits = {name: edge["limit"] for name, edge in edges.items()}
     limits["burst_messages"] *= limits["burst_messages"] >= 1.0
     worse, other = sorted(("jitter_ms", "tail_jitter_ms"), key=limits.__getitem__)
     corner = {name: limit for name, limit in limits.items() if limit and name != other}
 
-    def mixture(names: Sequence[str], k: int) -> Point:
-        return {name: corner[name] * k / SCALE for name in names}
+    def mixture(names: Sequence[str]) -> Ray:
+        return lambda k: {name: corner[name] * k / SCALE for name in names}
 
-    pairs = [partial(mixture, names) for names in combinations(corner, 2)]
-    edges["together"], *held = _side_by_side(
-        [
-            partial(search.edge, partial(mixture, list(corner)), 2 * SCALE),
-            *(partial(search.holds_up_to, pair, SCALE // 2) for pair in pairs),
-        ]
-    )
+    edges["together"] = search.edge(mixture(list(corner)), 2 * SCALE)
+    held = [search.holds_up_to(mixture(pair), SCALE // 2) for pair in combinations(corner, 2)]
     box = min(1.0, edges["together"].pop("steps")[0] / SCALE)
     joint = min(1.0, len(corner) * box, *(2 * k / SCALE for k in held))
     tail_ms, limits["jitter_ms"] = limits.pop("tail_jitter_ms"), limits[worse]
     return {"limits": limits, "joint": joint, "box": box, "tail_jitter_ms": tail_ms, "edges": edges}
-
-
-def _side_by_side(work: Sequence[Callable[[], Any]]) -> list[Any]:
-    """Do all in threads, which wait for drives. After ^C no thread is waited for."""
-    threads = ThreadPoolExecutor(len(work))
-    try:
-        return [future.result() for future in [threads.submit(one) for one in work]]
-    finally:
-        threads.shutdown(wait=False, cancel_futures=True)
 
 
 class EdgeNetworks(msgspec.Struct):
@@ -311,7 +297,7 @@ def run(arguments: argparse.Namespace) -> int:
             first = arguments.seed + FRESH
             found = confirm(drive, known, range(first, first + arguments.runs))
         else:
-            at_once = drivers.jobs * CHUNK
+            at_once = max(drivers.jobs, AT_ONCE)
             search = Search(drive, promise, told.confidence, arguments.seed, at_once)
             found = {**find_region(search), "tried": search.tried}
     report = {
