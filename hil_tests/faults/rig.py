@@ -136,12 +136,13 @@ class Rig:
             "--vehicle-id", VEHICLE_ID, "--out", str(self.directory / "report.json"),
         )  # fmt: skip
 
-    def start_recorder(self, path: Path) -> Process:
-        """Start `bridge record` of this drive, and wait until it listens."""
+    def start_recorder(self) -> tuple[Process, Path]:
+        """Start `bridge record` of this drive into a new file, and wait until it listens."""
+        path = self.directory / f"{time.monotonic_ns()}.mcap"  # a disturbed try is done again
         record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
         recorder = self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
         recorder.wait_for_line("recording")
-        return recorder
+        return recorder, path
 
     def start_router(self) -> Process:
         """Start the router between edge and probe; do not wait for it."""

@@ -271,8 +271,7 @@ def vehicle_not_enabled(rig: Rig, number: int) -> Try:
 @drives_on("recorder says so and ends; the recording is readable; drives on")
 def disk_full(rig: Rig, number: int) -> Try:
     """Disk full while recording."""
-    path = rig.directory / f"{number}.mcap"
-    recorder = rig.start_recorder(path)
+    recorder, path = rig.start_recorder()
     # No file may grow beyond a limit: the same failing write as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
     status = recorder.wait()
@@ -287,8 +286,7 @@ def disk_full(rig: Rig, number: int) -> Try:
 @drives_on("at most 1 s of the recording is lost; drives on")
 def recorder_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the recorder."""
-    path = rig.directory / f"{number}.mcap"
-    recorder = rig.start_recorder(path)
+    recorder, path = rig.start_recorder()
     time.sleep(RECORDED_S)
     sent = len(rig.timeline.states)
     recorder.kill()

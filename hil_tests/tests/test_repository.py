@@ -93,12 +93,6 @@ def test_a_folder_imports_only_what_stands_below_it(folder):
         assert not imported(path) & heavy, path
 
 
-def test_no_product_file_imports_from_tests_and_none_runs_what_it_reads():
-    for path in EVERY_SOURCE:
-        assert not [name for name in modules_of(path) if "tests" in name.split(".")], path
-        assert not RUNS.search(path.read_text()), path
-
-
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
     for path in sources("edge_runtime"):
         foreign = imported(path) - set(sys.stdlib_module_names) - {"edge_runtime"}
@@ -113,6 +107,12 @@ def test_every_library_that_is_imported_is_a_dependency():
     for module in modules - {*ARROWS, *ELSEWHERE} - sys.stdlib_module_names:
         names = {name.lower() for name in installed.get(module, ())}
         assert names & asked_for, module
+
+
+def test_no_product_file_imports_from_tests_and_none_runs_what_it_reads():
+    for path in EVERY_SOURCE:
+        assert not [name for name in modules_of(path) if "tests" in name.split(".")], path
+        assert not RUNS.search(path.read_text()), path
 
 
 @pytest.mark.parametrize("folder", ["edge_runtime", "bridge"])
