@@ -1,89 +1,23 @@
 """The decisions of the edge runtime: state, answer and time in, orders out. No clock, no socket.
 
-First how an action is cut to what a vehicle may do; then the controller. Times are monotonic
-seconds. The caller serialises the calls (loop.py holds one lock). Contract, section 5.
+Times are monotonic seconds. The caller serialises the calls (loop.py holds one lock). Contract,
+section 5.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Sequence, Union
+from typing import List, NamedTuple, Optional, Union
 
 import msgspec
 import numpy as np
 
 from edge_runtime import safety as rules
+from edge_runtime.actions import ActionLimit as ActionLimit  # drivers import it from here
+from edge_runtime.actions import Limits, Ride, limit_action, neutral_action, stop_action
 from edge_runtime.freshness import Freshness
 from edge_runtime.safety import Event, Mode, Safety
-from edge_runtime.util import UserError
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, State, is_foreign
-
-if TYPE_CHECKING:
-    from edge_runtime.manifest import Action
-    from edge_runtime.ride import Ride
-
-
-class ActionLimit(NamedTuple):
-    """What one action may be: its range, and the fastest change (inf: at once).
-
-    `stop` is its value in a safe stop, None to hold the last one: the policy's, no vehicle's.
-    """
-
-    low: float
-    high: float
-    slew_per_s: float = math.inf
-    stop: Optional[float] = None
-
-
-Limits = Dict[str, ActionLimit]  # by the action's name
-
-
-def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
-    """The manifest's range cut to the vehicle's, for each action in the policy's order.
-
-    An empty table (no vehicle) leaves the manifest's range and any speed of change.
-    Raises UserError where a vehicle lacks an action of the policy.
-    """
-    limits = {}
-    for row in actions:
-        if vehicle and row.name not in vehicle:
-            has, its = ", ".join(sorted(vehicle)), f"{row.name!r}, which the policy acts on"
-            raise UserError(f"the vehicle has no {its}; it has {has}")
-        theirs = vehicle.get(row.name) or ActionLimit(row.low, row.high)
-        low, high = max(row.low, theirs.low), min(row.high, theirs.high)
-        if low > high:
-            raise UserError(f"the policy's and the vehicle's range of {row.name!r} do not meet")
-        slew_per_s = min(row.slew_per_s or math.inf, theirs.slew_per_s)
-        stop = None if row.stop is None else min(max(row.stop, low), high)
-        limits[row.name] = ActionLimit(low, high, slew_per_s, stop)
-    return limits
-
-
-def limit_action(
-    wanted: Sequence[float], last: Sequence[float], limits: Limits, elapsed_s: float
-) -> List[float]:
-    """`wanted` within each range, and as near to `last` as the time between them demands.
-
-    A limit that does not bite leaves the number as it is, to the last bit.
-    """
-    limited = []
-    for value, previous, limit in zip(wanted, last, limits.values()):
-        if limit.slew_per_s < math.inf:
-            most = limit.slew_per_s * elapsed_s
-            value = min(max(value, previous - most), previous + most)
-        limited.append(min(max(value, limit.low), limit.high))
-    return limited
-
-
-def neutral_action(limits: Limits) -> List[float]:
-    """Where the limits start before the first command: 0, or the nearest the range allows."""
-    return [min(max(0.0, limit.low), limit.high) for limit in limits.values()]
-
-
-def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
-    """Each action's stop, at once; the last value of one that has none, like a steering."""
-    pairs = zip(limits.values(), last)
-    return [value if limit.stop is None else limit.stop for limit, value in pairs]
 
 
 class Received(NamedTuple):

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 import zenoh
 
 from edge_runtime import log, service
+from edge_runtime.actions import Ride, shared_limits
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
-from edge_runtime.controller import Controller, shared_limits
+from edge_runtime.controller import Controller
 from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.link_quality import link_words
 from edge_runtime.loop import ControlLoop
@@ -184,8 +185,6 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
         # On hold its vehicle must get nothing, and nobody sees what follows when the hold ends.
         armed = config.armed_at_start and config.hold is None
         if config.ride_through.max_s:
-            from edge_runtime.ride import Ride
-
             ride = Ride(config.ride_through.max_s, period_s, limits, plays=vehicle is not None)
         task, needs_rearm = policy.layout.task_text, vehicle is not None
         controller = Controller(limits, period_s, needs_rearm, armed, task, ride)

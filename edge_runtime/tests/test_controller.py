@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from edge_runtime.controller import ActionLimit, Controller, Received, limit_action, shared_limits
-from edge_runtime.ride import Ride
+from edge_runtime.actions import ActionLimit, Ride, limit_action, shared_limits
+from edge_runtime.controller import Controller, Received
 from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mock import MockVehicle

@@ -12,9 +12,9 @@ from hil_tests.testing.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.controller import Controller, Received, shared_limits
+from edge_runtime.actions import Ride, shared_limits
+from edge_runtime.controller import Controller, Received
 from edge_runtime.freshness import DRIFT, Freshness
-from edge_runtime.ride import Ride
 from edge_runtime.vehicles.mock import MockVehicle
 
 T = 0.1

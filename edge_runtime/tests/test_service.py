@@ -24,7 +24,8 @@ from hil_tests.testing.policies import PEDAL, TASK, T
 from hil_tests.testing.vehicles import BrokenVehicle
 
 from edge_runtime import log, loop, realtime
-from edge_runtime.controller import Controller, shared_limits
+from edge_runtime.actions import shared_limits
+from edge_runtime.controller import Controller
 from edge_runtime.loop import ControlLoop
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
