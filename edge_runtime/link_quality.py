@@ -14,13 +14,12 @@ of section 10; each way has its own least time, for a command is paired with no 
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any, Deque, Dict, Mapping, Tuple
+from typing import Any, Deque, Dict, Mapping, Tuple
 
 import msgspec
 import numpy as np
 
-if TYPE_CHECKING:
-    from edge_runtime.wire import State
+from edge_runtime.wire import State
 
 # Windows in messages: 300 follow a change of the delay in 30 s at 10 Hz, and a share of 5 % needs
 # 1,200 to be good to half a point.

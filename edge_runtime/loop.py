@@ -159,7 +159,7 @@ class ControlLoop:
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
         refusal = self._link.refusal(arrived_ns / 1e9)
-        state = refusal or wire.decode_state(payload, self._layout)
+        state = refusal or self._layout.decode(payload)
         with self._lock:
             if isinstance(state, Rejection):
                 self._log_rejection(self._latest.reject(state), arrived_s)

@@ -8,13 +8,22 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple, Union
 
 import msgspec
 import numpy as np
 
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Reason, Rejection, Versioned
+from edge_runtime.wire import (
+    MAX_STATE_BYTES,
+    MAX_TEXT_CHARS,
+    Reason,
+    Rejection,
+    State,
+    Versioned,
+    decode_state,
+    is_foreign,
+)
 
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 2
@@ -193,6 +202,17 @@ class Layout:
         if self.max_payload_bytes > MAX_STATE_BYTES:
             found = f"the observation holds {self.size + names} bytes"
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
+
+    def decode(self, payload: bytes) -> Union[State, Rejection]:
+        """A State with finite numbers whose observation is this task's, or why not.
+
+        A state that names another task is handed on as it is, so that its sender can be told; the
+        policy must not see it.
+        """
+        state = decode_state(payload, self.max_payload_bytes)
+        if isinstance(state, Rejection) or is_foreign(state, self.task_text):
+            return state
+        return self.refusal(state.observation) or state
 
     def refusal(self, observation: Mapping[str, bytes]) -> Optional[Rejection]:
         """Why a state's observation is none of this task's, None where it is one."""

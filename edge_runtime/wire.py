@@ -11,14 +11,11 @@ import math
 import re
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, TypeVar, Union
+from typing import Any, Dict, List, NamedTuple, Optional, TypeVar, Union
 
 import msgspec
 
 from edge_runtime.util import UserError
-
-if TYPE_CHECKING:  # It needs the messages' limits, and says what an observation must be.
-    from edge_runtime.manifest import Layout
 
 SCHEMA = 2
 
@@ -211,17 +208,9 @@ def encode(message: Message) -> bytes:
     return _ENCODER.encode(message)
 
 
-def decode_state(payload: bytes, layout: Optional[Layout] = None) -> Union[State, Rejection]:
-    """A State with finite numbers, whose observation fits the layout, or why not.
-
-    Without a layout any observation is taken. A state that names another task is handed on as it
-    is, so that its sender can be told; the policy must not see it.
-    """
-    limit = layout.max_payload_bytes if layout is not None else MAX_STATE_BYTES
-    state = _decode(payload, State, limit)
-    if layout is None or isinstance(state, Rejection) or is_foreign(state, layout.task_text):
-        return state
-    return layout.refusal(state.observation) or state
+def decode_state(payload: bytes, max_bytes: int = MAX_STATE_BYTES) -> Union[State, Rejection]:
+    """A State with finite numbers and any observation (`Layout.decode` checks that), or why not."""
+    return _decode(payload, State, max_bytes)
 
 
 def is_foreign(state: State, task: str) -> bool:

@@ -1,5 +1,4 @@
 import math
-from functools import partial
 from typing import Any, Dict, List, Optional, Union, get_type_hints
 
 import msgspec
@@ -16,7 +15,7 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
 LAYOUT = Layout(TASK)
-decode_state = partial(wire.decode_state, layout=LAYOUT)
+decode_state = LAYOUT.decode
 DECODERS: Dict[Any, Any] = {
     State: decode_state,
     Command: wire.decode_command,
@@ -203,7 +202,7 @@ def test_a_state_of_many_entries_fits_whatever_their_names_take():
     }
     task = msgspec.structs.replace(TASK, observation=entries)
     state = make_state(0, observation=dict.fromkeys(entries, bytes(4)), task=task.text)
-    assert isinstance(wire.decode_state(wire.encode(state), Layout(task)), State)
+    assert isinstance(Layout(task).decode(wire.encode(state)), State)
 
 
 def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -156,7 +155,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     decode, prefix = DECODERS[topic], "health_" if topic == "health" else ""
     legal = "foreign_session" if topic in ("state", "command") else ""
     if topic == "state":
-        decode = partial(wire.decode_state, layout=Layout(rig.task))
+        decode = Layout(rig.task).decode
     sent: Counter[str] = Counter()
     begin_s = time.monotonic()
     for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):

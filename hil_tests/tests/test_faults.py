@@ -67,7 +67,7 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     payloads = list(mutated(valid, 3000, seed=1))
     assert payloads == list(mutated(valid, 3000, seed=1))
     assert payloads != list(mutated(valid, 3000, seed=2))
-    read = [wire.decode_state(payload, Layout(TASK)) for payload in payloads]
+    read = [Layout(TASK).decode(payload) for payload in payloads]
     reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
     assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
