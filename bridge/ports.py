@@ -32,7 +32,7 @@ from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_a
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
 
@@ -353,7 +353,7 @@ def _run_router(arguments: Any) -> int:
     tls, rules, ready = None, None, f"config={arguments.config}"
     if arguments.config is None:
         ready = f"listen={','.join(listens)}"
-        tls = access.tls_for(arguments.tls, *listens)
+        tls = tls_for(arguments.tls, *listens)
     elif arguments.listen or arguments.tls or arguments.vehicle_id:
         raise UserError("--config goes with no other option: the file says it all")
     if tls is not None:

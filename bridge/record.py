@@ -43,7 +43,7 @@ from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
-from edge_runtime.tls import tls_for
+from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, counted
 
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue

@@ -31,7 +31,7 @@ from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.safety import SILENCE_PERIODS, Event
-from edge_runtime.tls import tls_for
+from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, name_in_file, printable
 from edge_runtime.vehicles import find_vehicle, installed_as, vehicle_limits
 from edge_runtime.wire import (

@@ -35,8 +35,7 @@ from edge_runtime.cli import (
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.run import rearm_command
-from edge_runtime.tls import tls_for
-from edge_runtime.transport import DEFAULT_ENDPOINT
+from edge_runtime.transport import DEFAULT_ENDPOINT, tls_for
 from edge_runtime.util import UserError, printable
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")

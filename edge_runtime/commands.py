@@ -15,8 +15,8 @@ from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_quality import link_words
 from edge_runtime.policy import infer, load_policy, probes
 from edge_runtime.service import peak_memory_mb, quantiles_ms
-from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
-from edge_runtime.transport import check_endpoint, open_session
+from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name
+from edge_runtime.transport import check_endpoint, open_session, tls_for
 from edge_runtime.util import UserError, parse_json, printable
 from edge_runtime.wire import key
 

@@ -51,16 +51,6 @@ class TlsFiles(NamedTuple):
         }
 
 
-def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
-    """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
-    from edge_runtime.transport import check_fits  # Here: `deploy certs` opens no session.
-
-    for endpoint in endpoints:
-        if endpoint is not None:
-            check_fits(endpoint, directory is not None)
-    return None if directory is None else load_tls(directory)
-
-
 def load_tls(directory: PathLike) -> TlsFiles:
     """Check the three files against one another and the clock.
 

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Sequence, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.util import UserError
-
-if TYPE_CHECKING:
-    from edge_runtime.tls import TlsFiles
+from edge_runtime.tls import TlsFiles, load_tls
+from edge_runtime.util import PathLike, UserError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 TLS_PROTOCOLS = ("tls", "quic")
@@ -51,6 +49,14 @@ def check_fits(endpoint: str, with_tls: bool) -> None:
     if not with_tls and is_tls(endpoint):
         where = "name a directory of `python -m deploy certs` with --tls"
         raise UserError(f"endpoint {endpoint} needs certificates: {where}")
+
+
+def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
+    """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
+    for endpoint in endpoints:
+        if endpoint is not None:
+            check_fits(endpoint, directory is not None)
+    return None if directory is None else load_tls(directory)
 
 
 def open_session(

@@ -37,7 +37,7 @@ from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link_quality import link_words
 from edge_runtime.manifest import Layout, Task
-from edge_runtime.tls import tls_for
+from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 

@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import graphlib
 import importlib.util
 import os
 import re
@@ -91,6 +92,35 @@ def test_a_folder_imports_only_what_stands_below_it(folder):
         neighbours = imported(path) & set(ARROWS) - {folder}
         assert neighbours <= ARROWS[folder], path
         assert not imported(path) & heavy, path
+
+
+OPEN_CIRCLES = {
+    "edge_runtime.vehicles.ros2.node": "edge_runtime.vehicles.ros2",
+}
+"""Imports back into a module above that are still there."""
+
+
+def modules_in(path: Path, known: dict[str, Path]) -> set[str]:
+    """Known modules that a file imports, also inside functions and for the type checker."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for name in (f"{node.module}.{alias.name}" for alias in node.names):
+                found.add(name if name in known else node.module)
+    return {name for name in found if known.get(name, path) != path}
+
+
+@pytest.mark.parametrize("folder", sorted(ARROWS.keys() - {"trainer"}))
+def test_no_modules_of_a_folder_import_each_other(folder):
+    names = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in sources(folder)}
+    del names[f"{folder}.__init__"]  # the door names what stands behind it
+    known = {name.removesuffix(".__init__"): path for name, path in names.items()}
+    imports = {
+        name: modules_in(path, known) - {OPEN_CIRCLES.get(name, "")} for name, path in known.items()
+    }
+    graphlib.TopologicalSorter(imports).prepare()  # CycleError names the circle
 
 
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
