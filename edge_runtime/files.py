@@ -128,39 +128,3 @@ def try_to_lock_file(descriptor: int) -> bool:
     except OSError:  # No locks here: then nobody can hold one.
         pass
     return True
-
-
-class Hold:
-    """No command while an installer tries this release: neither on the wire nor to the vehicle.
-
-    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies silences no runtime. Once free, this process never asks
-    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._stream: Optional[BinaryIO] = None
-        try:
-            self._stream = open_regular(path)  # kept until it is free
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
-
-    def is_on(self) -> bool:
-        """Whether commands must stay here. Never waits."""
-        if self._stream is None:
-            return False
-        try:
-            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:  # No locks on this file system; if only for now, the next call asks.
-            return False
-        self._stream.close()
-        self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

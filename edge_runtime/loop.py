@@ -27,13 +27,12 @@ from edge_runtime.link import Link
 from edge_runtime.link_quality import LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
-from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
+from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms
 from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Reason, Rejection, State
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     import numpy as np
 
-    from edge_runtime.files import Hold
     from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / HEALTH_HZ

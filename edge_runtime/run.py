@@ -27,7 +27,6 @@ from edge_runtime.transport import is_tls, open_session
 from edge_runtime.util import PathLike, ending_signals, ends_within, printable, take_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
-    from edge_runtime.files import Hold
     from edge_runtime.tls import TlsFiles
     from edge_runtime.vehicles.base import Vehicle, VehicleRunner
 
@@ -164,9 +163,7 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             find_vehicle(config.vehicle)
         claim = (config.realtime_priority, config.cpus, config.lock_memory)
         if any(claim):
-            from edge_runtime.realtime import claim_resources
-
-            claim_resources(*claim)
+            service.claim_resources(*claim)
         policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
         # Both of its sessions hear only what this vehicle's edge may hear.
         connected = partial(open_session, connect=config.connect, tls=tls, access=access)
@@ -188,11 +185,9 @@ def _drive(config: Config, stop: _StopSignal, vehicle: Optional[Vehicle] = None)
             ride = Ride(config.ride_through.max_s, period_s, limits, plays=vehicle is not None)
         task, needs_rearm = policy.layout.task_text, vehicle is not None
         controller = Controller(limits, period_s, needs_rearm, armed, task, ride)
-        hold: Optional[Hold] = None
+        hold: Optional[service.Hold] = None
         if config.hold is not None:
-            from edge_runtime.files import Hold
-
-            hold = Hold(config.hold)
+            hold = service.Hold(config.hold)
         has_router = require_free(open_client, config.vehicle_id)
         session = connected(mode="peer")
         undo.callback(session.close)  # An open one would hang the process at its exit.

@@ -6,18 +6,35 @@ The board's sensors are Linux's; elsewhere they are unknown.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
+import resource
 import socket
 import threading
 from pathlib import Path
-from typing import Collection, Dict, Mapping, NamedTuple, Optional
+from typing import (
+    Any,
+    BinaryIO,
+    Callable,
+    Collection,
+    Dict,
+    List,
+    Mapping,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+)
 
 import numpy as np
 
 from edge_runtime import log
+from edge_runtime.util import UserError, open_regular
 
 WINDOW = 1024
 _LOOK_PERIOD_S = 2.0
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 class Notifier:
@@ -104,3 +121,86 @@ def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
     """p50, p99 and max in milliseconds; zeros where there is none."""
     p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}
+
+
+def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
+    """Apply what is asked for (0, empty and False ask for nothing), before a thread
+    that drives is started.
+
+    The threads of Zenoh, of the policy and of the vehicle inherit what the main thread has. What
+    the system refuses is logged, one line each, and its name is in the list returned.
+    """
+    usable = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+    rows: Sequence[Tuple[str, Any, Callable[[Any], None], str]] = (
+        # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to all others.
+        ("realtime_priority", priority,
+         lambda it: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(it)),
+         "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"),
+        ("cpus", cpus, _set_cpus, f"this process may use {usable}"),
+        ("lock_memory", lock_memory, _lock_memory,
+         "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"),
+    )  # fmt: skip
+    refused = []
+    for key, value, apply, words in rows:
+        try:
+            if value:
+                apply(value)
+        except (OSError, ValueError, AttributeError) as error:
+            log.event("warning", "not_permitted", key=key, value=value, detail=error, help=words)
+            refused.append(key)
+    return refused
+
+
+def _set_cpus(cpus: Sequence[int]) -> None:
+    missing = set(cpus) - os.sched_getaffinity(0)
+    if missing:  # the kernel would silently take those that exist
+        raise ValueError(f"no processor {sorted(missing)} for this process")
+    os.sched_setaffinity(0, cpus)
+
+
+def _lock_memory(_: object) -> None:
+    """Keep every page that is ever touched; pages that nobody touches take no room."""
+    soft, _hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        # With a limit it would succeed now, and an allocation would fail in mid-drive.
+        raise PermissionError(f"at most {soft // 1024} KiB may be locked")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+class Hold:
+    """No command while an installer tries this release: neither on the wire nor to the vehicle.
+
+    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
+    process, so an installer that dies silences no runtime. Once free, this process never asks
+    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._stream: Optional[BinaryIO] = None
+        try:
+            self._stream = open_regular(path)  # kept until it is free
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # No locks on this file system; if only for now, the next call asks.
+            return False
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

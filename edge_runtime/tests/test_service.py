@@ -23,7 +23,7 @@ from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
 from hil_tests.testing.vehicles import BrokenVehicle
 
-from edge_runtime import log, loop, realtime
+from edge_runtime import log, loop, service
 from edge_runtime.actions import shared_limits
 from edge_runtime.controller import Controller
 from edge_runtime.loop import ControlLoop
@@ -65,17 +65,17 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.append(cpus))
     lock = MagicMock(return_value=-1)  # C's word for a failure
-    monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: MagicMock(mlockall=lock))
+    monkeypatch.setattr(service.ctypes, "CDLL", lambda *_, **__: MagicMock(mlockall=lock))
     for limit, user, tries in ((2**16, 1000, 0), (2**16, 0, 1), (resource.RLIM_INFINITY, 1000, 2)):
         monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
         monkeypatch.setattr(os, "geteuid", lambda user=user: user)
-        assert realtime.claim_resources(0, [], True) == ["lock_memory"]
+        assert service.claim_resources(0, [], True) == ["lock_memory"]
         assert lock.call_count == tries  # with a limit, an allocation would fail in mid-drive
     lock.return_value = 0
-    assert realtime.claim_resources(50, [1], True) == ["realtime_priority"]
+    assert service.claim_resources(50, [1], True) == ["realtime_priority"]
     assert (asked, lock.call_count) == ([[1]], 3)
-    assert realtime.claim_resources(0, [1, 7], False) == ["cpus"]
-    assert realtime.claim_resources(0, [], False) == []
+    assert service.claim_resources(0, [1, 7], False) == ["cpus"]
+    assert service.claim_resources(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json_without_what_a_terminal_acts_upon(capfd):

@@ -17,9 +17,9 @@ import pytest
 from edge_runtime import cli, util
 from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
-from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
+from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy
-from edge_runtime.service import quantiles_ms
+from edge_runtime.service import Hold, quantiles_ms
 from edge_runtime.util import UserError, printable, read_bytes
 
 
