@@ -444,7 +444,7 @@ def _hand_over(asked: Namespace) -> int:
     os.execv(sys.executable, command)
 
 
-FORK = cli.Command(
+FORK = cli.Subcommand(
     cli.examples(
         "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json",
         "python -m bridge fork drive.mcap --episode 2 --at 3s --policy my.onnx --latency 80ms",

@@ -19,7 +19,7 @@ import onnx
 
 from bridge.environments import Environment, changed, describe, known_stops, make_environment
 from bridge.episode import Actuators, pack
-from edge_runtime.cli import Command, examples, positive_number
+from edge_runtime.cli import Subcommand, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
 from edge_runtime.policy import (
@@ -184,4 +184,4 @@ EXAMPLE = examples(
     "    --out pendulum.onnx --key keys/policy.key",
     "python -m deploy policy mine.onnx --env my_package:MyRobot-v0 --out robot.onnx",
 )
-POLICY = Command(EXAMPLE, _add_arguments, _run)
+POLICY = Subcommand(EXAMPLE, _add_arguments, _run)

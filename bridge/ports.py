@@ -28,7 +28,7 @@ from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
-from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
+from edge_runtime.cli import Subcommand, examples, not_negative, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
@@ -379,4 +379,4 @@ ROUTER_EXAMPLE = examples(
     "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
     "    --vehicle-id hunter01 --vehicle-id hunter02",
 )
-ROUTER = Command(ROUTER_EXAMPLE, _add_router_arguments, _run_router)
+ROUTER = Subcommand(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

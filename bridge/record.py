@@ -40,7 +40,7 @@ from bridge.ports import (
 )
 from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
-from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
+from edge_runtime.cli import Subcommand, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
 from edge_runtime.transport import tls_for
@@ -319,4 +319,4 @@ RECORD_EXAMPLE = examples(
     "python -m bridge record --out drive.mcap",
     "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
 )
-RECORD = Command(RECORD_EXAMPLE, _add_record_arguments, _run_record)
+RECORD = Subcommand(RECORD_EXAMPLE, _add_record_arguments, _run_record)

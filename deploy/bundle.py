@@ -31,7 +31,7 @@ from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, BundleManifest, Target, to_json
 from edge_runtime import tls
 from edge_runtime.actions import shared_limits
-from edge_runtime.cli import Command, examples
+from edge_runtime.cli import Subcommand, examples
 from edge_runtime.config import BUILT_IN, NONE, Config, load_config
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.manifest import Manifest
@@ -369,7 +369,7 @@ def _run_lock(arguments: argparse.Namespace) -> int:
     return 0
 
 
-BUNDLE = Command(
+BUNDLE = Subcommand(
     examples(
         "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
         "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
@@ -380,4 +380,4 @@ BUNDLE = Command(
     _add_bundle_arguments,
     _run_bundle,
 )
-LOCK = Command(examples("python -m deploy lock jetpack5"), _add_lock_arguments, _run_lock)
+LOCK = Subcommand(examples("python -m deploy lock jetpack5"), _add_lock_arguments, _run_lock)

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from edge_runtime import tls
-from edge_runtime.cli import Command, examples, whole_number
+from edge_runtime.cli import Subcommand, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id
@@ -304,13 +304,13 @@ def _router_settings(listens: list[str], vehicle_ids: list[str], folder: str) ->
     return nested
 
 
-KEYS = Command(examples("python -m deploy keys --out keys"), _add_keys_arguments, _run_keys)
-CERTS = Command(
+KEYS = Subcommand(examples("python -m deploy keys --out keys"), _add_keys_arguments, _run_keys)
+CERTS = Subcommand(
     examples("python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs"),
     _add_certs_arguments,
     _run_certs,
 )
-ROUTER_FILE = Command(
+ROUTER_FILE = Subcommand(
     examples(
         "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
         "    --vehicle-id hunter01 --vehicle-id hunter02 --out router.json5",

@@ -9,7 +9,7 @@ from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import msgspec
 
-from edge_runtime.cli import Command, examples
+from edge_runtime.cli import Subcommand, examples
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_quality import link_words
@@ -163,7 +163,7 @@ def _temperature(value_c: Any) -> str:
     return "no sensor" if value_c is None else f"{value_c:.0f} degC"
 
 
-CHECK = Command(
+CHECK = Subcommand(
     examples(
         "python -m edge_runtime check my.onnx \\\n    --public-key keys/policy.pub",
         "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
@@ -171,7 +171,7 @@ CHECK = Command(
     _add_check,
     _check,
 )
-STATUS = Command(
+STATUS = Subcommand(
     examples(
         "python -m edge_runtime status",
         "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01 --json",
@@ -179,7 +179,7 @@ STATUS = Command(
     _add_status,
     _status,
 )
-REARM = Command(
+REARM = Subcommand(
     examples(
         "python -m edge_runtime rearm",
         "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
