@@ -167,8 +167,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
     assert "this process may use" in lines[0]["help"]
-    nobody = f"nobody listens on port {endpoint.split(':')[1]} of 127.0.0.1 (connection refused)"
-    assert lines[1]["why"] == f"{endpoint}: {nobody}"
+    assert "connection refused" in lines[1]["why"]
     assert lines[2]["accepted"] == 0
 
 
