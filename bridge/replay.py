@@ -23,10 +23,10 @@ from bridge.messages import Heard, decode, period_of
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of, say_missing
-from edge_runtime.actions import Limits, Ride, shared_limits
+from edge_runtime.actions import Limits, shared_limits
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
-from edge_runtime.controller import Controller, Order, Received
+from edge_runtime.controller import Controller, ControllerConfig, Order, Received
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
@@ -318,8 +318,7 @@ def controller_of(
     """The edge runtime's decision logic; its commands carry plans of so many periods."""
     period_s, task = policy.manifest.control_period_s, policy.layout.task_text
     ride_s = plan_periods * period_s
-    ride = Ride(ride_s, period_s, limits, plays=needs_rearm) if plan_periods else None
-    return Controller(limits, period_s, needs_rearm, is_armed, task, ride)
+    return Controller(ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s))
 
 
 class _Replay:

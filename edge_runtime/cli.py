@@ -180,10 +180,10 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
             if sys.stdout is not None:  # now: at the exit nobody could say what is wrong
                 sys.stdout.flush()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("interrupted", file=sys.stderr, flush=True)
         return INTERRUPTED
     except BrokenPipeError:
         _drop_stdout()
@@ -196,7 +196,7 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
             _drop_stdout()  # it may be stdout that takes no more
         else:
             raise
-        print(f"error: {what}: {error.strerror}", file=sys.stderr)
+        print(f"error: {what}: {error.strerror}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
 

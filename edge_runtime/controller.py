@@ -53,7 +53,7 @@ class Order(NamedTuple):
     ridden: bool = False
 
     def command(self, policy_id: str, sent_ns: int) -> Command:
-        """As it goes out."""
+        """Make the message that goes out."""
         state = self.answers.state
         return Command(
             session=state.session,
@@ -70,41 +70,49 @@ class Order(NamedTuple):
         )
 
 
+class ControllerConfig(NamedTuple):
+    """What a controller decides by.
+
+    `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop. `task`
+    is the policy's; a state that names another one is a fault. `ride_s` is [ride_through] max_s.
+    """
+
+    limits: Limits
+    control_period_s: float
+    needs_rearm: bool = False
+    armed_at_start: bool = True
+    task: str = ""
+    ride_s: float = 0.0
+
+
 class Controller:
     """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. Raises
+    UserError where no plan can be as long as `ride_s`.
     """
 
-    def __init__(
-        self,
-        limits: Limits,
-        control_period_s: float,
-        needs_rearm: bool,
-        armed_at_start: bool = True,
-        task: str = "",
-        ride: Optional[Ride] = None,
-    ) -> None:
-        self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
-        self._ride = ride
+    def __init__(self, config: ControllerConfig) -> None:
+        self._limits, self._period_s = config.limits, config.control_period_s
+        self._needs_rearm, self._task = config.needs_rearm, config.task
+        self._ride: Optional[Ride] = None
+        if config.ride_s:
+            self._ride = Ride(config.ride_s, self._period_s, self._limits, self._needs_rearm)
+        self.safety = Safety(self._period_s, ride_s=self._ride.max_s if self._ride else 0.0)
         self._freshness = Freshness(self.safety.answer_s)
         self._lag_s = 0.0  # of the newest state
         self._fresh_before_s: Optional[float] = None  # `last_fresh_s` before the newest state
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
-        self._policy_is_dead = False
-        self._period_s = control_period_s
-        self._task = task  # the policy's; states that name another one are a fault
         self._latched_fault = ""  # what stopped it, until it is re-armed
-        self._limits = limits
-        self._needs_rearm = needs_rearm
-        self._last_action = neutral_action(limits)
+        self._policy_is_dead = False
+        self._last_action = neutral_action(self._limits)
         self._ordered_s = -math.inf  # when that was ordered
         self._newest: Optional[Received] = None
         self._driven: Optional[Received] = None  # the state whose plan is played
         self._begun_s: Optional[float] = None
         self._next_stop_s = math.inf  # nothing is repeated before a first safe stop
-        if needs_rearm and not armed_at_start:
+        if self._needs_rearm and not config.armed_at_start:
             self._apply(Event.NOT_ARMED)
 
     @property
@@ -120,15 +128,19 @@ class Controller:
 
     def begin(self, received: Received, now_s: float) -> None:
         """The policy starts on the newest state."""
-        session, final = received.state.session, received.state.final
+        session, arrived_s = received.state.session, received.arrived_s
         # The gap counts even where the watchdog did not get to run within it.
-        event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
+        event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)
         if event is not None and not (event is Event.SILENT and self._stopped_late):
             self._apply(event)
-        stands = self.safety.mode is Mode.SAFE_STOP
-        sent_s, arrived_s = received.state.sent_ns * 1e-9, received.arrived_s
-        trip_s = received.trip_s
-        self._lag_s = self._freshness.lag_s(session, sent_s, arrived_s, trip_s, stands, final)
+        self._lag_s = self._freshness.lag_s(
+            session,
+            received.state.sent_ns * 1e-9,
+            arrived_s,
+            received.trip_s,
+            stands=self.safety.mode is Mode.SAFE_STOP,
+            final=received.state.final,
+        )
         self._fresh_before_s = self.safety.last_fresh_s
         if not self._is_late:
             self.safety = rules.note_arrival(self.safety, session, arrived_s)
@@ -138,7 +150,7 @@ class Controller:
     def finish(
         self, output: Optional[np.ndarray], inference_ns: int, now_s: float
     ) -> Optional[Order]:
-        """The policy's answer to the state of `begin`; no order where it came too late.
+        """Order what the policy answers to the state of `begin`; None where it came too late.
 
         An answer that is not float32 [n], or None, is a failed inference.
         """
@@ -160,7 +172,7 @@ class Controller:
         form = (np.float32, (len(self._limits),))
         if output is not None and (output.dtype, output.shape) == form:
             wanted = output.tolist()
-        event = self._event_of(wanted)
+        event = self._event_of(self._newest.state, wanted)
         self._apply(event)
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + self._period_s
@@ -183,7 +195,7 @@ class Controller:
         self._apply(Event.DEAD)
 
     def tick(self, now_s: float) -> Optional[Order]:
-        """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
+        """Order what is due by time alone: a stop, its repetition, or a step of a plan."""
         if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
         was, owed = self.safety.mode, self._newest is not None and not self._stopped_late
@@ -218,7 +230,7 @@ class Controller:
         return min(due) if due else None
 
     def rearm(self, now_s: float) -> str:
-        """An operator's permission to drive again. Empty when taken, else why it is refused."""
+        """Take an operator's permission to drive again; returns why it is refused, or ""."""
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
         if self._policy_is_dead:
@@ -236,16 +248,14 @@ class Controller:
         return ""
 
     def farewell(self) -> Optional[Order]:
-        """The safe stop that goes out when the runtime is ended while it answers a simulator."""
+        """Order the safe stop of a runtime that is ended while it answers a simulator."""
         if self.safety.mode is Mode.STANDBY or self._newest is None:
             return None
         return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
-    def _event_of(self, wanted: List[float]) -> Event:
+    def _event_of(self, state: State, wanted: List[float]) -> Event:
         """Which event an answer is; `wanted` is empty where it has another form."""
-        assert self._newest is not None
-        final = self._newest.state.final
-        if self._task and is_foreign(self._newest.state, self._task):
+        if self._task and is_foreign(state, self._task):
             return Event.OTHER_TASK
         if not wanted:
             return Event.FAILED
@@ -255,8 +265,8 @@ class Controller:
         if self.vehicle_fault:
             return Event.VEHICLE
         if self._is_late:  # the end of the episode ends the drive, however late it is
-            return Event.FINAL if final and self.safety.mode is Mode.DRIVE else Event.LATE
-        return rules.classify_fresh(self.safety, final, self._needs_rearm)
+            return Event.FINAL if state.final and self.safety.mode is Mode.DRIVE else Event.LATE
+        return rules.classify_fresh(self.safety, state.final, self._needs_rearm)
 
     @property
     def _is_late(self) -> bool:

@@ -15,7 +15,7 @@ be the command's: over jitter both ways it would else stay in a stop for good.
 from __future__ import annotations
 
 import math
-from typing import Dict, NamedTuple, Optional
+from typing import Dict, NamedTuple, Optional, Tuple
 
 DRIFT = 200e-6  # s per s: two clocks may drift apart so fast, and the least with them
 
@@ -47,37 +47,41 @@ class Freshness:
     ) -> float:
         """The lag of a state, 0 for the first of its session.
 
-        `sent_s` is the sender's stamp and `arrived_s` monotonic. `trip_s` is None where the sender
-        does not say what it has heard. `stands`: in a safe stop. A final state teaches nothing:
-        a simulator sends it past the network that it injects.
+        `sent_s` is the sender's stamp and `arrived_s` monotonic. `trip_s` is the round trip, None
+        where the sender does not say what it has heard. `stands`: in a safe stop. A final state
+        teaches nothing: a simulator sends it past the network that it injects.
         """
         offset_s = arrived_s - sent_s
         known = self._leasts.get(session, _Least(arrived_s, offset_s, math.inf))
         grown_s = DRIFT * (arrived_s - known.noted_s)
         least_s, least_trip_s = known.offset_s + grown_s, known.trip_s + grown_s
-        is_known, lag_s = least_trip_s < math.inf, offset_s - least_s
+        lag_s = offset_s - least_s
         if final:
             return max(lag_s, 0.0)
         stepped = abs(lag_s) > self._limit_s  # the delay, or a clock
+        knows_trip = least_trip_s < math.inf
         if trip_s is not None and trip_s < 0.0:
             trip_s = None  # a clock was set between its two readings
-        if trip_s is not None and (is_known or not stepped):
+        if trip_s is not None and (knows_trip or not stepped):
             # Only of the first is a lag taken off: later ones come of trips themselves.
-            quickest_s = trip_s if is_known else max(trip_s - max(lag_s, 0.0), 0.0)
+            quickest_s = trip_s if knows_trip else max(trip_s - max(lag_s, 0.0), 0.0)
             least_trip_s = min(least_trip_s, quickest_s)
-        if stands and trip_s is not None and is_known:
-            shown_s = offset_s - (trip_s - least_trip_s)  # the true least is no less
-            if lag_s < -self._limit_s:  # a clock was set ahead
-                least_s = shown_s
-            least_s = min(max(least_s, shown_s), offset_s)
-            # Commands lag, too: were all of the trip the state's, it would never drive over jitter.
-            lag_s = offset_s - min(least_s, shown_s + self._limit_s)
-            if lag_s <= self._limit_s:
-                least_s = offset_s - lag_s
-        elif stepped and is_known:
+        if stands and trip_s is not None and knows_trip:
+            least_s, lag_s = self._by_trip(offset_s, least_s, trip_s - least_trip_s)
+        elif stepped and knows_trip:
             # Where it is less, a clock was set, or the link was slow before: all is late from now.
             least_s, lag_s = offset_s - abs(lag_s), abs(lag_s)
         else:
             least_s, lag_s = min(least_s, offset_s), max(lag_s, 0.0)
         self._leasts[session] = _Least(arrived_s, least_s, least_trip_s)
         return lag_s
+
+    def _by_trip(self, offset_s: float, least_s: float, excess_s: float) -> Tuple[float, float]:
+        """The least offset and the lag by a round trip `excess_s` above the quickest."""
+        shown_s = offset_s - excess_s  # the true least is no less
+        if offset_s - least_s < -self._limit_s:  # a clock was set ahead
+            least_s = shown_s
+        least_s = min(max(least_s, shown_s), offset_s)
+        # Commands lag, too: were all of the trip the state's, it would never drive over jitter.
+        lag_s = offset_s - min(least_s, shown_s + self._limit_s)
+        return (offset_s - lag_s if lag_s <= self._limit_s else least_s), lag_s

@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Deque, Dict, Optional, Tuple
+from typing import TYPE_CHECKING, Deque, Dict, NamedTuple, Optional, Tuple
 
 from edge_runtime import log, wire
 from edge_runtime.controller import Controller, Order, Received
@@ -43,24 +43,27 @@ _FLOOD_PERIOD_S = 1.0
 _HUNG_S = 2.0
 
 
+class LoopParts(NamedTuple):
+    """What a loop connects. `rearm_command` is what the log names to an operator."""
+
+    policy: Policy
+    controller: Controller
+    link: Link
+    notifier: Notifier
+    vehicle: Optional[VehicleRunner] = None
+    hold: Optional[Hold] = None
+    rearm_command: str = ""
+
+
 class ControlLoop:
     """Answers states with commands until it is stopped."""
 
-    def __init__(
-        self,
-        policy: Policy,
-        controller: Controller,
-        link: Link,
-        vehicle: Optional[VehicleRunner],
-        notifier: Notifier,
-        hold: Optional[Hold] = None,
-        rearm_command: str = "",
-    ) -> None:
-        self._policy, self._controller, self._link = policy, controller, link
-        self._vehicle, self._notifier = vehicle, notifier
-        self._hold, self._rearm_command = hold, rearm_command
+    def __init__(self, parts: LoopParts) -> None:
+        self._policy, self._controller, self._link = parts.policy, parts.controller, parts.link
+        self._vehicle, self._notifier = parts.vehicle, parts.notifier
+        self._hold, self._rearm_command = parts.hold, parts.rearm_command
         self._link_quality, self._is_poor = LinkQuality(), False
-        self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
+        self._period_s = parts.policy.manifest.control_period_s
         self._board = BoardWatch()
         self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._latest = LatestState(self._period_s)
@@ -70,7 +73,7 @@ class ControlLoop:
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged, self._logged_wait = controller.safety, False
+        self._logged, self._logged_wait = parts.controller.safety, False
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -81,11 +84,11 @@ class ControlLoop:
         self._worker = threading.Thread(target=self._work, name="policy", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen. Call `run` next."""
+        """Begin to listen; call `run` next."""
         self._worker.start()
         if self._vehicle is not None:
             self._vehicle.on_fault = self._vehicle_failed
-        limit = self._layout.max_payload_bytes
+        limit = self._policy.layout.max_payload_bytes
         self._link.declare(self._on_state, self.health, self._rearm, limit)
 
     def run(self) -> None:
@@ -158,7 +161,7 @@ class ControlLoop:
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
         refusal = self._link.refusal(arrived_ns / 1e9)
-        state = refusal or self._layout.decode(payload)
+        state = refusal or self._policy.layout.decode(payload)
         with self._lock:
             if isinstance(state, Rejection):
                 self._log_rejection(self._latest.reject(state), arrived_s)
@@ -211,9 +214,9 @@ class ControlLoop:
                     self._commands_ns.append(int(took_s * 1e9))
 
     def _infer(self, state: State) -> Tuple[Optional[np.ndarray], int]:
-        if wire.is_foreign(state, self._layout.task_text):
+        if wire.is_foreign(state, self._policy.layout.task_text):
             return None, 0  # nobody has looked whether its observation fits
-        return infer(self._policy, self._layout.arrays(state.observation))
+        return infer(self._policy, self._policy.layout.arrays(state.observation))
 
     def _is_hung(self, now_s: float) -> bool:
         """Whether policy or driver keep or lost their thread: only a new process may help."""

@@ -76,7 +76,7 @@ def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, cla
         replies = [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
         session.liveliness().get.return_value = replies
         presence.look()
-        assert give_way.call_count == times_given
+        assert give_way.called == bool(times_given)
     assert presence.rivals == rivals
 
 
@@ -121,8 +121,8 @@ def test_states_are_taken_only_while_our_certificate_holds_and_the_one_seen_last
 
 
 def test_a_listener_is_looked_at_before_the_tokens_are_shown_to_it(session):
-    presence = Presence(session, "k", lambda: session, lambda: None)
-    presence.listener = listener = MagicMock()
+    listener = MagicMock()
+    presence = Presence(session, "k", lambda: session, lambda: None, listener)
     session.info.routers_zid.return_value = ["router"]
     before = len(declared(session))
     listener.look.side_effect = lambda: calls.append(len(declared(session)))
@@ -202,8 +202,8 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatc
     monkeypatch.setattr(run, "load_policy", lambda *_: policy)
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))
-    with pytest.raises(OSError, match="no link"):
-        run._drive(Config(), MagicMock(), None)
+    with pytest.raises(OSError, match="no link"), contextlib.ExitStack() as unbuilt:
+        run._build(Config(), None, unbuilt)
     assert session.close.call_count == 2  # the one that asked for other runtimes, and its own
 
 

@@ -25,8 +25,8 @@ from hil_tests.testing.vehicles import BrokenVehicle
 
 from edge_runtime import log, loop, service
 from edge_runtime.actions import shared_limits
-from edge_runtime.controller import Controller
-from edge_runtime.loop import ControlLoop
+from edge_runtime.controller import Controller, ControllerConfig
+from edge_runtime.loop import ControlLoop, LoopParts
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
@@ -211,9 +211,9 @@ def running():
         def start(notifier: Any, vehicle: Any = None) -> Any:
             policy: Any = FakePolicy()
             link: Any = FakeLink()
-            controller = Controller(shared_limits([PEDAL], {}), T, needs_rearm=False)
+            controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T))
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
-            control = ControlLoop(policy, controller, link, runner, notifier)
+            control = ControlLoop(LoopParts(policy, controller, link, notifier, runner))
             control.start()
             main = threading.Thread(target=control.run)
             main.start()
