@@ -13,9 +13,9 @@ LATE_PERIODS = 1.2  # So late the next command counts as missing: T, and a fifth
 
 
 class ActionLimit(NamedTuple):
-    """What one action may be: its range, and the fastest change (inf: at once).
+    """The range of one action, and its fastest change (inf: at once).
 
-    `stop` is its value in a safe stop, None to hold the last one: the policy's, no vehicle's.
+    `stop` is its value in a safe stop, None to hold the last one; a vehicle's limits leave it out.
     """
 
     low: float
@@ -28,7 +28,7 @@ Limits = Dict[str, ActionLimit]  # by the action's name
 
 
 def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
-    """The manifest's range cut to the vehicle's, for each action in the policy's order.
+    """Cut the manifest's range to the vehicle's, for each action in the policy's order.
 
     An empty table (no vehicle) leaves the manifest's range and any speed of change.
     Raises UserError where a vehicle lacks an action of the policy.
@@ -51,7 +51,7 @@ def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
 def limit_action(
     wanted: Sequence[float], last: Sequence[float], limits: Limits, elapsed_s: float
 ) -> List[float]:
-    """`wanted` within each range, and as near to `last` as the time between them demands.
+    """Clamp `wanted` to each range, and to the change from `last` that `elapsed_s` allows.
 
     A limit that does not bite leaves the number as it is, to the last bit.
     """
@@ -65,12 +65,12 @@ def limit_action(
 
 
 def neutral_action(limits: Limits) -> List[float]:
-    """Where the limits start before the first command: 0, or the nearest the range allows."""
+    """Return the action before the first command: 0, or the nearest that the range allows."""
     return [min(max(0.0, limit.low), limit.high) for limit in limits.values()]
 
 
 def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
-    """Each action's stop, at once; the last value of one that has none, like a steering."""
+    """Return each action's stop, or its last value where it has none, like a steering."""
     pairs = zip(limits.values(), last)
     return [value if limit.stop is None else limit.stop for limit, value in pairs]
 
@@ -96,7 +96,7 @@ class Ride:
         self._next_s = math.inf
 
     def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
-        """The actions after the command `action`, on towards what the policy `wanted`, from now on.
+        """Plan the actions after the command `action`, on towards what the policy `wanted`.
 
         Each action is limited like the command's own.
         """
@@ -114,7 +114,7 @@ class Ride:
         return self._next_s if self._left else math.inf
 
     def play(self, now_s: float) -> Optional[List[float]]:
-        """The action of this period; None where none is due. What was missed is not made up for."""
+        """Return the action that is due, None where none is. Missed ones are left out."""
         action = None
         while now_s >= self.due_s:
             action = self._left.pop(0)
@@ -122,5 +122,5 @@ class Ride:
         return action
 
     def end(self) -> None:
-        """Nothing is left to play: it stops."""
+        """Forget the plan: there is a stop."""
         self._left = []

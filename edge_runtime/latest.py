@@ -1,8 +1,8 @@
-"""Which state is the newest of the right simulator, and why the others are not.
+"""Which state is the newest of the right simulator, and why the others are rejected.
 
 Pure: time is passed in. Contract, section 3: a new session is taken over only when the current
-one has been silent for 2 T, and a state that is not newer than the last accepted one is rejected,
-as is one from further ahead than any simulator can have come, unless the next state follows it.
+one has been silent for 2 T. A state that is not newer than the last accepted one is rejected, and
+so is one from further ahead than any simulator can have come, unless the next state follows it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class LatestState:
         return None
 
     def reject(self, rejection: Rejection) -> Rejection:
-        """Count a rejection, also one from the decoder, and hand it back."""
+        """Count a rejection, also a decoder's, and return it."""
         reason = rejection.reason.value
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
         return rejection
@@ -89,7 +89,7 @@ class LatestState:
 def _judge_position(
     position: Position, last: _Last, now_s: float, period_s: float
 ) -> Optional[Rejection]:
-    """Reject what is not newer, and what no simulator can have reached since its last state."""
+    """Reject a position that is not newer, or that no simulator can have reached by now."""
     elapsed_s = now_s - last.accepted_s
     episodes = position[0] - last.position[0]
     steps = position[1] - (last.position[1] if episodes == 0 else 0)

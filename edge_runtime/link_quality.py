@@ -112,10 +112,7 @@ class LinkQuality:
         self.down.times_ms.append((heard_ns - sent_ns) * 1e-6)
 
     def measured(self) -> Dict[str, float]:
-        """Return FIELDS: mean delays, the error of both, deviations, losses; empty if not known.
-
-        A clock that is set anew reads as jitter.
-        """
+        """Return FIELDS: mean delays, the error of both, deviations, losses; empty if not known."""
         ways = self.up, self.down
         if min(len(each) for way in ways for each in (way.times_ms, way.counts)) < KNOWN:
             return {}

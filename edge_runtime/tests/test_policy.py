@@ -200,7 +200,7 @@ def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypat
     ("options", "match"),
     [
         ({"manifest_changes": {"action": [PEDAL, STEERING]}}, "its output must be action"),
-        ({"manifest_changes": {"action": []}}, "no action"),
+        ({"manifest_changes": {"action": []}}, "names 0 actions"),
         *(
             ({"manifest_changes": {"control_period_s": period_s}}, "control period is")
             for period_s in (0.0099, 1.001)
@@ -223,10 +223,10 @@ def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypat
         ({"value": float("nan")}, "not finite"),
         ({"actions": (action("x", low=0.5, high=0.5),)}, "must be finite, and not empty"),
         ({"actions": (action("x", high=float("inf")),)}, "not valid: "),  # JSON has no such number
-        ({"actions": (action("x", stop=1.5),)}, "safe stop of x is 1.5, outside"),
+        ({"actions": (action("x", stop=1.5),)}, "safe stop 1.5"),
         ({"actions": (action("x", slew_per_s=0.0),)}, "slew_per_s of x is 0.0"),
-        ({"actions": (PEDAL, PEDAL)}, "names an action twice: pedal, pedal"),
-        ({"actions": [action(f"a{i}") for i in range(601)]}, "names 601 actions; 600 at most"),
+        ({"actions": (PEDAL, PEDAL)}, "names 2 actions"),
+        ({"actions": [action(f"a{i}") for i in range(601)]}, "names 601 actions"),
     ],
 )
 def test_manifest_and_graph_must_agree(plain, options, match):
