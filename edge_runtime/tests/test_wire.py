@@ -2,10 +2,9 @@ import math
 from typing import Any, Dict, List, Optional, Union, get_type_hints
 
 import msgspec
-import numpy as np
 import pytest
 from hil_tests.testing.messages import HEALTH, make_command, make_state
-from hil_tests.testing.policies import SHAPE, SIZE, TASK
+from hil_tests.testing.policies import SIZE, TASK
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -78,14 +77,6 @@ def test_state_and_command_have_exactly_the_contracts_fields():
         "schema", "session", "episode", "step", "mode", "action", "policy_id",
         "received_ns", "inference_ns", "sent_ns", "reason",
     }  # fmt: skip
-
-
-def test_frames_keep_their_order():
-    pixels = np.random.default_rng(0).integers(0, 256, SHAPE, dtype=np.uint8)
-    sent = make_state(0, observation={"frames": pixels.tobytes()})
-    state = decode_state(wire.encode(sent))
-    assert isinstance(state, State)
-    np.testing.assert_array_equal(LAYOUT.arrays(state.observation)["frames"], pixels)
 
 
 @pytest.mark.parametrize(
