@@ -164,7 +164,7 @@ def test_the_example_config_holds_every_key_at_its_default():
     config = load_config(example, {})
     tables = config.vehicle_settings
     assert config == Config(policy="my.onnx", vehicle_settings=tables)
-    kinds = dict(zip(BUILT_IN, (MockParameters, HunterSettings, Ros2Settings), strict=True))
+    kinds: dict = dict(zip(BUILT_IN, (MockParameters, HunterSettings, Ros2Settings), strict=True))
     for name, kind in kinds.items():
         assert convert(tables[name], kind) == kind()
     keys = [key for kind in (Config, *kinds.values()) for key in kind.__struct_fields__]

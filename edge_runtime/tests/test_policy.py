@@ -190,7 +190,7 @@ def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypat
     refused(signed.path, "no public key")
 
 
-MANIFESTS = {
+MANIFESTS: dict = {
     "output": {"action": [PEDAL, STEERING]},
     "actions": {"action": []},
     "control period is 0.0099": {"control_period_s": 0.0099},
@@ -202,7 +202,7 @@ MANIFESTS = {
     "4190208": {"observation": {"frames": Entry(dtype="uint8", shape=[4096, 1024])}},
     "input": {"observation": {"frames": Entry(dtype="float32", shape=[2, 45, 80])}},
 }
-OPTIONS = {
+OPTIONS: dict = {
     "opset 12": {"opset": 12},
     "opset 22": {"opset": 22},
     "IR version 11": {"ir_version": 11},
