@@ -40,9 +40,8 @@ from bridge.replay import controller_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
 from edge_runtime import cli
-from edge_runtime.actions import shared_limits
 from edge_runtime.config import add_trust
-from edge_runtime.controller import Received
+from edge_runtime.controller import Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.policy import Policy, infer, load_policy

@@ -23,10 +23,16 @@ from bridge.messages import Heard, decode, period_of
 from bridge.ports import SimulatorPort, add_options, open_port
 from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of, say_missing
-from edge_runtime.actions import Limits, shared_limits
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
-from edge_runtime.controller import Controller, ControllerConfig, Order, Received
+from edge_runtime.controller import (
+    Controller,
+    ControllerConfig,
+    Limits,
+    Order,
+    Received,
+    shared_limits,
+)
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy

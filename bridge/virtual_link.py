@@ -23,7 +23,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from bridge.network import LatencySpec, make_link
-from edge_runtime.freshness import Freshness
+from edge_runtime.latest import Freshness
 from edge_runtime.safety import (
     Event,
     Mode,

@@ -30,9 +30,9 @@ from deploy.certs import DEFAULT_KEY, write_private
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, BundleManifest, Target, to_json
 from edge_runtime import tls
-from edge_runtime.actions import shared_limits
 from edge_runtime.cli import Subcommand, examples
 from edge_runtime.config import BUILT_IN, NONE, Config, load_config
+from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.manifest import Manifest
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy

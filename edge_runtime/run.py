@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 import zenoh
 
 from edge_runtime import log, service
-from edge_runtime.actions import shared_limits
 from edge_runtime.config import NONE, Config, add_run_flags, load_config
-from edge_runtime.controller import Controller, ControllerConfig
+from edge_runtime.controller import Controller, ControllerConfig, shared_limits
 from edge_runtime.link import Link, OpenClient, require_free, taken, wait_for_router
 from edge_runtime.link_quality import link_words
 from edge_runtime.loop import ControlLoop, LoopParts

@@ -33,7 +33,7 @@ class Event(str, Enum):
     RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for longer than silence_s
-    LATE = "state_late"  # the state lags behind its stamps by more than answer_s (freshness.py)
+    LATE = "state_late"  # the state lags behind its stamps by more than answer_s (latest.py)
     NOT_FINITE = "output_not_finite"
     FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
     DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps

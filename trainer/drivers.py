@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from edge_runtime.actions import limit_action, neutral_action, shared_limits
+from edge_runtime.controller import limit_action, neutral_action, shared_limits
 from edge_runtime.util import UserError, name_in_file
 from trainer.environments import (
     check_trained_in,

@@ -10,8 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from edge_runtime.actions import ActionLimit, Ride, limit_action, shared_limits
-from edge_runtime.controller import Controller, ControllerConfig, Received
+from edge_runtime.controller import (
+    ActionLimit,
+    Controller,
+    ControllerConfig,
+    Received,
+    Ride,
+    limit_action,
+    shared_limits,
+)
 from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mock import MockVehicle

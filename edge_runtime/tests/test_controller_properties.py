@@ -17,8 +17,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
-from edge_runtime.actions import ActionLimit, shared_limits
-from edge_runtime.controller import Controller, ControllerConfig, Order, Received
+from edge_runtime.controller import (
+    ActionLimit,
+    Controller,
+    ControllerConfig,
+    Order,
+    Received,
+    shared_limits,
+)
 
 T = 0.1
 SILENT_S = 2 * T + 0.02  # a grace within the contract's 50 ms

@@ -12,9 +12,8 @@ from hil_tests.testing.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.actions import shared_limits
-from edge_runtime.controller import Controller, ControllerConfig, Received
-from edge_runtime.freshness import DRIFT, Freshness
+from edge_runtime.controller import Controller, ControllerConfig, Received, shared_limits
+from edge_runtime.latest import DRIFT, Freshness
 from edge_runtime.vehicles.mock import MockVehicle
 
 T = 0.1

@@ -21,8 +21,7 @@ from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
 
 from edge_runtime import log, loop, service
-from edge_runtime.actions import shared_limits
-from edge_runtime.controller import Controller, ControllerConfig
+from edge_runtime.controller import Controller, ControllerConfig, shared_limits
 from edge_runtime.loop import ControlLoop, LoopParts
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
