@@ -21,7 +21,7 @@ import zenoh
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
 from edge_runtime.reach import Listener
-from edge_runtime.transport import LEASE_MS, only_own
+from edge_runtime.transport import LEASE_MS
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health, Message, Rejection, encode, key
 
@@ -73,6 +73,9 @@ class Link:
         """Listen to states and answer queries. Call `appear` next, when it can answer."""
 
         def state_came(sample: zenoh.Sample) -> None:
+            # Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
+            if str(sample.key_expr) != state_key:
+                return
             # One byte too many is enough to be rejected; a huge message is not copied.
             is_huge = len(sample.payload) > max_state_bytes
             on_state(bytes(max_state_bytes + 1) if is_huge else bytes(sample.payload))
@@ -91,7 +94,7 @@ class Link:
         session, state_key = self._session, key(self.vehicle_id, "state")
         rearm_key = key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(state_key, _at_once(only_own(state_key, state_came))),
+            session.declare_subscriber(state_key, _at_once(state_came)),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(rearm_key, rearm_asked),
         ]

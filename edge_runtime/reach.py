@@ -140,7 +140,7 @@ def check_port_is_free(endpoint: str) -> None:
     except OSError as error:
         is_busy = error.errno == errno.EADDRINUSE
         why = "is in use" if is_busy else f"cannot be listened at ({error.strerror})"
-        raise UserError(f"{endpoint} {why}; choose another address with --listen") from None
+        raise UserError(f"{endpoint} {why}; choose another with --listen") from None
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
