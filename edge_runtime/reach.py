@@ -27,22 +27,19 @@ _MOST_KEPT = 100
 def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
     """Return whether anybody answers at `endpoint`, and why there is no link; "" if one is likely.
 
-    A host of udp or quic is only resolved. Takes up to 1.3 s for each address of the host, and as
-    long as the name server does.
+    Of udp and quic it knows nothing. Takes up to 1.3 s for each address of the host, and as long
+    as the name server does.
     """
     protocol, host, port = _parts(endpoint)
-    try:
-        _address(endpoint)
-    except OSError as error:
-        return False, f"host {host!r} cannot be resolved ({error.strerror}), port {port}"
     if _kind(protocol) != socket.SOCK_STREAM:
         return False, ""
     try:
         plain = socket.create_connection((host, port), timeout=_LOOK_S)
-    except OSError as error:
-        return False, f"port {port} of {host}: {str(error.strerror or error).lower()}"
+    except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
+        words = str(getattr(error, "strerror", None) or error).lower()
+        return False, f"port {port} of {host}: {words}"
     with contextlib.closing(plain):
-        why = _why_not_plain(plain) if files is None else _why_not_tls(plain, host, files)
+        why = _why_not(plain, host, files)
     return True, why and f"{endpoint} {why}"
 
 
@@ -55,18 +52,8 @@ def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
     return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
 
 
-def _why_not_plain(plain: socket.socket) -> str:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    try:
-        context.wrap_socket(plain).close()
-    except OSError as error:
-        if "ALERT" not in (getattr(error, "reason", "") or ""):  # as an SSLError has it
-            return "answers, but not as a simulator or a router does"
-    return "listens with TLS and wants --tls, with tls/ for tcp/"
-
-
-def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
+def _why_not(plain: socket.socket, host: str, files: Optional[TlsFiles]) -> str:
+    """Shake hands; say what is wrong. Without files nobody should be able to."""
     try:
         with _context(files).wrap_socket(plain, server_hostname=host) as link:
             link.settimeout(_ALERT_S)
@@ -76,17 +63,25 @@ def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
         return f"shows a certificate that is not believed here: {error.verify_message}"
     except OSError as error:
         reason = str(getattr(error, "reason", "") or error.strerror or error)
-        if "ALERT" in reason:
-            needs = "both need one authority, and certificates that have not expired"
-            return f"refuses the certificate of {files.name} ({reason}): {needs}"
-        return f"gives no TLS link to {files.name} ({reason})"
-    return ""
+        is_tls = "ALERT" in reason
+    else:
+        reason, is_tls = "", True
+    if files is None:
+        tls, other = "listens with TLS and wants --tls, with tls/ for tcp/", "answers, but not as"
+        return tls if is_tls else f"{other} a simulator or a router does"
+    if is_tls and reason:
+        needs = "both need one authority, and certificates that have not expired"
+        return f"refuses the certificate of {files.name} ({reason}): {needs}"
+    return reason and f"gives no TLS link to {files.name}: {reason}"
 
 
-def _context(files: TlsFiles) -> ssl.SSLContext:
+def _context(files: Optional[TlsFiles]) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
-    context.load_verify_locations(files.ca)
-    context.load_cert_chain(files.certificate, files.key)
+    if files is None:
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    else:
+        context.load_verify_locations(files.ca)
+        context.load_cert_chain(files.certificate, files.key)
     return context
 
 
@@ -131,15 +126,17 @@ class Listener:
 
 def check_port_is_free(endpoint: str) -> None:
     """Raise UserError where nothing can listen at an endpoint."""
+    protocol, host, port = _parts(endpoint)
     try:
-        family, kind, _, _, target = _address(endpoint)
+        found = socket.getaddrinfo(host, port, type=_kind(protocol))
+        family, kind, _, _, target = found[0]
         with socket.socket(family, kind) as probe:
             # As the listener does: the last run's closed links are no bar.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == _kind("tcp")))
             probe.bind(target)
-    except OSError as error:
-        is_busy = error.errno == errno.EADDRINUSE
-        why = "is in use" if is_busy else f"cannot be listened at ({error.strerror})"
+    except (OSError, UnicodeError) as error:
+        is_busy = getattr(error, "errno", None) == errno.EADDRINUSE
+        why = "is in use" if is_busy else f"cannot be listened at ({error})"
         raise UserError(f"{endpoint} {why}; choose another with --listen") from None
 
 
@@ -169,12 +166,3 @@ def _parts(endpoint: str) -> Tuple[str, str, int]:
     protocol, address = endpoint.split("/", 1)
     host, port = address.rsplit(":", 1)
     return protocol, host.strip("[]"), int(port)
-
-
-def _address(endpoint: str) -> Any:
-    """Resolve the host: the first of `socket.getaddrinfo`; OSError where that fails."""
-    protocol, host, port = _parts(endpoint)
-    try:
-        return socket.getaddrinfo(host, port, type=_kind(protocol))[0]
-    except UnicodeError as error:  # no host can have such a name
-        raise OSError(None, str(error)) from None

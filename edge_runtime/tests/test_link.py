@@ -193,7 +193,7 @@ def test_the_session_is_closed_whatever_fails(session, link, monkeypatch):
 
 
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
-    for endpoint in ("tcp/no-such-host.invalid:1", "tcp/a..b:7447", "udp/a..b:7447"):
+    for endpoint in ("tcp/no-such-host.invalid:1", "tcp/a..b:7447"):
         answers, why = look(endpoint, None)
         assert not answers
         assert endpoint[4:].split(":")[0] in why
