@@ -26,7 +26,6 @@ main = program(
 
 
 def script() -> None:
-    """Be the process of `phil-edge`."""
     status = run_cli(main)  # it has flushed what it printed
     # The interpreter's exit would wait for a thread that hangs, or that a driver left behind.
     os._exit(status)

@@ -72,7 +72,6 @@ def _add_status(parser: argparse.ArgumentParser) -> None:
 
 
 def _status(arguments: argparse.Namespace) -> int:
-    """Print the runtime's status as a table, or as JSON."""
     check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
@@ -85,7 +84,6 @@ def _status(arguments: argparse.Namespace) -> int:
 
 
 def _rearm(arguments: argparse.Namespace) -> int:
-    """Let the runtime drive again. Raises UserError where it refuses."""
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     if tls is not None:
         check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))

@@ -101,7 +101,6 @@ def add_trust(parser: Any) -> None:
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `run`, in groups."""
     policy = parser.add_argument_group("policy")
     add_flags(policy, "policy")
     add_trust(policy)

@@ -169,7 +169,6 @@ class Order(NamedTuple):
     ridden: bool = False
 
     def command(self, policy_id: str, sent_ns: int) -> Command:
-        """Make the message that goes out."""
         state = self.answers.state
         return Command(
             session=state.session,
@@ -243,7 +242,7 @@ class Controller:
         return self.vehicle_fault or self._latched_fault
 
     def begin(self, received: Received, now_s: float) -> None:
-        """The policy starts on the newest state."""
+        """Note that the policy starts on the newest state."""
         session, arrived_s = received.state.session, received.arrived_s
         # The gap counts even where the watchdog did not get to run within it.
         event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)
@@ -305,7 +304,7 @@ class Controller:
         return order._replace(plan=self._ride.begin(wanted, order.action, now_s))
 
     def policy_died(self) -> None:
-        """Nobody finishes what was begun, or begins again. It stops for good; `tick` is due."""
+        """Note that the policy's thread has ended: a stop for good, which `tick` orders at once."""
         self._policy_is_dead = True
         self._begun_s, self._next_stop_s = None, -math.inf
         self._apply(Event.DEAD)
@@ -334,7 +333,7 @@ class Controller:
         return self._stop_order(0, now_s)
 
     def next_deadline_s(self) -> Optional[float]:
-        """When `tick` must be called next; None while nothing is due by time alone."""
+        """Return when `tick` must be called next; None while nothing is due by time alone."""
         due = []
         if self._begun_s is not None:
             due.append(self._begun_s + self._period_s)
@@ -370,7 +369,7 @@ class Controller:
         return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
     def _event_of(self, state: State, wanted: List[float]) -> Event:
-        """Which event an answer is; `wanted` is empty where it has another form."""
+        """Return the event of an answer; `wanted` is empty where it has another form."""
         if self._task and is_foreign(state, self._task):
             return Event.OTHER_TASK
         if not wanted:
@@ -390,7 +389,7 @@ class Controller:
 
     @property
     def _stopped_late(self) -> bool:
-        """Whether it stands and states come late: that there are no others goes without saying."""
+        """Whether it stands while states come late; then the lack of fresh states is no news."""
         return self._is_late and self.safety.mode is Mode.SAFE_STOP
 
     def _give_up(self, now_s: float) -> Order:
@@ -402,7 +401,7 @@ class Controller:
         return self._stop_order(0, now_s)
 
     def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
-        """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
+        """Keep repetitions on a grid, so that late wake-ups do not lower the rate of 1/T."""
         grid_s = self._next_stop_s + self._period_s
         self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + self._period_s
 

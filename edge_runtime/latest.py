@@ -28,8 +28,6 @@ Position = Tuple[int, int]  # (episode, step): what "newer" compares within a se
 
 
 class _Last(NamedTuple):
-    """The newest accepted state of a session."""
-
     position: Position
     accepted_s: float
 
@@ -49,7 +47,7 @@ class LatestState:
         self._leap: Optional[Tuple[str, int, int]] = None
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
-        """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
+        """Accept the state (None) or reject it. `now_s`: monotonic time of arrival."""
         rejection = self._judge(state, now_s)
         if rejection is not None:
             return self.reject(rejection)
@@ -148,7 +146,7 @@ class Freshness:
         stands: bool,
         final: bool = False,
     ) -> float:
-        """The lag of a state, 0 for the first of its session.
+        """Return the lag of a state in s, 0 for the first of its session.
 
         `sent_s` is the sender's stamp and `arrived_s` monotonic. `trip_s` is the round trip, None
         where the sender does not say what it has heard. `stands`: in a safe stop. A final state
@@ -180,7 +178,7 @@ class Freshness:
         return lag_s
 
     def _by_trip(self, offset_s: float, least_s: float, excess_s: float) -> Tuple[float, float]:
-        """The least offset and the lag by a round trip `excess_s` above the quickest."""
+        """Return the least offset and the lag by a round trip `excess_s` above the quickest."""
         shown_s = offset_s - excess_s  # the true least is no less
         if offset_s - least_s < -self._limit_s:  # a clock was set ahead
             least_s = shown_s

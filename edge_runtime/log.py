@@ -33,7 +33,6 @@ def configure(level: str, log_format: str = "text") -> None:
 
 
 def event(level: str, name: str, /, **fields: Any) -> None:
-    """Log an event with its fields."""
     _LOGGER.log(logging.getLevelName(level.upper()), name, extra={"fields": fields})
 
 

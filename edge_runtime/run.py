@@ -44,7 +44,6 @@ add_arguments = add_run_flags
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run `drive` with the command line's settings."""
     flags = {name: getattr(arguments, name, None) for name in (*Config.__struct_fields__, "bus")}
     drive(config=arguments.config, **flags)
     for number in ending_signals():  # a second one must not change how it has ended
@@ -186,7 +185,7 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
 
 
 class _Runtime:
-    """All parts, open and connected: run once, which closes them."""
+    """Owns all parts, open and connected; `run` closes them."""
 
     def __init__(
         self,

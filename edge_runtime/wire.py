@@ -186,7 +186,7 @@ Message = Union[State, Command, Feedback, Health]
 
 
 class Versioned(msgspec.Struct):
-    """What every version of a message has."""
+    """The field of every version of every message."""
 
     schema: int
 
