@@ -70,21 +70,23 @@ def drive(
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
     flags = {"policy": policy and str(policy), "connect": connect, **settings}
-    # `unbuilt` closes what a build that fails has opened.
-    with contextlib.ExitStack() as undo, contextlib.ExitStack() as unbuilt:
-        if driver is not None:
-            from edge_runtime.vehicles import check_driver
+    try:
+        # `unbuilt` closes what a build that fails has opened.
+        with contextlib.ExitStack() as undo, contextlib.ExitStack() as unbuilt:
+            if driver is not None:
+                from edge_runtime.vehicles import check_driver
 
-            check_driver(driver)
-            _close_unless_built(driver, unbuilt)
-        loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
-        log.configure(loaded.log_level, loaded.log_format)
-        undo.callback(log.close)
-        stop = _StopSignal(until, undo)
-        runtime = _build(loaded, driver, unbuilt)
-        unbuilt.pop_all()
-        ended = runtime.run(stop)
-    return log.close() and ended
+                check_driver(driver)
+                _close_unless_built(driver, unbuilt)
+            loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
+            log.configure(loaded.log_level, loaded.log_format)
+            stop = _StopSignal(until, undo)
+            runtime = _build(loaded, driver, unbuilt)
+            unbuilt.pop_all()
+            ended = runtime.run(stop)
+    finally:
+        written = log.close()
+    return ended and written
 
 
 class _StopSignal:
