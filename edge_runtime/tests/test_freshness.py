@@ -41,6 +41,14 @@ def test_a_lag_is_what_a_state_has_above_the_quickest_of_its_session():
     assert lags((0.0, 0.0), *((T * n, T * n + 3.0) for n in (1, 2, 3)))[1:] == near(3, 3, 3)
 
 
+def test_a_quicker_state_is_the_new_measure_and_is_not_late_itself():
+    # Of a sender that does not say what it heard.
+    assert lags((0.0, 3.0), (3.1, 3.1), (3.2, 6.2)) == near(0, 0, 3)
+    # Of one that does, while it stands.
+    states, trips = [(0.0, 0.2), (T, 0.2), (2 * T, 0.4)], {0: 0.25, 1: 0.15}
+    assert lags(*states, trips=trips, stands={1}) == near(0, 0, 0.1)
+
+
 def test_clocks_that_drift_apart_are_followed():
     drifting = [(s, s * (1 + DRIFT)) for s in range(0, 3601, 60)]
     assert max(lags(*drifting)) == 0.0
