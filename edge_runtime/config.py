@@ -107,7 +107,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     add_flags(parser.add_argument_group("simulator"), "connect", "tls", "vehicle_id")
     add_flags(parser.add_argument_group("vehicle"), "vehicle", "bus")
     more = parser.add_argument_group("settings and log")
-    text = "file with these and more settings (see edge_runtime/config.example.toml); options win"
+    text = "settings file (edge_runtime/config.example.toml explains each); options override it"
     more.add_argument("--config", metavar="FILE.toml", help=text)
     add_flags(more, "log_level", "log_format")
 
