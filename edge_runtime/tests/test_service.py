@@ -19,6 +19,7 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.edge import run_edge
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
+from hil_tests.testing.vehicles import BrokenVehicle
 
 from edge_runtime import log, loop, service
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
@@ -27,7 +28,6 @@ from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
 from edge_runtime.vehicles.base import VehicleRunner
-from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.wire import Reason, Rejection, encode
 
 
@@ -212,20 +212,6 @@ class FakeLink:
         self.sent[topic] = self.sent[topic][0] + 1, message
 
 
-class FaultyVehicle(MockVehicle):
-    """A mock with faults in words, which hangs while it is told to."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.says: list = []
-        self.free = threading.Event()
-        self.free.set()
-
-    def feedback(self, now_s: float) -> Any:
-        self.free.wait(20.0)
-        return super().feedback(now_s)._replace(faults=list(self.says))
-
-
 @pytest.fixture
 def running():
     """Starts a loop with its real threads between a fake policy and a fake link."""
@@ -251,7 +237,7 @@ def running():
             if vehicle:
                 runner.start()
                 ends.callback(runner.close)
-                ends.callback(vehicle.free.set)
+                ends.callback(vehicle.released.set)
             return control, link, policy
 
         yield start
@@ -307,22 +293,22 @@ def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running,
 
 def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
     monkeypatch.setattr(loop, "_HUNG_S", 0.2)
-    vehicle = FaultyVehicle()
+    vehicle = BrokenVehicle()
     running(systemd.notifier(), vehicle)
     assert systemd.next() == "WATCHDOG=1"
-    vehicle.free.clear()
+    vehicle.hangs = "feedback"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
-    vehicle.free.set()
+    vehicle.go_on()
     assert systemd.until("WATCHDOG") == "WATCHDOG=1"
 
 
 def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
-    vehicle = FaultyVehicle()
+    vehicle = BrokenVehicle()
     control, link, _ = running(Notifier({}), vehicle)
     link.state_comes(encode(make_state(0)))
-    vehicle.says = ["the battery is hot"]
+    vehicle.odd = {"faults": ["the battery is hot"]}
     wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
-    vehicle.says = []
+    vehicle.odd = {}
     wait_until(lambda: not control._vehicle.fault(time.monotonic()), "the end of the fault")
     assert control.health().vehicle_fault == "the battery is hot"
 
