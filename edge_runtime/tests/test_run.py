@@ -336,9 +336,8 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
     # Nobody has seen what the vehicle would do: it waits for its operator, armed at start or not.
     command = simulator.next_command()
     assert (command.session, command.reason) == ("simulator-a", "not_armed")
-    assert simulator.query("rearm")["accepted"]
-    feed(6)
-    assert wait_until(lambda: simulator.feedback[-1].mode == "drive", "a drive at the vehicle")
+    simulator.steps = steps
+    simulator.drive_until(lambda: simulator.feedback[-1].mode == "drive", "a drive", rearms=True)
     assert edge.end() == 0
 
 
