@@ -16,7 +16,8 @@ import numpy as np
 from bridge.clocks import Clock
 from bridge.environments import Environment, entry_name, finite, offered
 from bridge.messages import Origin, Scene
-from bridge.report import ACCELERATIONS, EpisodeResult, SafeStopLog, of_known, outcome_of
+from bridge.outcomes import outcome_of
+from bridge.report import ACCELERATIONS, EpisodeResult, SafeStopLog, of_known
 from bridge.virtual_link import Decision
 from edge_runtime.manifest import Action, Layout, Task
 from edge_runtime.safety import Event

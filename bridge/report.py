@@ -15,47 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.outcomes import COLLISION, GOAL, UNTOLD, settled
 from bridge.virtual_link import BRAKE_PERIODS, NO_COMMAND, Decision
 from edge_runtime.util import counted, printable
 from edge_runtime.wire import Command, Feedback
-
-GOAL, FAILED = "goal", "failed"
-UNKNOWN = "ended"
-"""An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
-TRUNCATED, TIMEOUT = "truncated", "timeout"
-"""Gymnasium's limit of steps has ended an episode of which the environment says nothing: a timeout
-as soon as it says of any other how that ended (`settled`)."""
-COLLISION = "collision"
-STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
-DISCARDED = "discarded"
-"""The person threw it away: it is shown, and nothing learns from it."""
-UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
-
-
-def failed(outcome: str) -> bool:
-    """Whether an episode missed its goal; not where none is known, or where a person ended it."""
-    return outcome != GOAL and outcome not in UNTOLD
-
-
-def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
-    """How an episode has ended, by the environment's last ``info``.
-
-    Where that does not say: TRUNCATED for one that only a limit of steps has ended, else UNKNOWN.
-    """
-    if info.get("outcome"):
-        return str(info["outcome"])
-    success = info.get("is_success")
-    if success is None:
-        return TRUNCATED if only_truncated else UNKNOWN
-    return GOAL if success else FAILED
-
-
-def settled(outcomes: Iterable[str]) -> list[str]:
-    """The same, with TIMEOUT for TRUNCATED as soon as any tells how its episode ended."""
-    outcomes = list(outcomes)
-    is_told = not UNTOLD.issuperset(outcomes)
-    return [TIMEOUT if is_told and one == TRUNCATED else one for one in outcomes]
-
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
 

@@ -15,7 +15,8 @@ from multiprocessing import get_context
 from typing import Any
 
 from bridge.network import LatencySpec
-from bridge.report import TIMEOUT, TRUNCATED, UNKNOWN, EpisodeResult
+from bridge.outcomes import TIMEOUT, TRUNCATED, UNKNOWN
+from bridge.report import EpisodeResult
 from edge_runtime.util import UserError
 from trainer.drivers import load_driver, located
 from trainer.environments import make_environment

@@ -35,7 +35,7 @@ from typing import Annotated, Any
 import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
-from bridge.report import GOAL
+from bridge.outcomes import GOAL
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json

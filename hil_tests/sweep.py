@@ -18,8 +18,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from bridge.network import parse_spec
+from bridge.outcomes import COLLISION, GOAL
 from bridge.progress import ProgressBar
-from bridge.report import COLLISION, GOAL, EpisodeResult, markdown_table
+from bridge.report import EpisodeResult, markdown_table
 from hil_tests.drivers import Drivers
 from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 

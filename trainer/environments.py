@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bridge import environments as bridge
 from bridge.episode import array_of, finite
-from bridge.report import outcome_of
+from bridge.outcomes import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bridge.report import GOAL
+from bridge.outcomes import GOAL
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
 from trainer.training.config import CURVE_FILE

@@ -29,7 +29,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bridge.messages import Pace, SeenScene, read_scene
-from bridge.report import GOAL
+from bridge.outcomes import GOAL
 from bridge.rerun import draw
 from bridge.rerun.draw import Canvas, Plot
 from edge_runtime.cli import sigterm_as_interrupt

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.network import parse_spec
-from bridge.report import GOAL
+from bridge.outcomes import GOAL
 from edge_runtime.policy import policy_id_of
 from edge_runtime.util import UserError
 from hil_tests.__main__ import main

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from bridge.report import GOAL, failed
+from bridge.outcomes import GOAL, failed
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
 from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit

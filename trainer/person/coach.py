@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.report import failed
+from bridge.outcomes import failed
 from edge_runtime.util import counted
 from trainer.training.metrics import LEARNED as LEVELS
 from trainer.training.metrics import is_reached, was_validated

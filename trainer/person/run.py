@@ -31,7 +31,8 @@ from typing import Any, NamedTuple
 import torch
 from numpy.typing import NDArray
 
-from bridge.report import DISCARDED, GOAL, EpisodeResult
+from bridge.outcomes import DISCARDED, GOAL
+from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted

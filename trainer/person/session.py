@@ -18,7 +18,7 @@ from typing import Any
 from msgspec import structs
 
 from bridge.fork import ForkedEnvironment, find_fork
-from bridge.report import DISCARDED, RESTARTED, STOPPED, failed, settled
+from bridge.outcomes import DISCARDED, RESTARTED, STOPPED, failed, settled
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError, counted

@@ -17,7 +17,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import trainer
-from bridge.report import COLLISION
+from bridge.outcomes import COLLISION
 from edge_runtime.cli import AGAIN_S, INTERRUPTED, run_cli
 from edge_runtime.util import UserError
 from hil_tests.testing.learners import same_weights

@@ -19,7 +19,8 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, EpisodeResult, failed, settled
+from bridge.outcomes import GOAL, failed, settled
+from bridge.report import EpisodeResult
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.drivers import BEST_FILE, TogetherDriver
