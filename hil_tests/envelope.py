@@ -36,12 +36,12 @@ import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
 from bridge.outcomes import GOAL
+from bridge.statistics import success_estimate
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json
 from hil_tests.drivers import Drivers
 from trainer.environments import CONDITIONS
-from trainer.experiments.data import success_estimate
 from trainer.util import kept
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"

@@ -21,8 +21,8 @@ from bridge.network import parse_spec
 from bridge.outcomes import COLLISION, GOAL
 from bridge.progress import ProgressBar
 from bridge.report import EpisodeResult, markdown_table
+from bridge.statistics import Estimate, mean_estimate, success_estimate
 from hil_tests.drivers import Drivers
-from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 
 PANELS = 3  # In a row
 
