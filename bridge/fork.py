@@ -16,7 +16,6 @@ import os
 import sys
 import tempfile
 from argparse import Namespace
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
@@ -31,11 +30,11 @@ from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
 from bridge.environments import Environment, describe, make_environment, scene_of
 from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
 from bridge.inbound import CommandCheck
-from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene, decode
+from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
 from bridge.record import RecordingWriter, new_recording
-from bridge.recording import Recording, choose_vehicle, heard_of, say_missing
+from bridge.recording import Recording, choose_vehicle, valid_messages
 from bridge.replay import controller_of
 from bridge.report import EpisodeResult
 from bridge.virtual_link import Arrival, Decision
@@ -82,7 +81,7 @@ class RecordedEpisode:
             self.states.setdefault(message.step, []).append(message)
         elif isinstance(message, Command):
             self.commands.setdefault(message.step, message)
-        else:
+        elif isinstance(message, Scene):
             self.scenes[message.step], action = _told(heard.payload), message.applied or []
             if len(action) == len(self.task.action) and np.isfinite(action).all():
                 self.applied[message.step - 1] = action, message.braked
@@ -157,12 +156,12 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
     """
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
-    say_missing(recording, vehicle_id)
     begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
-    for heard, message in _messages(recording, vehicle_id):
+    for heard, message in valid_messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:
             about = message.origin, message.episode, message.task, heard.arrived_ns
             begun.setdefault((message.origin.session, message.episode), about)
+    recording.say_missing()
     if not begun:
         why = "it was recorded by an earlier version, or without its scenes"
         raise UserError(f"{path} does not say how its drives were begun: {why}")
@@ -172,15 +171,9 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
         which = f"--episode says which, 0 to {len(begun) - 1}"
         raise UserError(f"{path} holds {counted(len(begun), 'drive')}; {which}")
     drive = RecordedEpisode(path, vehicle_id, number, *list(begun.values())[number])
-    for heard, message in _messages(recording, vehicle_id):
+    for heard, message in valid_messages(recording, vehicle_id):
         drive.take(heard, message)
     return drive
-
-
-def _messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
-    for heard in heard_of(recording, vehicle_id):
-        if heard.topic in ("scene", "state", "command"):
-            yield heard, decode(heard)
 
 
 class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -24,8 +24,7 @@ import numpy as np
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
-from bridge.recording import say_missing
-from bridge.replay import Answer, RecordedDrive, key_of, without_repetitions
+from bridge.replay import Answer, RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
 from edge_runtime.files import check_writable, write_json
@@ -79,7 +78,6 @@ def run(arguments: Any) -> int:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     left_out = sum(not state.final for state in drive.states()) - frames
-    say_missing(drive.recording, drive.vehicle_id)
     missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
     print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
     return 0
@@ -128,10 +126,8 @@ def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
     Of an answer with a plan, the action of now.
     """
     layout, size = Layout(task), len(task.action)
-    answers = without_repetitions(exchange.answers for exchange in drive.exchanges.values())
-    first = {key: each[0] for key, each in zip(drive.exchanges, answers, strict=True)}
     for state in drive.states():
-        answer = None if state.final else first.get(key_of(state))
+        answer = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
         if readable and answer and answer.action and len(answer.action) % size == 0:
             yield state, answer._replace(action=answer.action[:size])

@@ -16,7 +16,7 @@ import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -65,6 +65,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.invalid_messages = 0  # Of the last pass of `valid_messages`
         self._begin()
 
     def _begin(self) -> None:
@@ -100,6 +101,13 @@ class Recording:
         if trouble := self.trouble():
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line + taken, file=sys.stderr, flush=True)
+
+    def say_missing(self) -> None:
+        """Say on stderr what `valid_messages` could not read, and what it left out."""
+        self.say_trouble()
+        if self.invalid_messages:
+            left_out = f"left out: {counted(self.invalid_messages, 'message')} not valid"
+            print(f"{self.path}: {left_out}", file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[Stored]:
         """Yield the messages as they stand in the file, which is the order of their arrival.
@@ -237,14 +245,16 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
             yield Heard(key, topic, message.data, message.log_time, len(message.data))
 
 
-def say_missing(recording: Recording, vehicle_id: str) -> None:
-    """Say on stderr what cannot be read, and how many messages of the vehicle nobody can use."""
-    wire = (heard for heard in heard_of(recording, vehicle_id) if heard.topic in DECODERS)
-    invalid = sum(isinstance(decode(heard), Rejection) for heard in wire)
-    recording.say_trouble()
-    if invalid:
-        messages = counted(invalid, "message")
-        print(f"{recording.path}: left out: {messages} not valid", file=sys.stderr, flush=True)
+def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
+    """Yield a vehicle's messages, heard and decoded; the invalid are left out and counted."""
+    recording.invalid_messages = 0
+    for heard in heard_of(recording, vehicle_id):
+        if heard.topic in DECODERS:
+            message = decode(heard)
+            if isinstance(message, Rejection):
+                recording.invalid_messages += 1
+            else:
+                yield heard, message
 
 
 def _wire_topic(stored: Stored) -> tuple[str, str]:

@@ -30,7 +30,7 @@ from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import Log, RawImage, RecordingWriter, _listen, describe
 from bridge.recording import Recording, Stored
-from bridge.replay import RecordedDrive, replay_in_process
+from bridge.replay import RecordedDrive, replay
 from bridge.tests.test_inbound import health
 from bridge.tests.test_replay import Hand
 from edge_runtime.cli import quit_on_signals
@@ -137,7 +137,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     drive = RecordedDrive(tmp_path / "a.mcap", None)
     policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
     assert ("here", 0, 1) in drive.exchanges
-    replay_in_process(drive, policy, Config())
+    replay(drive, policy, Config())
 
 
 def states_in(path: Path) -> list[tuple[int, Any]]:
