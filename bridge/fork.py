@@ -27,8 +27,8 @@ import msgspec
 import numpy as np
 
 from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
-from bridge.environments import Environment, describe, make_environment, scene_of
-from bridge.episode import Actuators, EpisodeRunner, pack, policy_action
+from bridge.environments import Adapter, Environment, describe, make_environment, scene_of
+from bridge.episode import EpisodeRunner, policy_action
 from bridge.inbound import CommandCheck
 from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene
 from bridge.network import LatencySpec, parse_spec
@@ -42,7 +42,7 @@ from edge_runtime import cli
 from edge_runtime.config import add_trust
 from edge_runtime.controller import Received, shared_limits
 from edge_runtime.files import write_atomic, write_json_out
-from edge_runtime.manifest import Layout, Task
+from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, name_in_file, printable
 from edge_runtime.wire import DRIVE, Command, State, encode
@@ -142,11 +142,11 @@ class RecordedEpisode:
             why = f"{where} {found} is another than recorded"
             raise UserError(f"{self.path}: the drive cannot be rebuilt: {why}")
 
-    def redo(self, step: int, actuators: Actuators) -> np.ndarray:
+    def redo(self, step: int, adapter: Adapter) -> np.ndarray:
         """The recorded action of a step, with the brake as it was."""
         action, braked = self.applied[step]
-        actuators.brake(braked)
-        return actuators.within(action)
+        adapter.press_brake(braked)
+        return adapter.within(action)
 
 
 def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
@@ -188,15 +188,15 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Rebuild the drive until the fork; its seed goes before. UserError: it is another."""
-        drive, layout = self._drive, Layout(self._drive.task)
-        actuators = Actuators(self.env, drive.task.action)
+        drive = self._drive
+        adapter = Adapter(self.env, drive.task)
         options = {"standing": True} if drive.origin.standing else None
         seen, info = self.env.reset(seed=drive.origin.seed, options=options)
         for step in range(self._fork):
-            drive.check(step, pack(layout, self.env, seen), self.env)
-            seen, *_, info = self.env.step(drive.redo(step, actuators))
-        drive.check(self._fork, pack(layout, self.env, seen), self.env)
-        actuators.brake(False)
+            drive.check(step, adapter.pack(seen), self.env)
+            seen, *_, info = self.env.step(drive.redo(step, adapter))
+        drive.check(self._fork, adapter.pack(seen), self.env)
+        adapter.press_brake(False)
         return seen, info
 
 
@@ -275,10 +275,10 @@ class ForkedDrive(LockStepClock):
         if self.first_difference is None and not same:
             self.first_difference = self._step
 
-    def _apply(self, actuators: Actuators, decision: Decision) -> np.ndarray:
+    def _apply(self, adapter: Adapter, decision: Decision) -> np.ndarray:
         if self._step < self._fork:
-            return self._drive.redo(self._step, actuators)
-        action = policy_action(actuators, decision)
+            return self._drive.redo(self._step, adapter)
+        action = policy_action(adapter, decision)
         done = [float(value) for value in action.ravel()], bool(decision.brake_reason)
         self._note(self._drive.applied.get(self._step) == done)
         return action

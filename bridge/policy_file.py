@@ -8,6 +8,9 @@ board itself would load.
 from __future__ import annotations
 
 import argparse
+import json
+import re
+from collections.abc import Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,11 +20,10 @@ import msgspec
 import numpy as np
 import onnx
 
-from bridge.environments import Environment, changed, describe, known_stops, make_environment
-from bridge.episode import Actuators, pack
+from bridge.environments import Adapter, Environment, describe, known_stops, make_environment
 from edge_runtime.cli import Subcommand, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
+from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Task, check_task
 from edge_runtime.policy import (
     MAX_POLICY_MIB,
     OUTPUT,
@@ -96,6 +98,33 @@ def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> 
             raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
 
 
+def changed(task: Task, changes: Sequence[str]) -> Task:
+    """Return the task with changes such as ``action.0.stop=-1``; the value is JSON or plain text.
+
+    ``stop``, ``slew_per_s``, ``meaning`` and ``unit`` of an action can be changed. Raises UserError
+    for anything else.
+    """
+    actions = list(task.action)
+    for change in changes:
+        match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)=(.*)", change)
+        if match is None or int(match[1]) >= len(actions):
+            most = len(actions) - 1
+            form = f"action.N.stop=VALUE, or slew_per_s, meaning, unit, with N from 0 to {most}"
+            raise UserError(f"--set {change}: expected {form}")
+        try:
+            value = json.loads(match[3])
+        except ValueError:
+            value = match[3]
+        row = msgspec.to_builtins(actions[int(match[1])]) | {match[2]: value}
+        try:
+            actions[int(match[1])] = msgspec.convert(row, Action)
+        except msgspec.ValidationError as error:
+            raise UserError(f"--set {change}: {error}") from None
+    task = msgspec.structs.replace(task, action=actions)
+    check_task(task)
+    return task
+
+
 def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
     """The policy file's bytes: the model with its manifest in it.
 
@@ -142,14 +171,14 @@ def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.nda
     actions: list[np.ndarray] = []
     space: Any = environment.action_space
     space.seed(0)
-    actuators = Actuators(environment, policy.manifest.action)
+    adapter = Adapter(environment, policy.manifest)
     episode, over = 0, True
     seen: Any = None
     while len(actions) < REAL_OBSERVATIONS:
         if over:
             seen, _ = environment.reset(seed=episode)
             episode += 1
-        packed = pack(policy.layout, environment, seen)
+        packed = adapter.pack(seen)
         try:
             action = policy.act(policy.layout.arrays(packed))
         except UserError:
@@ -159,7 +188,7 @@ def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.nda
         check_answer(action, policy.manifest, "a real observation")
         actions.append(action)
         wanted = space.sample() if episode % 2 == 0 else action
-        seen, _, terminated, truncated, _ = environment.step(actuators.within(wanted))
+        seen, _, terminated, truncated, _ = environment.step(adapter.within(wanted))
         over = terminated or truncated
     return np.min(actions, axis=0), np.max(actions, axis=0)
 

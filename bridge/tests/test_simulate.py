@@ -16,16 +16,16 @@ import pytest
 
 from bridge.environments import (
     SCENARIO_GROUP,
+    Adapter,
     describe,
     known_stops,
     make_environment,
     say_once,
     scene_of,
 )
-from bridge.episode import Actuators, EpisodeRunner, pack
+from bridge.episode import EpisodeRunner
 from bridge.messages import Origin
 from bridge.virtual_link import NO_COMMAND, Decision
-from edge_runtime.manifest import Layout
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
@@ -373,14 +373,14 @@ def test_what_a_wrapper_offers_is_found_and_the_outermost_wins():
     assert [row.name for row in task.action] == ["pedal"]
     assert known_stops(inner) == [None]  # It has a brake.
     assert scene_of(inner) == {"road_width_m": 4.0}
-    actuators = Actuators(inner, task.action)
-    actuators.brake(True)
+    adapter = Adapter(inner, task)
+    adapter.press_brake(True)
     assert inner.get_wrapper_attr("pressed") == [True]
-    assert actuators.stop().tolist() == [-1.0]
+    assert adapter.stop().tolist() == [-1.0]
     outer = gymnasium.Wrapper(inner)
     outer.control_period_s = 0.4  # type: ignore[attr-defined]
     assert describe(outer).control_period_s == 0.4
-    assert list(pack(Layout(task), outer, np.zeros(3, np.float32))) == ["numbers"]
+    assert list(Adapter(outer, task).pack(np.zeros(3, np.float32))) == ["numbers"]
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")  # Gymnasium's
@@ -399,9 +399,9 @@ def test_an_observation_that_is_not_of_its_spaces_numbers_is_refused(monkeypatch
     made = make_environment(odd("FloatPicture"))
     monkeypatch.setattr(made.unwrapped, "shown", given)
     seen, _ = made.reset(seed=0)
-    layout = Layout(describe(made))
+    adapter = Adapter(made, describe(made))
     with contextlib.nullcontext() if fits else pytest.raises(UserError, match="it is to be uint8"):
-        assert pack(layout, made, seen)["observation"] == np.array(given, np.uint8).tobytes()
+        assert adapter.pack(seen)["observation"] == np.array(given, np.uint8).tobytes()
 
 
 class Steady(ScriptedClock):
