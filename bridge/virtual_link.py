@@ -22,7 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from bridge.network import LatencySpec, make_link
+from bridge.network import LatencySpec, make_network
 from edge_runtime.latest import Freshness
 from edge_runtime.safety import (
     Event,
@@ -184,7 +184,7 @@ class VirtualLink(Generic[Message]):
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
-        self._link = make_link(spec, seed)
+        self._link = make_network(spec, seed)
         self._on_heard, self._on_stale = on_heard, on_stale
         self._under_way: list[tuple[float, int, Any]] = []
         """A heap by arrival time; messages of the same time keep their order."""
@@ -198,7 +198,7 @@ class VirtualLink(Generic[Message]):
 
     def change(self, spec: LatencySpec, seed: int) -> None:
         """Let another network carry what is sent from now on; what is under way arrives."""
-        self._link = make_link(spec, seed)
+        self._link = make_network(spec, seed)
 
     def send_state(self, step: int, message: Message) -> None:
         """Begin tick ``step``: its state leaves the vehicle."""

@@ -15,7 +15,7 @@ from bridge.network import (
     LatencyModel,
     LatencySpec,
     Outage,
-    make_link,
+    make_network,
     parse_spec,
 )
 from edge_runtime.util import UserError
@@ -115,7 +115,7 @@ seeds = st.integers(0, 2**32)
 
 
 def one_way(text, seed=0):
-    return make_link(parse_spec(text), seed).up
+    return make_network(parse_spec(text), seed).up
 
 
 def run(model, count, start_s=0.0, period_s=PERIOD_S):
@@ -129,7 +129,7 @@ def delays_ms(text, count=20_000):
 
 
 def test_delay_jitter_and_loss_draw_what_they_drew_before_there_was_more():
-    link = make_link(parse_spec("50ms+-10ms,loss=20%"), seed=7)
+    link = make_network(parse_spec("50ms+-10ms,loss=20%"), seed=7)
     assert run(link.up, 8) == [
         (0.0646508463442135,), (0.17136357283613712,), (0.2567519285192703,), (), (),
         (0.5545275421404332,), (0.6446744988827918,), (0.7331908891114509,),
@@ -149,16 +149,16 @@ def test_none_comes_early_or_thrice_and_none_overtakes_where_order_is_kept(spec,
         assert len(times) <= 2
     arrivals = [time for times in sent for time in times]
     assert spec.order != "kept" or arrivals == sorted(arrivals)
-    perfect = make_link(LatencySpec(), seed)
+    perfect = make_network(LatencySpec(), seed)
     assert run(perfect.up, 2, start_s) == [(start_s,), (start_s + PERIOD_S,)]
 
 
 @given(specs, seeds)
 def test_the_same_seed_draws_the_same_and_another_way_something_else(spec, seed):
-    first, second = make_link(spec, seed), make_link(spec, seed)
+    first, second = make_network(spec, seed), make_network(spec, seed)
     assert run(first.up, 20) == run(second.up, 20)
     assert run(first.down, 20) == run(second.down, 20)
-    each = make_link(parse_spec("50ms+-10ms"), seed)
+    each = make_network(parse_spec("50ms+-10ms"), seed)
     assert run(each.up, 1) != run(each.down, 1)  # Each way has luck of its own.
 
 
