@@ -1,7 +1,7 @@
-"""Driving one episode of an environment over the wire.
+"""Drive one episode of an environment over the wire.
 
-An episode is: state out, decision back, one step of the environment, again. What the environment is
-stepped with is the policy's command, or what a vehicle made of it.
+Each tick sends a state, takes the decision back, and steps the environment with the policy's
+command, or with what a vehicle made of it.
 """
 
 from __future__ import annotations
@@ -59,17 +59,17 @@ def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
 
 @dataclass
 class EpisodeRunner:
-    """Drives one environment through a clock and keeps what the report needs."""
+    """Drives one environment through a clock and collects figures for the report."""
 
     environment: Environment
     clock: Clock
     publish_scene: Callable[[Any, Scene], None]
-    """Called with the environment and what is to stand beside its own scene."""
+    """Called with the environment and the fields to add to its own scene."""
     on_tick: Callable[[int, int, Decision], None]
     """Called with episode, step, decision after every tick."""
     task: Task
     origin: Origin
-    """Of the drive, to be told with every scene; each episode has a seed of its own."""
+    """Sent with every scene; each episode has a seed of its own."""
     apply: Apply = policy_action
 
     def __post_init__(self) -> None:
@@ -87,9 +87,9 @@ class EpisodeRunner:
         self._options = {"standing": True} if self.origin.standing else None
 
     def show_task(self, seed: int) -> None:
-        """Send one state, the final one already, so that the edge runtime compares it as well.
+        """Send one state, which is final, so that the edge runtime compares the task as well.
 
-        It shows nothing: what another policy observes may be of another size.
+        It holds no observation: another policy's may be of another size.
         """
         self.clock.begin(0, seed)
         self.clock.finish(self._state(0, 0, None, {}, final=True))
@@ -183,7 +183,7 @@ class EpisodeRunner:
 
 
 def accelerations(info: Mapping[str, Any]) -> list[float | None]:
-    """|a| of a step in the order of ACCELERATIONS; None where the environment does not say."""
+    """Return |a| of a step in the order of ACCELERATIONS; None where it is unknown."""
     return [None if info.get(n) is None else abs(finite(n, info[n])) for n in ACCELERATIONS]
 
 

@@ -1,9 +1,8 @@
-"""``python -m bridge export``: a recording as a LeRobotDataset v3.0, in Parquet and MP4.
+"""``python -m bridge export``: turn a recording into a LeRobotDataset v3.0, in Parquet and MP4.
 
-A frame is a state that was answered, with the first new answer to it, whether to drive or to stop.
-The format knows no gaps: where nobody answered a state, only the feature ``step`` jumps. The file
-is read once for each array of the observation, so that pictures need no memory; other arrays wait
-in a file.
+A frame is an answered state with the first new answer to it. The format knows no gaps: where nobody
+answered a state, only the feature ``step`` jumps. The file is read once for each array of the
+observation, so that pictures need no memory; other arrays wait in a file.
 """
 
 from __future__ import annotations
@@ -53,9 +52,8 @@ Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of it
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
-    form = "what to make: a LeRobotDataset v3.0"
+    parser.add_argument("recording", metavar="F.mcap", help="a file of bridge record")
+    form = "the form of the data set: LeRobotDataset v3.0"
     parser.add_argument("--format", choices=["lerobot"], required=True, help=form)
     out = "the directory of the data set; it must not exist yet"
     parser.add_argument("--out", metavar="DIR", required=True, help=out)
@@ -64,7 +62,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Any) -> int:
-    """Run the command; the directory gets its name when it is whole, and else nothing is left."""
+    """Run the command. The directory gets its name when it is whole; otherwise nothing is left."""
     out = Path(arguments.out)
     if os.path.lexists(out):
         raise UserError(f"{out} exists; choose another name: no data set is lost")
@@ -84,7 +82,7 @@ def run(arguments: Any) -> int:
 
 
 def _export(drive: RecordedDrive, folder: Path) -> int:
-    """Write the data set; how many frames it has.
+    """Write the data set and return its number of frames.
 
     UserError where the states cannot be read, or none was answered.
     """
@@ -108,7 +106,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
         arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
         if name in plain:
             key = "observation.state" if len(plain) == 1 else f"observation.{name}"
-            columns[key] = _Rows(folder, arrays)
+            columns[key] = _rows(folder, arrays)
             features[key] = _feature(columns[key])
         else:
             key = f"observation.images.{name}"
@@ -121,10 +119,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
 
 
 def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
-    """The states that can be read, each with the first answer that does not repeat a stop.
-
-    Of an answer with a plan, the action of now.
-    """
+    """Yield the readable states with their answers; of a plan, only the action of now."""
     layout, size = Layout(task), len(task.action)
     for state in drive.states():
         answer = None if state.final else drive.answers.get(key_of(state))
@@ -134,7 +129,7 @@ def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:
-    """The features that every data set has, and where its episodes begin and the last one ends."""
+    """Return the features of every data set, and where its episodes begin and the last ends."""
     kept = [(key_of(state), answer) for state, answer in _kept(drive, task)]
     if not kept:
         raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
@@ -158,27 +153,19 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
     return columns, bounds
 
 
-class _Rows:
-    """Rows of numbers in a file without a name, read as an array's: ``rows[3:9, :100]``."""
-
-    def __init__(self, folder: Path, arrays: Iterable[np.ndarray]) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open while it is read)
+def _rows(folder: Path, arrays: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the arrays as rows of a memory map: they need not fit into memory."""
+    with tempfile.TemporaryFile(dir=folder) as file:
         count = 0
-        for count, array in enumerate(arrays, 1):  # noqa: B007
-            self._file.write(array.tobytes())
-        self.shape, self.dtype = (count, array.size), array.dtype
-
-    def __getitem__(self, at: tuple[slice, slice]) -> np.ndarray:
-        rows, numbers = (range(*one.indices(n)) for one, n in zip(at, self.shape, strict=True))
-        found = np.empty((len(rows), len(numbers)), self.dtype)
-        for row, into in zip(rows, found, strict=True):
-            self._file.seek((row * self.shape[1] + numbers.start) * self.dtype.itemsize)
-            self._file.readinto(into.view(np.uint8))
-        return found
+        for array in arrays:
+            file.write(array.tobytes())
+            count += 1
+        file.flush()
+        return np.memmap(file, array.dtype, "r", shape=(count, array.size))
 
 
 def _feature(values: Any) -> dict[str, Any]:
-    """As info.json has it."""
+    """Return the feature's entry of info.json."""
     dtype = "string" if values.dtype.kind == "U" else values.dtype.name
     return {"dtype": dtype, "shape": [math.prod(values.shape[1:])], "names": None}
 
@@ -186,7 +173,7 @@ def _feature(values: Any) -> dict[str, Any]:
 def _encode(
     path: Path, rate: Fraction, arrays: Iterable[np.ndarray]
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Write the newest picture of each array; a sample of their pixels, and the feature."""
+    """Encode the newest picture of each array; return a sample of pixels, and the feature."""
     path.parent.mkdir(parents=True)
     sampled = []
     with av.open(str(path), "w") as container:
@@ -217,7 +204,7 @@ def _encode(
 def _write(
     folder: Path, task: str, rate: Fraction, columns: Columns, info: dict[str, Any], bounds: Any
 ) -> None:
-    """All but the videos."""
+    """Write everything but the videos."""
     features = info["features"]
     videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
     size = sum(feature["shape"][0] for feature in features.values())
@@ -268,20 +255,20 @@ def _write(
 
 
 def _parts(count: int, size: int) -> Iterator[slice]:
-    """So many rows of this size in slices, of each of which memory holds the numbers."""
+    """Yield slices of ``count`` rows of this size, each small enough for memory."""
     step = max(1, MOST_NUMBERS // size)
     return (slice(start, min(start + step, count)) for start in range(0, count, step))
 
 
 def _column(values: Any, rows: slice) -> Any:
-    """Plain numbers or texts, or lists of a fixed length."""
+    """Return a column of plain numbers or texts, or of lists of a fixed length."""
     part = values[rows] if len(values.shape) == 1 else values[rows, :]
     column, size = pa.array(part.ravel()), part.size // len(part)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 
 
 def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[str, Any]:
-    """Of each feature but texts, as LeRobot has them: of a video each colour, from 0 to 1."""
+    """Return LeRobot's statistics of each feature but texts; of a video each colour, 0 to 1."""
     found = {}
     for key, feature in features.items():
         if feature["dtype"] == "string":
@@ -304,7 +291,7 @@ def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[st
 
 
 def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Of each column, in numbers whose squares are finite."""
+    """Return the statistics of each column, in numbers whose squares are finite."""
     values = values.astype(np.float64)
     stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
     quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)

@@ -1,8 +1,7 @@
-"""Writing a policy file; and ``python -m deploy policy``, which makes one of any ONNX model.
+"""Write policy files; and ``python -m deploy policy``, which makes one of any ONNX model.
 
-What a model is for is read from its environment: the names, shapes and ranges of what goes in and
-out, and the control period. The model is then driven in the environment for a while, by what the
-board itself would load.
+The manifest comes from the environment: names, shapes and ranges of observations and actions, and
+the control period. The model then drives the environment for a while, in the board's own runtime.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
-    change = "what the environment does not say: action.N.stop (a number, or null to hold the last"
-    change += " action), slew_per_s, unit, meaning; may be repeated"
+    change = "set action.N.stop (a number, or null to hold the last action), slew_per_s, unit or"
+    change += " meaning of an action; may be repeated"
     add("model", metavar="MODEL.onnx", type="path", help="the model, in one file")
     add("--env", metavar="ENV", required=True, help=env)
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
@@ -53,12 +52,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
     period = "seconds of a step (default: what the environment says, else its render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
-    algorithm = "what trained it, for the manifest"
+    algorithm = "the training's algorithm, for the manifest"
     add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Make, check and sign the policy file."""
+    """Make, check and sign a policy file."""
     out, key = Path(arguments.out), arguments.key
     if out.suffix != ".onnx":
         raise UserError(f"--out {out}: a policy file's name ends in .onnx")
@@ -126,10 +125,10 @@ def changed(task: Task, changes: Sequence[str]) -> Task:
 
 
 def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
-    """The policy file's bytes: the model with its manifest in it.
+    """Return a policy file's bytes: the model with its manifest in it.
 
-    A single input and a single output may have any name: they get the manifest's. Raises UserError
-    for what is no ONNX model that the board can run.
+    A single input and a single output may have any name and get the manifest's. Raises UserError
+    for anything but an ONNX model that the board can run.
     """
     check_graph(model)
     graph = onnx.load_from_string(model)
@@ -153,7 +152,7 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
 
 
 def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
-    """Rename a value wherever it stands; another of the new name makes room."""
+    """Rename a value wherever it stands; another value of the new name makes room."""
     swap = {old: new, new: f"{new}_of_the_model"} if old != new else {}
     for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
         value.name = swap.get(value.name, value.name)
@@ -163,9 +162,9 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
 
 
 def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.ndarray]:
-    """The least and largest actions, float [n], in REAL_OBSERVATIONS steps of the environment.
+    """Return the least and largest actions, float [n], over REAL_OBSERVATIONS steps.
 
-    Every other episode is driven by random actions: a policy that stands sees little.
+    Random actions drive every other episode: a policy that stands sees little.
     Raises UserError for an action that the environment cannot take.
     """
     actions: list[np.ndarray] = []

@@ -1,4 +1,4 @@
-"""``python -m bridge simulate``: serve an environment to an edge runtime, and report."""
+"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report."""
 
 from __future__ import annotations
 
@@ -48,14 +48,13 @@ EXAMPLE = examples(
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     env = f"scenario ({', '.join(scenarios())}), gymnasium id or module:id"
     scene = "scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items())
-    clock = "lockstep waits for each command; realtime waits for nobody"
-    loop = "the car does what the policy commands, or (realtime only) what the vehicle behind"
-    loop += " the edge runtime reports to have done"
-    standing = "the car starts every episode at rest, as with --loop vehicle it always does"
+    clock = "lockstep waits for each command, realtime never waits"
+    loop = "the car follows the policy's commands, or (realtime only) the reports of the vehicle"
+    loop += " behind the edge runtime"
+    standing = "begin every episode at rest (always so with --loop vehicle)"
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
@@ -66,7 +65,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--standing", action="store_true", help=standing)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
-    help_text = "share a router with other vehicles instead of listening"
+    help_text = "a router to share with other vehicles, instead of listening"
     add_options(where, "--connect", default=None, help=help_text)
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
     add_options(parser, "--vehicle-id", help="the vehicle to simulate")
@@ -74,7 +73,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Run the command; UserError for anything the caller can put right."""
+    """Run the command."""
     if arguments.loop == VEHICLE and arguments.clock != REALTIME:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     arguments.standing |= arguments.loop == VEHICLE
@@ -142,7 +141,7 @@ def _drive(
         Origin(session=port.session, environment=asked.env, latency=network, **how),
         apply=vehicle_action if vehicle else policy_action,
     )
-    # Where it says nothing, the edge runtime compares by itself what the states say.
+    # Without a manifest, the edge runtime itself compares what the states say.
     if manifest is not None and manifest.text != task.text:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
