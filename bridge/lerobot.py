@@ -2,7 +2,7 @@
 
 A frame is an answered state with the first new answer to it. The format knows no gaps: where nobody
 answered a state, only the feature ``step`` jumps. The file is read once for each array of the
-observation, so that pictures need no memory; other arrays wait in a file.
+observation, so that pictures need no memory.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ import math
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from edge_runtime.wire import State, is_foreign
 try:
     import av
     import pyarrow as pa
-    from pyarrow.parquet import ParquetWriter
+    from pyarrow.parquet import write_table
 except ImportError:
     raise UserError("export needs av and pyarrow: pip install 'phil-hil[lerobot]'") from None
 
@@ -44,7 +43,6 @@ FIRST = FILE.format(chunk_index=0, file_index=0)
 SAMPLED_PIXELS = 256  # Of each picture, for the statistics
 ENCODER = {"crf": "10", "g": "2", "bf": "0"}
 """Hardly any loss; every second picture stands alone: a training jumps about in the video."""
-MOST_NUMBERS = 1 << 22  # That are in memory at once
 MOST_IN_STATE = 400_000
 """Of a state, without its pictures: nine statistics of each are kept as text."""
 QUANTILES = (1, 10, 50, 90, 99)
@@ -106,7 +104,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
         arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
         if name in plain:
             key = "observation.state" if len(plain) == 1 else f"observation.{name}"
-            columns[key] = _rows(folder, arrays)
+            columns[key] = np.array([array.ravel() for array in arrays])
             features[key] = _feature(columns[key])
         else:
             key = f"observation.images.{name}"
@@ -153,17 +151,6 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
     return columns, bounds
 
 
-def _rows(folder: Path, arrays: Iterable[np.ndarray]) -> np.ndarray:
-    """Return the arrays as rows of a memory map: they need not fit into memory."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        count = 0
-        for array in arrays:
-            file.write(array.tobytes())
-            count += 1
-        file.flush()
-        return np.memmap(file, array.dtype, "r", shape=(count, array.size))
-
-
 def _feature(values: Any) -> dict[str, Any]:
     """Return the feature's entry of info.json."""
     dtype = "string" if values.dtype.kind == "U" else values.dtype.name
@@ -207,7 +194,6 @@ def _write(
     """Write everything but the videos."""
     features = info["features"]
     videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
-    size = sum(feature["shape"][0] for feature in features.values())
 
     def episode(number: int, start: int, end: int) -> dict[str, Any]:
         row = {"episode_index": number, "tasks": [task], "length": end - start}
@@ -226,24 +212,15 @@ def _write(
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
     tasks = pa.table({"task_index": [0], "task": [task]})
-    numbers = {key: column for key, column in columns.items() if len(column.shape) < 3}
-    for name, tables in {
-        f"data/{FIRST}": (
-            pa.table({key: _column(column, part) for key, column in numbers.items()})
-            for part in _parts(bounds[-1], size)
-        ),
-        f"meta/episodes/{FIRST}": (
-            pa.Table.from_pylist([episode(number, *bound) for number, bound in ends[part]])
-            for part in _parts(len(ends), 9 * size)
-        ),
-        "meta/tasks": iter([tasks.replace_schema_metadata({"pandas": json.dumps(told)})]),
+    numbers = {key: column for key, column in columns.items() if column.ndim < 3}
+    for name, table in {
+        f"data/{FIRST}": pa.table({key: _column(column) for key, column in numbers.items()}),
+        f"meta/episodes/{FIRST}": pa.Table.from_pylist([episode(n, *bound) for n, bound in ends]),
+        "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
     }.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        table = next(tables)
-        with ParquetWriter(path, table.schema) as writer:
-            for one in chain([table], tables):
-                writer.write_table(one)
+        write_table(table, path)
     write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
     info |= {
         "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
@@ -254,16 +231,9 @@ def _write(
     write_json(folder / "meta/info.json", info)
 
 
-def _parts(count: int, size: int) -> Iterator[slice]:
-    """Yield slices of ``count`` rows of this size, each small enough for memory."""
-    step = max(1, MOST_NUMBERS // size)
-    return (slice(start, min(start + step, count)) for start in range(0, count, step))
-
-
-def _column(values: Any, rows: slice) -> Any:
+def _column(values: np.ndarray) -> Any:
     """Return a column of plain numbers or texts, or of lists of a fixed length."""
-    part = values[rows] if len(values.shape) == 1 else values[rows, :]
-    column, size = pa.array(part.ravel()), part.size // len(part)
+    column, size = pa.array(values.ravel()), values.size // len(values)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 
 
@@ -273,27 +243,14 @@ def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[st
     for key, feature in features.items():
         if feature["dtype"] == "string":
             continue
-        values, most, shape, rows = columns[key], 1, feature["shape"], frames
+        # As float64, so that the squares of any float32 are finite
+        values, shape = columns[key][frames].astype(np.float64), feature["shape"]
         if feature["dtype"] == "video":
-            pixels = values[frames].reshape(-1, 3)
-            values, most, shape = pixels[:: len(pixels) // MOST_NUMBERS + 1], 255, [3, 1, 1]
-            rows = slice(0, len(values))
-        elif len(values.shape) == 1:
-            values = values[:, None]
-        columns_each = _parts(shape[0], rows.stop - rows.start)
-        parts = [_describe(values[rows, part] / most) for part in columns_each]
-        found[key] = {
-            name: np.concatenate([part[name] for part in parts]).reshape(shape).tolist()
-            for name in parts[0]
-        }
+            values, shape = values.reshape(-1, 3) / 255, [3, 1, 1]
+        quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
+        stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+        stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
+        stats["std"] = values.std(0)
+        found[key] = {name: np.reshape(value, shape).tolist() for name, value in stats.items()}
         found[key]["count"] = [frames.stop - frames.start]
     return found
-
-
-def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the statistics of each column, in numbers whose squares are finite."""
-    values = values.astype(np.float64)
-    stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
-    quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
-    stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
-    return stats | {"std": values.std(0)}

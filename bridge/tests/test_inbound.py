@@ -15,8 +15,9 @@ from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.manifest import Action
 from edge_runtime.wire import encode
 from hil_tests.testing.environments import ToyEnv
-from hil_tests.testing.messages import HEALTH, make_command, make_feedback
+from hil_tests.testing.messages import make_command, make_feedback
 from hil_tests.testing.policies import TASK, T
+from hil_tests.testing.recordings import health
 
 
 def checking(task=TASK):
@@ -285,11 +286,6 @@ def test_a_steered_car_brakes_when_its_vehicle_does():
     silent = decide(make_feedback(3), after_s=1.0)
     assert vehicle_action(adapter, silent).tolist() == [pytest.approx(0.1)]
     assert environment.pressed == [True, False, True]
-
-
-def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
-    what = {"vehicle": vehicle, "needs_rearm": needs_rearm, "rejected": rejected}
-    return msgspec.structs.replace(HEALTH, sent_ns=sent_ns, uptime_s=uptime_s, **what)
 
 
 @pytest.mark.parametrize(
