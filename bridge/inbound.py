@@ -236,16 +236,14 @@ class EdgeCounts:
     """
 
     def __init__(self) -> None:
-        self.rejected: Counter[str] = Counter()
-        """States that the edge rejected, by reason, without zeros."""
-        self.unreadable: Counter[str] = Counter()
-        """Health messages that could not be read, as ``health_REASON``."""
-        self.changes = 0  # How often another edge runtime took over, or the same was started again
+        self.rejected: Counter[str] = Counter()  # States that the edge rejected, by reason
+        self.unreadable: Counter[str] = Counter()  # Health messages, as ``health_REASON``
+        self.changes = 0  # How often another edge runtime took over, or the same was restarted
         self.newest: Health | None = None
         self._lock = threading.Lock()
 
     def observe_message(self, payload: bytes) -> None:
-        """Take a health message; one that cannot be read is counted."""
+        """Take a health message; count one that cannot be read."""
         health = decode_health(payload)
         if isinstance(health, Health):
             self.observe(health)
@@ -259,7 +257,7 @@ class EdgeCounts:
             self.observe(msgspec.json.decode(payload, type=Health))
 
     def observe(self, health: Health) -> None:
-        """Add what is new since the last health."""
+        """Add the growth since the last health."""
         with self._lock:
             last, before = self.newest, health.rejected
             if last is not None:
@@ -272,7 +270,5 @@ class EdgeCounts:
                 another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
                 self.changes += another
                 before = {} if another else last.rejected
-            grown = Counter(health.rejected)
-            grown.subtract(before)
-            self.rejected = self.rejected + grown
+            self.rejected = self.rejected + (Counter(health.rejected) - Counter(before))
             self.newest = health
