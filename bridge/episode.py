@@ -27,6 +27,7 @@ from edge_runtime.wire import State
 PEDAL = "pedal"
 Apply = Callable[[Adapter, Decision], np.ndarray]
 """Returns the action of one tick, and presses or releases the brake."""
+OnTick = Callable[[int, int, Decision], None]  # Takes episode, step and decision after every tick
 
 
 def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
@@ -65,8 +66,7 @@ class EpisodeRunner:
     clock: Clock
     publish_scene: Callable[[Any, Scene], None]
     """Called with the environment and the fields to add to its own scene."""
-    on_tick: Callable[[int, int, Decision], None]
-    """Called with episode, step, decision after every tick."""
+    on_tick: OnTick
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""

@@ -316,10 +316,10 @@ class ForkedDrive(LockStepClock):
 
 def add_place(parser: Any) -> None:
     """Declare the options that say where a recording is forked."""
-    at, which = "when it is forked, in seconds of the drive, as 12.3s", "which drive, from 0"
+    at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
     parser.add_argument("--at", metavar="T", type=_seconds, default=0.0, help=at)
     parser.add_argument("--episode", metavar="K", type=cli.not_negative, help=which)
-    several = "which vehicle, where the recording holds several"
+    several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 
@@ -344,7 +344,7 @@ def _add_fork_arguments(parser: Any) -> None:
     record = "record the fork, as `bridge record` does; with --human a directory"
     parser.add_argument("--policy", metavar="POLICY.onnx", type="path", help=policy)
     add_trust(parser)
-    add_options(parser, "--latency", default=None, help="another network, as of `simulate`")
+    add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
     parser.add_argument("--human", metavar="web", help=human)
     parser.add_argument("--record", metavar="G.mcap", help=record)
 

@@ -51,11 +51,11 @@ Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of it
 
 def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("recording", metavar="F.mcap", help="a file of bridge record")
-    form = "the form of the data set: LeRobotDataset v3.0"
+    form = "format of the data set: LeRobotDataset v3.0"
     parser.add_argument("--format", choices=["lerobot"], required=True, help=form)
-    out = "the directory of the data set; it must not exist yet"
+    out = "the directory of the data set, which must not exist yet"
     parser.add_argument("--out", metavar="DIR", required=True, help=out)
-    several = "which vehicle, where the recording holds several"
+    several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 

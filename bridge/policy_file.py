@@ -50,7 +50,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
     add("--key", metavar="KEY", type="path", help="the private key that signs it (deploy keys)")
     add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
-    period = "seconds of a step (default: what the environment says, else its render_fps)"
+    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     algorithm = "the training's algorithm, for the manifest"
     add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)

@@ -292,18 +292,17 @@ ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
 _FOLDER = {"metavar": "DIR", "type": "path"}
 _VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
-_TLS, _WAIT = "ca.pem, cert.pem, key.pem of this party", "longest wait for"
-_SIMULATOR = "where the simulator or the router listens"
-_UNTIL = "stop after this many seconds (otherwise when no simulator is left)"
-_NETWORK = "injected network: " + GRAMMAR.replace("%", "%%")
+_TLS = "folder with ca.pem, cert.pem and key.pem (python -m deploy certs), for tls/... endpoints"
+_UNTIL = "stop after this time, in s (default: when no simulator is left)"
+_NETWORK = "simulated network: " + GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--listen": {**ENDPOINT, "help": "where the edge runtime and viewers connect to"},
-    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": _SIMULATOR},
-    "--tls": {**_FOLDER, "help": f"{_TLS} (python -m deploy certs); endpoint tls/..."},
+    "--listen": {**ENDPOINT, "help": "endpoint for edge runtimes and viewers"},
+    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": "simulator or router"},
+    "--tls": {**_FOLDER, "help": _TLS},
     "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
-    "--wait-s": {**_SECONDS, "default": 10.0, "help": f"{_WAIT} a simulator, in seconds"},
+    "--wait-s": {**_SECONDS, "default": 10.0, "help": "longest wait for a simulator, in s"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},
-    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": f"{_WAIT} an edge runtime, in seconds"},
+    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "longest wait for an edge, in s"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
     "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "random seed"},
     "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
@@ -330,13 +329,13 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
 
 
 def _add_router_arguments(parser: Any) -> None:
-    help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
+    help_text = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
     add_options(parser, "--listen", action="append", help=help_text)
     add_options(parser, "--tls")
     vehicle = "with --tls: a vehicle whose parties have rights here; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "all settings from a file of `python -m deploy router`, and no other option"
+    config = "settings from a file of `python -m deploy router`, without other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 

@@ -71,7 +71,7 @@ def _add_record_arguments(parser: Any) -> None:
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     help_text = "record this vehicle only (otherwise all)"
     add_options(parser, "--vehicle-id", default=None, help=help_text)
-    linger = "how long to wait for a simulator that has gone to come back, in seconds"
+    linger = "longest wait for a simulator that has gone to come back, in s"
     parser.add_argument(
         "--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger
     )

@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_trust(parser)
     config = "settings of the recorded edge runtime, if a vehicle's model or scale was not default"
     parser.add_argument("--config", metavar="FILE.toml", help=config)
-    several = "which vehicle, where the recording holds several"
+    several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
     apart = "largest difference of two equal actions, in the unit of the action"
     parser.add_argument(

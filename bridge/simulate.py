@@ -18,7 +18,7 @@ from bridge.environments import (
     make_environment,
     scenarios,
 )
-from bridge.episode import EpisodeRunner, policy_action, vehicle_action
+from bridge.episode import EpisodeRunner, OnTick, policy_action, vehicle_action
 from bridge.inbound import CommandCheck
 from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
@@ -58,7 +58,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
-    period = "seconds of a step (default: what the environment says, else its render_fps)"
+    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
@@ -119,24 +119,11 @@ def _drive(
     network, manifest = str(asked.latency), port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
-    rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
-    edge, waited = port.edge_counts, False
-
-    def on_tick(episode: int, step: int, decision: Decision) -> None:
-        nonlocal waited
-        reason = printable(decision.brake_reason)
-        doing = f"braking: {reason}" if reason else "driving"
-        bar.show(f"step {step:3d}  {doing[:40]}")
-        waits = edge.newest is not None and edge.newest.needs_rearm
-        if waits and not waited:
-            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
-        waited = waits
-
     runner = EpisodeRunner(
         environment,
         clock,
         port.publish_scene,
-        on_tick,
+        _shown_on(bar, port, rearm_command(asked.connect or asked.listen, asked.vehicle_id)),
         task,
         Origin(session=port.session, environment=asked.env, latency=network, **how),
         apply=vehicle_action if vehicle else policy_action,
@@ -161,7 +148,7 @@ def _drive(
         bar.advance({}, told=told)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
-    by_simulator = clock.rejected() + edge.unreadable
+    edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
     return make_report(
         results,
         runner.safe_stops.events,
@@ -185,3 +172,21 @@ def _drive(
             "vehicle": vehicle.report() if vehicle else None,
         },
     )
+
+
+def _shown_on(bar: ProgressBar, port: SimulatorPort, rearm: str) -> OnTick:
+    """Return what shows each tick on the bar, and says when the vehicle waits for a re-arm."""
+    waited = False
+
+    def on_tick(episode: int, step: int, decision: Decision) -> None:
+        nonlocal waited
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
+        bar.show(f"step {step:3d}  {doing[:40]}")
+        newest = port.edge_counts.newest
+        waits = newest is not None and newest.needs_rearm
+        if waits and not waited:
+            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
+        waited = waits
+
+    return on_tick
