@@ -42,7 +42,7 @@ class Hand:
         self.path, self.writer = path, RecordingWriter(path)
         self.edge_clock_s, self.closed = edge_clock_s, False
 
-    def hear(self, at_s: float, topic: str, message: msgspec.Struct, vehicle_id: str = "v") -> None:
+    def hear(self, at_s: float, topic: str, message: Any, vehicle_id: str = "v") -> None:
         payload = encode(message)
         key = f"phil/{vehicle_id}/{topic}"
         self.writer.write(Heard(key, topic, payload, ns(at_s), len(payload)))
