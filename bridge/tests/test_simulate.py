@@ -44,7 +44,7 @@ from hil_tests.testing.drives import (
 from hil_tests.testing.edge import start_edge, wait_until_driving, wait_until_driving_steadily
 from hil_tests.testing.environments import odd
 from hil_tests.testing.messages import make_command
-from hil_tests.testing.policies import PEDAL, STEERING, write_policy, write_rover
+from hil_tests.testing.policies import STEERING, write_policy, write_rover
 
 
 def refused(run: Process, out: Path, *parts: str) -> None:
@@ -464,31 +464,28 @@ def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, opt
 
 
 def policy_of(folder, scenario, *actions):
-    path = folder / f"{scenario}-{len(actions)}.onnx"
+    path = folder / f"{scenario}.onnx"
     write_policy(path, actions=actions, manifest_changes={"task": scenario})
     return path
 
 
 def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path):
-    policy, out = policy_of(tmp_path, "left_turn", PEDAL), tmp_path / "never.json"
+    policy, out = policy_of(tmp_path, "congestion", STEERING), tmp_path / "never.json"
     endpoint = free_endpoint()
     with start_edge(endpoint, policy) as edge:
-        with start_simulate(endpoint, out, "congestion") as run:
-            shown = "left_turn: frames uint8 2x45x80, pedal -1 to 1, every 0.1 s')"
-            refused(run, out, shown, "congestion: frames", "steering")
+        with start_simulate(endpoint, out, TOY) as run:
+            refused(run, out, "congestion: frames uint8 2x45x80, steering", "left_turn: frames")
         assert edge.end() == 0
     assert "was=standby now=safe_stop reason=other_task" in edge.errors
     assert "now=drive" not in edge.errors
 
 
 def test_another_runtime_in_the_middle_of_a_drive_ends_it(tmp_path):
-    own, other = (
-        policy_of(tmp_path, "left_turn", PEDAL), policy_of(tmp_path, "congestion", STEERING),
-    )  # fmt: skip
+    other = policy_of(tmp_path, "congestion", STEERING)
     endpoint, out = free_endpoint(), tmp_path / "never.json"
     options = ("--clock", "realtime", "--episodes", "20")
-    with start_simulate(endpoint, out, "left_turn", *options) as run:
-        with start_edge(endpoint, own) as edge:
+    with start_simulate(endpoint, out, SLOW_TOY, *options) as run:
+        with start_edge(endpoint, make_policy(tmp_path, "constant")) as edge:
             wait_until_driving(edge)
             edge.kill()
         with start_edge(endpoint, other):
