@@ -49,7 +49,7 @@ ROWS = [
     ("view --save /dev/null/a.rrd", "Not a directory"),
     ("view --connect FREE --save a.rrd --vehicle-id a/b", "vehicle id"),
     ("view --save a.rrd --serve", "not allowed with"),
-    ("view --save a.mcap", "called F.rrd"),
+    ("view --save a.mcap", "FILE.rrd"),
     ("view none.mcap --save a.rrd", "cannot be read"),
     ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds no vehicle other"),
 ]
