@@ -7,13 +7,13 @@ import sys
 from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
-    "simulate": ("bridge.simulate", "serve an environment to an edge runtime, and report"),
+    "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
-    "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
-    "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and go on in another way"),
-    "export": ("bridge.lerobot", "make a data set of a recording: LeRobot's"),
-    "view": ("bridge.rerun.command:view", "show the wire in rerun, live or in a file"),
+    "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
+    "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and drive on in another way"),
+    "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),
+    "view": ("bridge.rerun:view", "show the wire in rerun, live or in a file"),
 }
 main = program(
     "python -m bridge",

@@ -26,7 +26,7 @@ from typing import Any
 import msgspec
 
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.network import LatencyModel, LatencySpec, make_link
+from bridge.network import LatencyModel, LatencySpec, make_network
 from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
     BRAKE_PERIODS,
@@ -47,14 +47,14 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 
 
 class _Clock:
-    """Drives the exchange of one episode at a time; ``begin``, ``exchange`` ..., ``finish``."""
+    """Drives the exchange of one episode at a time: ``begin``, ``exchange`` ..., ``finish``."""
 
     def __init__(
         self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
     ) -> None:
         self._period_s = task.control_period_s
         self._silence_s = BRAKE_PERIODS * self._period_s
-        self._window_s = COMMAND_WINDOW * task.control_period_s
+        self._window_s = COMMAND_WINDOW * self._period_s
         self._observation_bytes = Layout(task).size
         self.latencies_ms: list[float] = []
         """From state sent to command received, injected delays included; one per answered state."""
@@ -69,16 +69,15 @@ class _Clock:
         self._publish = publish
         self._spec = spec
         self._hold = CommandHold(0.0, self._period_s)
-        self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()  # Lock-step's
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
     def rejected(self) -> Counter[str]:
-        """What was not believed so far, by reason."""
-        return Counter(dict(self.check.rejected))  # Another thread may go on counting.
+        """Return the counts of what was not believed so far, by reason."""
+        return Counter(dict(self.check.rejected))  # Another thread may go on counting
 
     def newest_answer(self) -> tuple[int, float] | None:
-        """The newest state of this episode that was answered, and its latency in ms."""
+        """Return the newest state of this episode that was answered, and its latency in ms."""
         with self._arrived:
             step = self._hold.newest_step
             return None if step < 0 else (step, self.latencies_ms[-1])
@@ -97,7 +96,7 @@ class _Clock:
         """Stop any thread."""
 
     def _stamped(self, state: State) -> bytes:
-        """The state as it leaves now: with the wall clock, and what was heard of the commands."""
+        """Encode the state as it leaves now: with the wall clock and the commands heard."""
         heard = self.check.heard
         return encode(msgspec.structs.replace(state, sent_ns=time.time_ns(), **heard))
 
@@ -105,8 +104,14 @@ class _Clock:
 class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
+    def __init__(
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
+    ) -> None:
+        super().__init__(publish, check, spec, task)
+        self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
+
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode at virtual time 0; ``seed`` decides the link's delays and losses."""
+        """Start an episode at virtual time 0; ``seed`` decides the network's delays and losses."""
         self.check.begin(episode)
         self._link: VirtualLink[State] = VirtualLink(
             self._spec,
@@ -147,7 +152,7 @@ class LockStepClock(_Clock):
             self._link.answer(arrival, command, computing_s=received_s - published_s)
 
     def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
-        """Wait in wall time for the answer to exactly this state, and say when it came."""
+        """Wait in wall time for the answer to exactly this state; return it with its arrival."""
         deadline_s = self._deadline_s(published_s)
         while (wait_s := deadline_s - time.monotonic()) > 0:
             try:
@@ -167,7 +172,7 @@ class LockStepClock(_Clock):
         return None
 
     def _deadline_s(self, published_s: float) -> float:
-        """The vehicle brakes 2 T after the last answer; each state has T for its answer at least.
+        """Return when to stop waiting: 2 T after the last answer, T after this state at least.
 
         Once the edge runtime is silent, T for each state is also the pace of the braking steps.
         """
@@ -177,7 +182,7 @@ class LockStepClock(_Clock):
         return max(answered_at_s + self._silence_s, published_s + self._period_s)
 
     def _wall_silence_s(self) -> float | None:
-        """Wall time without an answer (s), if the last state really published got none."""
+        """Return the wall time without an answer if the last published state got none."""
         if self._edge_silent and self._answered_at_s is not None:
             return time.monotonic() - self._answered_at_s
         return self._silence_s if self._edge_silent else None
@@ -193,22 +198,22 @@ class RealTimeClock(_Clock):
     def __init__(
         self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
     ) -> None:
-        self._line = DelayLine()
         super().__init__(publish, check, spec, task)
+        self._line = DelayLine()
         self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode now; ``seed`` decides the link's delays and losses."""
+        """Start an episode now; ``seed`` decides the network's delays and losses."""
         with self._arrived:
             self.check.begin(episode)
             self._start_s = self._begun_s = time.monotonic()
-            self._link = make_link(self._spec, seed)
+            self._network = make_network(self._spec, seed)
             self._hold = CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
         """Send one command down the line to the vehicle."""
-        self._send(self._link.down, payload, self._arrive_at_vehicle)
+        self._send(self._network.down, payload, self._arrive_at_vehicle)
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and decide when its command window closes."""
@@ -231,13 +236,13 @@ class RealTimeClock(_Clock):
         self._line.close()
 
     def _send_state(self, state: State) -> float:
-        """Wait for the state's tick, send it, and return the tick's time."""
+        """Wait for the state's tick, send the state, and return the tick's time."""
         tick_s = self._wait_for_tick(state.step)
         payload = self._stamped(state)
         with self._arrived:
             self._sent_s[state.step] = time.monotonic()
             self.check.sent(state.step)
-        self._send(self._link.up, payload, self._publish)
+        self._send(self._network.up, payload, self._publish)
         return tick_s
 
     def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
@@ -304,14 +309,14 @@ class VehicleClock(RealTimeClock):
         super().begin(episode, seed)
         with self._arrived:
             # Its own stream, so that commands meet the same luck as without it.
-            self._feedback_link = make_link(self._spec, seed + 1).down
+            self._feedback_way = make_network(self._spec, seed + 1).down
             self.tracking.begin()
 
     def receive_feedback(self, payload: bytes) -> None:
         """Send one feedback down the line to the simulation, on Zenoh's thread."""
         received_s = time.monotonic()
         arrive = partial(self._feedback_arrives, received_s=received_s)
-        self._send(self._feedback_link, payload, arrive)
+        self._send(self._feedback_way, payload, arrive)
 
     def wait_for_vehicle(self, limit_s: float, vehicle_id: str) -> None:
         """Wait until the vehicle reports; UserError after ``limit_s``."""
@@ -328,7 +333,7 @@ class VehicleClock(RealTimeClock):
         )
 
     def rejected(self) -> Counter[str]:
-        """The commands that were not believed, and the feedback as ``feedback_REASON``."""
+        """Return the counts of commands, and of feedback as ``feedback_REASON``."""
         counts = dict(self.feedback_check.rejected)
         feedback = {f"feedback_{name}": count for name, count in counts.items()}
         return super().rejected() + Counter(feedback)
@@ -370,7 +375,7 @@ class VehicleClock(RealTimeClock):
                 self.tracking.feedback(feedback)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
-        """Whether it holds for what the vehicle says, of whichever drive, before ``limit_s``."""
+        """Return whether a feedback, of any session, satisfies ``holds`` before ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
         while time.monotonic() < give_up_s:
             with self._arrived:
@@ -384,8 +389,8 @@ class VehicleClock(RealTimeClock):
 class DelayLine:
     """Runs actions at their time on the monotonic clock, on a thread of its own.
 
-    ``close`` ends the thread; as a daemon, a forgotten one does not hold up the process's end.
-    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
+    ``close`` ends the thread. What an action raises ends the line, and is raised by the next
+    ``push`` or ``close``.
     """
 
     def __init__(self) -> None:

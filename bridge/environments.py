@@ -1,9 +1,9 @@
-"""Finding an environment by its name, and what it asks of a policy.
+"""Environments: found by name, described for a policy file, and adapted to a task.
 
-The bridge knows environments only by name, and imports nothing of the trainer itself: a scenario's
-word is an entry point of the group ``phil.scenarios``, whose value is a gymnasium id in a module
-that registers it. Whatever an environment offers beyond gymnasium's own is found by name, and
-optional; docs/own_environment.md lists it.
+The bridge knows environments only by name, and imports nothing of the trainer: a scenario's word is
+an entry point of the group ``phil.scenarios``, whose value is a gymnasium id in a module that
+registers it. Everything beyond gymnasium's own interface is optional and found by name on the
+environment or one of its wrappers; docs/own_environment.md lists it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,11 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import io
-import json
 import math
 import os
-import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from typing import Any
 import gymnasium
 import msgspec
 import numpy as np
-from gymnasium.envs.registration import namespace
+from gymnasium.envs.registration import load_env_creator, namespace
 from gymnasium.spaces import Box, Dict
 from PIL import Image
 
@@ -33,8 +31,8 @@ from edge_runtime.manifest import DTYPES, Action, Car, Entry, Task, check_task
 from edge_runtime.policy import OUTPUT
 from edge_runtime.util import UserError
 
-# Environments draw into memory. Left to itself SDL looks for a screen, with an "error:" that looks
-# like ours, and takes SIGTERM for itself. Its "dummy" screen makes highway-env draw nothing.
+# Environments draw into memory. By default SDL looks for a screen, prints an "error:" that looks
+# like ours, and handles SIGTERM itself. With its "dummy" screen highway-env draws nothing.
 os.environ.setdefault("SDL_VIDEODRIVER", "offscreen")
 os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
 
@@ -46,74 +44,61 @@ CONDITIONS = {
     "variant": "more vehicles, and other types of them",
     "dense": "closer and less even traffic",
 }
-
 PLUGIN_GROUP, ROOT = "gymnasium.envs", "__root__"
 PLAIN = "observation"  # The entry's name where an environment observes one array
 RENDERED = "rgb_array"
-_NAME = re.compile(r"(?:\w+(?:\.\w+)*:)?[^:\s]+")
 
 
 def scenarios() -> dict[str, str]:
-    """Scenario word -> ``module:id`` of its environment, of all installed packages."""
+    """Return scenario word -> ``module:id`` of its environment, of all installed packages."""
     found = importlib.metadata.entry_points(group=SCENARIO_GROUP)
-    return {one.name: one.value for one in found}
-
-
-def hint() -> str:
-    """What a name may be."""
-    return f"use {', '.join(sorted(scenarios()))}, a gymnasium id, or module:id"
+    return {each.name: each.value for each in found}
 
 
 def make_environment(name: str, condition: str = NOMINAL) -> Environment:
     """Make the environment of a scenario word, a gymnasium id or ``module:id``.
 
-    Another condition than the nominal one is asked for by the keyword ``scene``. An environment
-    that can draw itself is made so that it does.
+    Another condition than the nominal one is passed as the keyword ``scene``. An environment that
+    can draw itself gets ``render_mode="rgb_array"``.
 
     Raises UserError for an unknown name, or a module that does not import.
     """
-    if not _NAME.fullmatch(name):
-        raise UserError(f"{name!r} names no environment; {hint()}")
     try:
         words = importlib.metadata.entry_points(group=SCENARIO_GROUP, name=name)
-        # To load a scenario's word imports the module that registers it.
-        environment_id = next((str(one.load()) for one in words), name)
+        # Loading a scenario's word imports the module that registers it.
+        environment_id = next((str(each.load()) for each in words), name)
         _load_plugin(environment_id)
-        options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
+        options = {} if condition == NOMINAL else {"scene": condition}
         modes = _metadata(environment_id).get("render_modes") or ()
         drawn = {"render_mode": RENDERED} if RENDERED in modes else {}
         try:
             return _OneLine(_make_quietly(environment_id, **options, **drawn))
         except TypeError as error:
-            if "render_mode" not in str(error):  # Not every constructor takes it.
+            if "render_mode" not in str(error):  # Not every constructor takes it
                 raise
             return _OneLine(_make_quietly(environment_id, **options))
-    except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
-        first_line = (str(error).splitlines() or [""])[0]
-        what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
-        raise UserError(f"no environment {name!r}: {what} ({hint()})") from error
+    except (Exception, SystemExit) as error:  # A module may raise anything when it is imported
+        what = f"{type(error).__name__}: {error}".splitlines()[0]
+        hint = f"use {', '.join(sorted(scenarios()))}, a gymnasium id, or module:id"
+        raise UserError(f"no environment {name!r}: {what} ({hint})") from error
 
 
 class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Says in one line what a stranger's environment raises while it drives or draws, and where."""
+    """Reports in one line what a foreign environment raises while it drives or draws."""
 
     def reset(self, **options: Any) -> Any:
-        """Begin an episode."""
         return self._do(self.env.reset, **options)
 
     def step(self, action: Any) -> Any:
-        """One control period; the environment may write into its copy of the action."""
-        return self._do(self.env.step, np.array(action))
+        return self._do(self.env.step, np.array(action))  # It may write into its copy
 
     def render(self) -> Any:
-        """What it draws."""
         return self._do(self.env.render)
 
     def close(self) -> None:
-        """Close it; a fault in that is said, and costs nobody what was driven."""
         try:
             self._do(self.env.close)
-        except UserError as error:
+        except UserError as error:  # A fault here must not cost what was driven
             print(error, file=sys.stderr)
 
     def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -125,8 +110,8 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
             last = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(last.filename).name}, line {last.lineno}"
             what = f"{type(error).__name__}: {error} ({where})"
-            own = self.spec.id if self.spec else type(self.unwrapped).__name__
-            raise UserError(f"environment {own} failed in {call.__name__}: {what}") from error
+            name = name_of(self)
+            raise UserError(f"environment {name} failed in {call.__name__}: {what}") from error
 
 
 def _make_quietly(environment_id: str, **options: Any) -> Environment:
@@ -139,48 +124,42 @@ def _make_quietly(environment_id: str, **options: Any) -> Environment:
 
 
 def _metadata(environment_id: str) -> dict[str, Any]:
-    """What the environment's class says of itself, before one is made."""
+    """Return the metadata of the environment's class, before one is made."""
     module, _, plain_id = environment_id.rpartition(":")
     if module:
         importlib.import_module(module)
-    entry_point = gymnasium.spec(plain_id).entry_point
-    made = (
-        gymnasium.envs.registration.load_env_creator(entry_point)
-        if isinstance(entry_point, str)
-        else entry_point
-    )
-    found = getattr(made, "metadata", None)
-    return found if isinstance(found, dict) else {}  # A wrapper's is a property of each object.
+    creator: Any = gymnasium.spec(plain_id).entry_point
+    creator = load_env_creator(creator) if isinstance(creator, str) else creator
+    found = getattr(creator, "metadata", None)
+    return found if isinstance(found, dict) else {}  # A wrapper's is a property of each object
 
 
 def _load_plugin(environment_id: str) -> None:
     """Let an installed package register the id, as Gymnasium did by itself before 1.0.
 
     Such a package declares an entry point of the group ``gymnasium.envs``: its name is the
-    namespace of its ids (ROOT: none), its value a function that registers them. Only what the id
-    needs is imported.
+    namespace of its ids (ROOT: none), its value a function that registers them, or (highway-env) a
+    module. The id may also be that of a scenario.
     """
     if ":" in environment_id or environment_id in gymnasium.registry:
         return
     wanted = environment_id.rpartition("/")[0]
     known = importlib.metadata.entry_points
-    # The second form is highway-env's.
-    plugins = [
+    for plugin in (
         *known(group=PLUGIN_GROUP, name=wanted or ROOT),
         *known(group=f"{PLUGIN_GROUP}.{wanted or ROOT}"),
-    ]
-    for plugin in plugins:
+    ):
         register = plugin.load()
         with namespace(wanted) if wanted else contextlib.nullcontext():
-            if callable(register):  # A module has registered them by being imported.
+            if callable(register):
                 register()
     failures = []
-    for scenario in known(group=SCENARIO_GROUP):  # One may be named by its id.
+    for scenario in known(group=SCENARIO_GROUP):
         if environment_id in gymnasium.registry:
             return
         try:
             scenario.load()
-        except (Exception, SystemExit) as error:  # It may be the one that is wanted, or not.
+        except (Exception, SystemExit) as error:  # It may be of another package
             failures.append(f"{scenario.value}: {type(error).__name__}: {error}")
     if failures and environment_id not in gymnasium.registry:
         raise UserError(f"nobody registers it; these scenarios fail: {', '.join(failures)}")
@@ -189,17 +168,15 @@ def _load_plugin(environment_id: str) -> None:
 def describe(
     environment: Environment, period_s: float | None = None, unknown_s: float | None = None
 ) -> Task:
-    """What the environment asks of a policy: its observation, actions, and control period.
+    """Return what the environment asks of a policy: its observation, actions, and control period.
 
-    The period is ``period_s`` where that is given, else the environment's ``control_period_s``,
-    that of ``config["policy_frequency"]`` (highway-env's), ``dt``, a guess from ``render_fps``, or
-    ``unknown_s``. A line says of the last two that they were taken.
+    The period is ``period_s`` where given, else the environment's ``control_period_s``, that of
+    ``config["policy_frequency"]`` (highway-env's), ``dt``, a guess from ``render_fps``, or
+    ``unknown_s``. A line says where one of the last two is taken.
 
     Raises UserError where the wire cannot carry it, or where nothing says how long a step is.
     """
-    spec = environment.spec
-    own = spec.id if spec else type(environment.unwrapped).__name__
-    name = offered(environment, "scenario") or own
+    name = offered(environment, "scenario") or name_of(environment)
     try:
         car = msgspec.convert(offered(environment, "car"), Car | None)
     except msgspec.ValidationError as error:
@@ -215,8 +192,14 @@ def describe(
     return task
 
 
+def name_of(environment: Environment) -> str:
+    """Return the environment's id, or the name of its class."""
+    spec = environment.spec
+    return spec.id if spec else type(environment.unwrapped).__name__
+
+
 def offered(environment: Environment, name: str, default: Any = None) -> Any:
-    """What the outermost of an environment's wrappers that has this name, or it itself, has."""
+    """Return the attribute of the outermost wrapper that has it, or of the environment itself."""
     try:
         return environment.get_wrapper_attr(name)
     except AttributeError:
@@ -225,16 +208,16 @@ def offered(environment: Environment, name: str, default: Any = None) -> Any:
 
 @cache
 def say_once(text: str) -> None:
-    """Say it on stderr; many environments may be made of one kind."""
+    """Print a line on stderr, once a process: many environments of one kind may be made."""
     print(text, file=sys.stderr)
 
 
 def _entries(environment: Environment, name: str) -> dict[str, Entry]:
     space = environment.observation_space
     meanings = offered(environment, "observation_meanings", {})
-    boxes = dict(space.spaces) if isinstance(space, Dict) else {entry_name(environment): space}
+    plain = str(offered(environment, "observation_name", PLAIN))
     entries = {}
-    for entry, box in boxes.items():
+    for entry, box in (space.spaces if isinstance(space, Dict) else {plain: space}).items():
         if not entry or entry.isdigit() or entry == OUTPUT:  # An ONNX graph would rename it
             taken = "an observation's name must not be empty, a number or the policy's output"
             raise UserError(f"environment {name!r} observes {entry!r}: {taken}")
@@ -245,11 +228,6 @@ def _entries(environment: Environment, name: str) -> dict[str, Entry]:
         meaning = meanings.get(entry, "")
         entries[entry] = Entry(dtype=dtype, shape=list(box.shape), meaning=meaning)
     return entries
-
-
-def entry_name(environment: Environment) -> str:
-    """How an environment calls its one observation."""
-    return str(offered(environment, "observation_name", PLAIN))
 
 
 def _actions(environment: Environment, name: str) -> list[Action]:
@@ -271,13 +249,12 @@ def _actions(environment: Environment, name: str) -> list[Action]:
 
 
 def known_stops(environment: Environment) -> list[float | None] | None:
-    """Each action's value in a safe stop as the environment says it; None where it does not.
+    """Return each action's value in a safe stop; None where the environment does not say.
 
-    One that has a brake of its own (``press_brake``) holds the last action and presses it.
+    An environment with a brake of its own (``press_brake``) holds the last action and presses it.
     """
-    size = math.prod(environment.action_space.shape or (1,))
     if callable(offered(environment, "press_brake")):
-        return [None] * size
+        return [None] * math.prod(environment.action_space.shape or (1,))
     brake = offered(environment, "brake_action")
     return None if brake is None else [float(value) for value in np.ravel(brake)]
 
@@ -286,12 +263,12 @@ def _period_s(environment: Environment, name: str, unknown_s: float | None) -> f
     own, config = (offered(environment, key) for key in ("control_period_s", "config"))
     if own is not None:
         return finite("control_period_s", own)
-    # These names others have, too: what is no number means something else.
-    rate = _number(config.get("policy_frequency")) if isinstance(config, Mapping) else None
-    if found := (rate and 1.0 / rate) or _number(offered(environment, "dt")):
+    # Other environments use these names for other things, which are no positive number.
+    rate = _positive(config.get("policy_frequency")) if isinstance(config, Mapping) else None
+    if found := (rate and 1.0 / rate) or _positive(offered(environment, "dt")):
         return found
     says = f"{name} does not say how long a step is"
-    if frames_per_s := _number(environment.metadata.get("render_fps")):
+    if frames_per_s := _positive(environment.metadata.get("render_fps")):
         say_once(f"{says}: {1.0 / frames_per_s:g} s is guessed from its render_fps")
         return 1.0 / frames_per_s
     if unknown_s is None:
@@ -300,8 +277,13 @@ def _period_s(environment: Environment, name: str, unknown_s: float | None) -> f
     return unknown_s
 
 
+def _positive(value: Any) -> float | None:
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    return float(value) if is_number and value > 0 else None
+
+
 def finite(name: str, value: Any) -> float:
-    """The number; UserError for one that is not finite, or none: no wire or report carries it."""
+    """Return the number; UserError for one that no wire or report carries."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -311,19 +293,14 @@ def finite(name: str, value: Any) -> float:
     return number
 
 
-def _number(value: Any) -> float | None:
-    is_number = isinstance(value, int | float | np.integer | np.floating)
-    return float(value) if is_number and value > 0 else None
-
-
 def scene_of(environment: Environment) -> dict[str, Any] | None:
-    """Return the picture seen from above, for viewers only; None if there is none."""
+    """Return the scene from above, for viewers only; None if the environment has none."""
     scene = offered(environment, "scene")
     return scene() if callable(scene) else None
 
 
 def picture_of(environment: Environment) -> bytes:
-    """A JPEG of what ``render()`` shows; empty for an environment that does not draw itself."""
+    """Return a JPEG of what ``render()`` shows; empty for an environment that does not draw."""
     if environment.render_mode != RENDERED:
         return b""
     shown = io.BytesIO()
@@ -331,29 +308,73 @@ def picture_of(environment: Environment) -> bytes:
     return shown.getvalue()
 
 
-def changed(task: Task, changes: Sequence[str]) -> Task:
-    """The task with changes such as ``action.0.stop=-1`` in it.
+class Adapter:
+    """An environment that is driven as a task says: observations in, actions out, and its brake.
 
-    ``stop``, ``slew_per_s``, ``meaning`` and ``unit`` of an action can be changed; the value is
-    JSON, or plain text. Raises UserError for anything else.
+    The task's actions may be the policy's, with their safe stops; the environment's own
+    ``brake_action`` and ``press_brake`` come before those.
     """
-    actions = list(task.action)
-    for change in changes:
-        place, found, text = change.partition("=")
-        match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)", place)
-        if match is None or not found or int(match[1]) >= len(actions):
-            most = len(actions) - 1
-            form = f"action.N.stop=VALUE, or slew_per_s, meaning, unit, with N from 0 to {most}"
-            raise UserError(f"--set {change}: expected {form}")
-        try:
-            value = json.loads(text)
-        except ValueError:
-            value = text
-        row = msgspec.to_builtins(actions[int(match[1])]) | {match[2]: value}
-        try:
-            actions[int(match[1])] = msgspec.convert(row, Action)
-        except msgspec.ValidationError as error:
-            raise UserError(f"--set {change}: {error}") from None
-    task = msgspec.structs.replace(task, action=actions)
-    check_task(task)
-    return task
+
+    def __init__(self, env: Environment, task: Task) -> None:
+        self.env, self.task = env, task
+        space: Any = env.action_space
+        self._space = space
+        self.hands_off: np.ndarray = np.clip(0.0, space.low, space.high).astype(space.dtype)
+        """Zero, or the nearest in range: the action before the first command."""
+        self.last = self.hands_off
+
+    def arrays(self, observation: Any) -> dict[str, np.ndarray]:
+        """Return an observation's entries as the task has them.
+
+        Raises UserError for another shape, or where a number would change.
+        """
+        if not isinstance(observation, Mapping):
+            observation = {next(iter(self.task.observation)): observation}
+        return {
+            name: _fitting(observation, name, entry)
+            for name, entry in self.task.observation.items()
+        }
+
+    def pack(self, observation: Any) -> dict[str, bytes]:
+        """Return an observation as a state carries it."""
+        return {name: array.tobytes() for name, array in self.arrays(observation).items()}
+
+    def within(self, action: Any) -> np.ndarray:
+        """Return the numbers as an action of the environment, within its range."""
+        values = np.asarray(action, self._space.dtype).reshape(self._space.shape)
+        self.last = np.clip(values, self._space.low, self._space.high)
+        return self.last
+
+    def stop(self) -> np.ndarray:
+        """Return the action of a safe stop."""
+        own = offered(self.env, "brake_action")
+        if own is not None:
+            return self.within(own)
+        pairs = zip(self.task.action, self.last.ravel().tolist(), strict=True)
+        return self.within([last if row.stop is None else row.stop for row, last in pairs])
+
+    def press_brake(self, pressed: bool) -> None:
+        """Press or release the brake of an environment that has one: its action only steers."""
+        press = offered(self.env, "press_brake")
+        if callable(press):
+            press(pressed)
+
+    def scene(self) -> dict[str, Any] | None:
+        """Return the scene from above in metres; None where the environment has none."""
+        return scene_of(self.env)
+
+
+def _fitting(observation: Mapping[str, Any], name: str, entry: Entry) -> np.ndarray:
+    try:
+        given = np.asarray(observation[name])
+        array = np.asarray(given, entry.dtype)
+    except (LookupError, TypeError, ValueError) as error:
+        raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
+    if array.shape != tuple(entry.shape):
+        raise UserError(f"the observation {name} is {array.shape}, not {tuple(entry.shape)}")
+    # A float may come as any number; of whole numbers none may change.
+    if array.dtype.kind != "f" and not (given.dtype.kind in "iub" and np.array_equal(array, given)):
+        value = given.ravel()[np.argmax(array != given)]
+        found = f"{value} ({given.dtype}); it is to be {array.dtype}"
+        raise UserError(f"the observation {name} holds {found}")
+    return array

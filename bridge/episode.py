@@ -1,12 +1,12 @@
-"""Driving one episode of an environment over the wire.
+"""Drive one episode of an environment over the wire.
 
-An episode is: state out, decision back, one step of the environment, again. What the environment is
-stepped with is the policy's command, or what a vehicle made of it.
+Each tick sends a state, takes the decision back, and steps the environment with the policy's
+command, or with what a vehicle made of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,110 +14,68 @@ import msgspec
 import numpy as np
 
 from bridge.clocks import Clock
-from bridge.environments import Environment, entry_name, finite, offered
+from bridge.environments import Adapter, Environment, finite, offered
 from bridge.messages import Origin, Scene
-from bridge.report import ACCELERATIONS, EpisodeResult, SafeStopLog, of_known, outcome_of
+from bridge.outcomes import outcome_of
+from bridge.report import ACCELERATIONS, EpisodeResult, SafeStopLog, of_known
 from bridge.virtual_link import Decision
-from edge_runtime.manifest import Action, Layout, Task
+from edge_runtime.manifest import Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import Feedback, State
+from edge_runtime.wire import State
 
 PEDAL = "pedal"
-
-
-class Actuators:
-    """Applies actions to an environment; ``actions`` are the policy's, with their safe stops.
-
-    An environment's own ``brake_action`` and ``press_brake`` come before those.
-    """
-
-    def __init__(self, environment: Environment, actions: Sequence[Action]) -> None:
-        self._environment, self._actions = environment, actions
-        space: Any = environment.action_space
-        self._space, self._shape = space, space.shape
-        self.hands_off: np.ndarray = np.clip(0.0, space.low, space.high).astype(space.dtype)
-        """Zero, or the nearest in range: what is done before the first command."""
-        self.last = self.hands_off
-
-    def brake(self, pressed: bool) -> None:
-        """Press or release the brake of an environment that has one: its action only steers."""
-        press = offered(self._environment, "press_brake")
-        if callable(press):
-            press(pressed)
-
-    def stop(self) -> np.ndarray:
-        """The action of a safe stop, in the environment's shape."""
-        own = offered(self._environment, "brake_action")
-        if own is not None:
-            return self.within(own)
-        pairs = zip(self._actions, self.last.ravel().tolist(), strict=True)
-        return self.within([last if row.stop is None else row.stop for row, last in pairs])
-
-    def reached(self, feedback: Feedback) -> np.ndarray:
-        """What a vehicle's actuators have reached.
-
-        Where it tells the speed of the scenario's car and the environment knows which pedal leads
-        to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
-        for what the last step missed, while errors of pedals would add up.
-        """
-        pedal_for_speed = offered(self._environment, "pedal_for_speed")
-        speed_mps, action = feedback.scenario_speed_mps, list(feedback.action)
-        for place, row in enumerate(self._actions):
-            if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
-                action[place] = float(pedal_for_speed(speed_mps))
-        return self.within(action)
-
-    def within(self, action: Any) -> np.ndarray:
-        """The numbers as an action of the environment, within its range."""
-        values = np.asarray(action, self._space.dtype).reshape(self._shape)
-        self.last = np.clip(values, self._space.low, self._space.high)
-        return self.last
-
-
-Apply = Callable[[Actuators, Decision], np.ndarray]
+Apply = Callable[[Adapter, Decision], np.ndarray]
 """Returns the action of one tick, and presses or releases the brake."""
+OnTick = Callable[[int, int, Decision], None]  # Takes episode, step and decision after every tick
 
 
-def policy_action(actuators: Actuators, decision: Decision) -> np.ndarray:
-    """The command's action, the safe stop's, or (before the first command) hands off."""
-    actuators.brake(bool(decision.brake_reason))
+def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
+    """Return the command's action, the safe stop's, or (before the first command) hands off."""
+    adapter.press_brake(bool(decision.brake_reason))
     if decision.brake_reason:
-        return actuators.stop()
+        return adapter.stop()
     if decision.command is None:
-        return actuators.hands_off
-    return actuators.within(decision.command.action)
+        return adapter.hands_off
+    return adapter.within(decision.command.action)
 
 
-def vehicle_action(actuators: Actuators, decision: Decision) -> np.ndarray:
-    """What the vehicle's actuators have reached.
+def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
+    """Return what the vehicle's actuators have reached; the safe stop without feedback.
 
-    Without feedback the car brakes fully; an environment that is only steered does so whenever the
-    vehicle brakes.
+    Where the vehicle reports the speed of the scenario's car and the environment knows which pedal
+    leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
+    for what the last step missed, while errors of pedals would add up.
     """
-    actuators.brake(bool(decision.brake_reason))
-    return actuators.reached(decision.feedback) if decision.feedback else actuators.stop()
+    adapter.press_brake(bool(decision.brake_reason))
+    if decision.feedback is None:
+        return adapter.stop()
+    pedal_for_speed = offered(adapter.env, "pedal_for_speed")
+    speed_mps, action = decision.feedback.scenario_speed_mps, list(decision.feedback.action)
+    for place, row in enumerate(adapter.task.action):
+        if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
+            action[place] = float(pedal_for_speed(speed_mps))
+    return adapter.within(action)
 
 
 @dataclass
 class EpisodeRunner:
-    """Drives one environment through a clock and keeps what the report needs."""
+    """Drives one environment through a clock and collects figures for the report."""
 
     environment: Environment
     clock: Clock
     publish_scene: Callable[[Any, Scene], None]
-    """Called with the environment and what is to stand beside its own scene."""
-    on_tick: Callable[[int, int, Decision], None]
-    """Called with episode, step, decision after every tick."""
+    """Called with the environment and the fields to add to its own scene."""
+    on_tick: OnTick
     task: Task
     origin: Origin
-    """Of the drive, to be told with every scene; each episode has a seed of its own."""
+    """Sent with every scene; each episode has a seed of its own."""
     apply: Apply = policy_action
 
     def __post_init__(self) -> None:
-        self._layout, self._period_s = Layout(self.task), self.task.control_period_s
+        self._period_s = self.task.control_period_s
         self.safe_stops = SafeStopLog(self._period_s)
-        self._actuators = Actuators(self.environment, self.task.action)
+        self._adapter = Adapter(self.environment, self.task)
         self.deadline_misses = 0
         self.command_ages_ms: list[float] = []
         """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
@@ -129,9 +87,9 @@ class EpisodeRunner:
         self._options = {"standing": True} if self.origin.standing else None
 
     def show_task(self, seed: int) -> None:
-        """Send one state, the final one already, so that the edge runtime compares it as well.
+        """Send one state, which is final, so that the edge runtime compares the task as well.
 
-        It shows nothing: what another policy observes may be of another size.
+        It holds no observation: another policy's may be of another size.
         """
         self.clock.begin(0, seed)
         self.clock.finish(self._state(0, 0, None, {}, final=True))
@@ -153,7 +111,7 @@ class EpisodeRunner:
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
         observation, info = self.environment.reset(seed=seed, options=self._options)
         self.clock.begin(episode, seed)
-        self._actuators.last = self._actuators.hands_off
+        self._adapter.last = self._adapter.hands_off
         self._ridden = 0
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         self._applied = (None, False)
@@ -169,7 +127,7 @@ class EpisodeRunner:
                     "the edge runtime's policy is for another task than this environment"
                     f" ({self.task.text}); start it with a policy of this one"
                 )
-            action = self.apply(self._actuators, decision)
+            action = self.apply(self._adapter, decision)
             observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
             applied = [float(value) for value in action.ravel()]
@@ -200,16 +158,13 @@ class EpisodeRunner:
     def _state(
         self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
     ) -> State:
-        packed = {}
-        if observation is not None:
-            packed = pack(self._layout, self.environment, observation)
         return State(
             session=self.origin.session,
             episode=episode,
             step=step,
             sim_time_s=round(step * self._period_s, 6),
             sent_ns=0,  # The clock stamps it when it sends it.
-            observation=packed,
+            observation={} if observation is None else self._adapter.pack(observation),
             speed_mps=_speed_mps(info),
             final=final,
             task=self.task.text,
@@ -227,38 +182,8 @@ class EpisodeRunner:
         self.publish_scene(self.environment, stamps)
 
 
-def pack(layout: Layout, environment: Environment, observation: Any) -> dict[str, bytes]:
-    """An environment's observation as a state carries it. Raises UserError for another shape."""
-    if not isinstance(observation, Mapping):
-        observation = {entry_name(environment): observation}
-    packed = {}
-    for name, dtype, shape, _ in layout.parts:
-        packed[name] = array_of(observation, name, dtype, shape).tobytes()
-    return packed
-
-
-def array_of(
-    observation: Mapping[str, Any], name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> np.ndarray:
-    """An entry of an observation as its task has it. Raises UserError where it does not fit."""
-    try:
-        given = np.asarray(observation[name])
-        array = np.asarray(given, dtype)
-    except (LookupError, TypeError, ValueError) as error:
-        raise UserError(f"the observation {name}: {type(error).__name__}: {error}") from None
-    if array.shape != shape:
-        raise UserError(f"the observation {name} is {array.shape}, not {shape}")
-    # A float may come as any number; of whole numbers none may change.
-    if dtype.kind != "f" and not (given.dtype.kind in "iub" and np.array_equal(array, given)):
-        value = given.ravel()[np.argmax(array != given)]
-        raise UserError(
-            f"the observation {name} holds {value} ({given.dtype}); it is to be {dtype}"
-        )
-    return array
-
-
 def accelerations(info: Mapping[str, Any]) -> list[float | None]:
-    """|a| of a step in the order of ACCELERATIONS; None where the environment does not say."""
+    """Return |a| of a step in the order of ACCELERATIONS; None where it is unknown."""
     return [None if info.get(n) is None else abs(finite(n, info[n])) for n in ACCELERATIONS]
 
 

@@ -1,7 +1,7 @@
-"""What the simulator believes of the commands, feedback and health that it hears. No socket.
+"""Validation of the commands, feedback and health that the simulator hears. No socket.
 
-What it does not believe is counted by reason. In the loop with a vehicle, feedback moves the car:
-it is checked as commands are, and counts for 2 T.
+What is not believed is counted by reason. In the loop with a vehicle, feedback moves the car: it is
+checked as commands are, and counts for 2 T.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class CommandCheck:
     """Reads commands for one simulator session and keeps the counts of the whole run.
 
     ``policy_ids`` holds the policies that answered, each once, in order of appearance.
-    One thread at a time: the clock that owns it.
+    Used by one thread at a time, under the clock's lock.
     """
 
     def __init__(self, session: str, task: Task) -> None:
@@ -47,10 +47,10 @@ class CommandCheck:
         self._ended = (-1, -1)
         self._stamps: deque[int] = deque(maxlen=64)  # Of recent commands: a copy counts once
         self.heard: dict[str, int] = {}
-        """What the next state says of this session's commands; empty before the first."""
+        """The next state's fields about this session's commands; empty before the first."""
 
     def begin(self, episode: int) -> None:
-        """Note that an episode begins: whatever answers an earlier one is stale from now on."""
+        """Note that an episode begins: answers to earlier episodes are stale from now on."""
         self.newest = (episode, -1)
 
     def sent(self, step: int) -> None:
@@ -98,7 +98,7 @@ class CommandCheck:
         self.rejected[reason] += 1
 
     def _fault(self, command: Command) -> str:
-        """Why a well-formed command answers nothing in this episode; empty if it does."""
+        """Return why a well-formed command answers nothing in this episode; empty if it does."""
         if command.session != self.session:
             return Reason.FOREIGN_SESSION.value
         plan = command.plan or []
@@ -142,7 +142,7 @@ NOT_COMMANDED = ""
 class FeedbackCheck:
     """Reads feedback for the session of ``commands`` and keeps the counts of the whole run.
 
-    Another simulator's session is no fault before the vehicle has heard of this one, but is not
+    Another simulator's session is no fault before the vehicle has heard of this session, but is not
     believed either. Feedback is ordered by its stamps; after 2 T of silence any stamp is taken:
     another board, with another clock, may be there.
     """
@@ -150,7 +150,7 @@ class FeedbackCheck:
     def __init__(self, commands: CommandCheck, task: Task) -> None:
         self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
-        """The last that could be read, of whatever session: it tells that a vehicle is there."""
+        """The last readable feedback, of whatever session: a vehicle is there."""
         self.heard_s = 0.0
         self._commands = commands
         self._actions, self._silence_s = task.action, BRAKE_PERIODS * task.control_period_s
@@ -163,8 +163,8 @@ class FeedbackCheck:
     ) -> Feedback | None:
         """Return the feedback if it is this vehicle's newest, else None.
 
-        Monotonic times: ``received_s`` from the wire (None: now), and, network injected, heard at
-        ``now_s``.
+        Monotonic times: ``received_s`` from the wire (None: now), and ``now_s`` after the simulated
+        network.
         """
         feedback = decode_feedback(payload)
         if isinstance(feedback, Rejection):
@@ -184,10 +184,10 @@ class FeedbackCheck:
         return feedback
 
     def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
-        """Say what the vehicle did in the tick that ends now.
+        """Return what the vehicle did in the tick that ends now.
 
-        ``heard`` is what its commands would have it do: the simulator hears those, too. They give
-        a stop its reason, and decide nothing.
+        ``heard`` is the decision by its commands, which the simulator hears, too. They only give a
+        stop its reason.
         """
         silent = now_s - self._newest_s > self._silence_s + ROUNDING_S
         feedback, reason = None if silent else self._newest, ""
@@ -211,7 +211,7 @@ class FeedbackCheck:
         )
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
-        """Why a well-formed feedback of this session is not believed; empty if it is."""
+        """Return why a well-formed feedback of this session is not believed; empty if it is."""
         if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
             return fault
         if (feedback.episode, feedback.step) > self._commands.newest:
@@ -229,23 +229,21 @@ OVERTAKEN_S = 5.0  # At most, by a message or an answer that came later
 
 
 class EdgeCounts:
-    """Adds up how the edge's counts grow; the first health seen is where they stood before.
+    """Adds up how the edge's counts grow from the first health on.
 
     Two threads report here: health messages on Zenoh's, answers to the status query on the
-    caller's. What is read is only ever replaced, so readers need no lock.
+    caller's. The public values are only ever replaced, so readers need no lock.
     """
 
     def __init__(self) -> None:
-        self.rejected: Counter[str] = Counter()
-        """States that the edge rejected, by reason, without zeros."""
-        self.unreadable: Counter[str] = Counter()
-        """Health messages that could not be read, as ``health_REASON``."""
-        self.changes = 0  # How often another edge runtime took over, or the same was started again
+        self.rejected: Counter[str] = Counter()  # States that the edge rejected, by reason
+        self.unreadable: Counter[str] = Counter()  # Health messages, as ``health_REASON``
+        self.changes = 0  # How often another edge runtime took over, or the same was restarted
         self.newest: Health | None = None
         self._lock = threading.Lock()
 
     def observe_message(self, payload: bytes) -> None:
-        """Take a health message; one that cannot be read is counted."""
+        """Take a health message; count one that cannot be read."""
         health = decode_health(payload)
         if isinstance(health, Health):
             self.observe(health)
@@ -259,20 +257,18 @@ class EdgeCounts:
             self.observe(msgspec.json.decode(payload, type=Health))
 
     def observe(self, health: Health) -> None:
-        """Add what is new since the last health."""
+        """Add the growth since the last health."""
         with self._lock:
             last, before = self.newest, health.rejected
             if last is not None:
                 # Where a message and an answer have overtaken one another both clocks are behind by
                 # little. A board that starts anew, its wall clock not yet set, is behind by much.
                 behind_s = last.uptime_s - health.uptime_s, (last.sent_ns - health.sent_ns) * 1e-9
-                if all(0.0 <= one < OVERTAKEN_S for one in behind_s):
+                if all(0.0 <= behind < OVERTAKEN_S for behind in behind_s):
                     return
                 # A restarted edge runtime has a younger clock; it counts from zero, as another.
                 another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
                 self.changes += another
                 before = {} if another else last.rejected
-            grown = Counter(health.rejected)
-            grown.subtract(before)
-            self.rejected = self.rejected + grown
+            self.rejected = self.rejected + (Counter(health.rejected) - Counter(before))
             self.newest = health

@@ -1,9 +1,8 @@
-"""``python -m bridge export``: a recording as a LeRobotDataset v3.0, in Parquet and MP4.
+"""``python -m bridge export``: turn a recording into a LeRobotDataset v3.0, in Parquet and MP4.
 
-A frame is a state that was answered, with the first new answer to it, whether to drive or to stop.
-The format knows no gaps: where nobody answered a state, only the feature ``step`` jumps. The file
-is read once for each array of the observation, so that pictures need no memory; other arrays wait
-in a file.
+A frame is an answered state with the first new answer to it. The format knows no gaps: where nobody
+answered a state, only the feature ``step`` jumps. The file is read once for each array of the
+observation, so that pictures need no memory.
 """
 
 from __future__ import annotations
@@ -13,10 +12,9 @@ import math
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,7 @@ import numpy as np
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
-from bridge.recording import say_missing
-from bridge.replay import Answer, RecordedDrive, key_of, without_repetitions
+from bridge.replay import Answer, RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
 from edge_runtime.files import check_writable, write_json
@@ -36,7 +33,7 @@ from edge_runtime.wire import State, is_foreign
 try:
     import av
     import pyarrow as pa
-    from pyarrow.parquet import ParquetWriter
+    from pyarrow.parquet import write_table
 except ImportError:
     raise UserError("export needs av and pyarrow: pip install 'phil-hil[lerobot]'") from None
 
@@ -46,7 +43,6 @@ FIRST = FILE.format(chunk_index=0, file_index=0)
 SAMPLED_PIXELS = 256  # Of each picture, for the statistics
 ENCODER = {"crf": "10", "g": "2", "bf": "0"}
 """Hardly any loss; every second picture stands alone: a training jumps about in the video."""
-MOST_NUMBERS = 1 << 22  # That are in memory at once
 MOST_IN_STATE = 400_000
 """Of a state, without its pictures: nine statistics of each are kept as text."""
 QUANTILES = (1, 10, 50, 90, 99)
@@ -54,18 +50,17 @@ Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of it
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
-    form = "what to make: a LeRobotDataset v3.0"
+    parser.add_argument("recording", metavar="F.mcap", help="a file of bridge record")
+    form = "format of the data set: LeRobotDataset v3.0"
     parser.add_argument("--format", choices=["lerobot"], required=True, help=form)
-    out = "the directory of the data set; it must not exist yet"
+    out = "the directory of the data set, which must not exist yet"
     parser.add_argument("--out", metavar="DIR", required=True, help=out)
-    several = "which vehicle, where the recording holds several"
+    several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 
 def run(arguments: Any) -> int:
-    """Run the command; the directory gets its name when it is whole, and else nothing is left."""
+    """Run the command. The directory gets its name when it is whole; otherwise nothing is left."""
     out = Path(arguments.out)
     if os.path.lexists(out):
         raise UserError(f"{out} exists; choose another name: no data set is lost")
@@ -79,14 +74,13 @@ def run(arguments: Any) -> int:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     left_out = sum(not state.final for state in drive.states()) - frames
-    say_missing(drive.recording, drive.vehicle_id)
     missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
     print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
     return 0
 
 
 def _export(drive: RecordedDrive, folder: Path) -> int:
-    """Write the data set; how many frames it has.
+    """Write the data set and return its number of frames.
 
     UserError where the states cannot be read, or none was answered.
     """
@@ -110,7 +104,7 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
         arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
         if name in plain:
             key = "observation.state" if len(plain) == 1 else f"observation.{name}"
-            columns[key] = _Rows(folder, arrays)
+            columns[key] = np.array([array.ravel() for array in arrays])
             features[key] = _feature(columns[key])
         else:
             key = f"observation.images.{name}"
@@ -123,22 +117,17 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
 
 
 def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
-    """The states that can be read, each with the first answer that does not repeat a stop.
-
-    Of an answer with a plan, the action of now.
-    """
+    """Yield the readable states with their answers; of a plan, only the action of now."""
     layout, size = Layout(task), len(task.action)
-    answers = without_repetitions(exchange.answers for exchange in drive.exchanges.values())
-    first = {key: each[0] for key, each in zip(drive.exchanges, answers, strict=True)}
     for state in drive.states():
-        answer = None if state.final else first.get(key_of(state))
+        answer = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
         if readable and answer and answer.action and len(answer.action) % size == 0:
             yield state, answer._replace(action=answer.action[:size])
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:
-    """The features that every data set has, and where its episodes begin and the last one ends."""
+    """Return the features of every data set, and where its episodes begin and the last ends."""
     kept = [(key_of(state), answer) for state, answer in _kept(drive, task)]
     if not kept:
         raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
@@ -162,27 +151,8 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
     return columns, bounds
 
 
-class _Rows:
-    """Rows of numbers in a file without a name, read as an array's: ``rows[3:9, :100]``."""
-
-    def __init__(self, folder: Path, arrays: Iterable[np.ndarray]) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open while it is read)
-        count = 0
-        for count, array in enumerate(arrays, 1):  # noqa: B007
-            self._file.write(array.tobytes())
-        self.shape, self.dtype = (count, array.size), array.dtype
-
-    def __getitem__(self, at: tuple[slice, slice]) -> np.ndarray:
-        rows, numbers = (range(*one.indices(n)) for one, n in zip(at, self.shape, strict=True))
-        found = np.empty((len(rows), len(numbers)), self.dtype)
-        for row, into in zip(rows, found, strict=True):
-            self._file.seek((row * self.shape[1] + numbers.start) * self.dtype.itemsize)
-            self._file.readinto(into.view(np.uint8))
-        return found
-
-
 def _feature(values: Any) -> dict[str, Any]:
-    """As info.json has it."""
+    """Return the feature's entry of info.json."""
     dtype = "string" if values.dtype.kind == "U" else values.dtype.name
     return {"dtype": dtype, "shape": [math.prod(values.shape[1:])], "names": None}
 
@@ -190,7 +160,7 @@ def _feature(values: Any) -> dict[str, Any]:
 def _encode(
     path: Path, rate: Fraction, arrays: Iterable[np.ndarray]
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Write the newest picture of each array; a sample of their pixels, and the feature."""
+    """Encode the newest picture of each array; return a sample of pixels, and the feature."""
     path.parent.mkdir(parents=True)
     sampled = []
     with av.open(str(path), "w") as container:
@@ -221,10 +191,9 @@ def _encode(
 def _write(
     folder: Path, task: str, rate: Fraction, columns: Columns, info: dict[str, Any], bounds: Any
 ) -> None:
-    """All but the videos."""
+    """Write everything but the videos."""
     features = info["features"]
     videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
-    size = sum(feature["shape"][0] for feature in features.values())
 
     def episode(number: int, start: int, end: int) -> dict[str, Any]:
         row = {"episode_index": number, "tasks": [task], "length": end - start}
@@ -243,24 +212,15 @@ def _write(
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
     tasks = pa.table({"task_index": [0], "task": [task]})
-    numbers = {key: column for key, column in columns.items() if len(column.shape) < 3}
-    for name, tables in {
-        f"data/{FIRST}": (
-            pa.table({key: _column(column, part) for key, column in numbers.items()})
-            for part in _parts(bounds[-1], size)
-        ),
-        f"meta/episodes/{FIRST}": (
-            pa.Table.from_pylist([episode(number, *bound) for number, bound in ends[part]])
-            for part in _parts(len(ends), 9 * size)
-        ),
-        "meta/tasks": iter([tasks.replace_schema_metadata({"pandas": json.dumps(told)})]),
+    numbers = {key: column for key, column in columns.items() if column.ndim < 3}
+    for name, table in {
+        f"data/{FIRST}": pa.table({key: _column(column) for key, column in numbers.items()}),
+        f"meta/episodes/{FIRST}": pa.Table.from_pylist([episode(n, *bound) for n, bound in ends]),
+        "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
     }.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        table = next(tables)
-        with ParquetWriter(path, table.schema) as writer:
-            for one in chain([table], tables):
-                writer.write_table(one)
+        write_table(table, path)
     write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
     info |= {
         "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
@@ -271,46 +231,26 @@ def _write(
     write_json(folder / "meta/info.json", info)
 
 
-def _parts(count: int, size: int) -> Iterator[slice]:
-    """So many rows of this size in slices, of each of which memory holds the numbers."""
-    step = max(1, MOST_NUMBERS // size)
-    return (slice(start, min(start + step, count)) for start in range(0, count, step))
-
-
-def _column(values: Any, rows: slice) -> Any:
-    """Plain numbers or texts, or lists of a fixed length."""
-    part = values[rows] if len(values.shape) == 1 else values[rows, :]
-    column, size = pa.array(part.ravel()), part.size // len(part)
+def _column(values: np.ndarray) -> Any:
+    """Return a column of plain numbers or texts, or of lists of a fixed length."""
+    column, size = pa.array(values.ravel()), values.size // len(values)
     return column if size == 1 else pa.FixedSizeListArray.from_arrays(column, size)
 
 
 def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[str, Any]:
-    """Of each feature but texts, as LeRobot has them: of a video each colour, from 0 to 1."""
+    """Return LeRobot's statistics of each feature but texts; of a video each colour, 0 to 1."""
     found = {}
     for key, feature in features.items():
         if feature["dtype"] == "string":
             continue
-        values, most, shape, rows = columns[key], 1, feature["shape"], frames
+        # As float64, so that the squares of any float32 are finite
+        values, shape = columns[key][frames].astype(np.float64), feature["shape"]
         if feature["dtype"] == "video":
-            pixels = values[frames].reshape(-1, 3)
-            values, most, shape = pixels[:: len(pixels) // MOST_NUMBERS + 1], 255, [3, 1, 1]
-            rows = slice(0, len(values))
-        elif len(values.shape) == 1:
-            values = values[:, None]
-        columns_each = _parts(shape[0], rows.stop - rows.start)
-        parts = [_describe(values[rows, part] / most) for part in columns_each]
-        found[key] = {
-            name: np.concatenate([part[name] for part in parts]).reshape(shape).tolist()
-            for name in parts[0]
-        }
+            values, shape = values.reshape(-1, 3) / 255, [3, 1, 1]
+        quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
+        stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+        stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
+        stats["std"] = values.std(0)
+        found[key] = {name: np.reshape(value, shape).tolist() for name, value in stats.items()}
         found[key]["count"] = [frames.stop - frames.start]
     return found
-
-
-def _describe(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Of each column, in numbers whose squares are finite."""
-    values = values.astype(np.float64)
-    stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
-    quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
-    stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
-    return stats | {"std": values.std(0)}

@@ -1,7 +1,7 @@
 """The messages on the wire as listeners get them: the table of topics, and the scene.
 
-The scene is an extension topic, ``phil/<vehicle_id>/scene``: the road from above, for viewers. The
-policy never hears it: it holds what the environment knows and the vehicle does not.
+The scene is an extension topic for viewers, ``phil/<vehicle_id>/scene``: the road from above. It
+holds what the environment knows and the vehicle does not, so the policy never hears it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S, Entry, Task, check
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_STATE_BYTES
 
-MOST = 1e12
-"""Of metres, seconds, milliseconds and all else that is drawn."""
+MOST = 1e12  # Of metres, seconds, milliseconds and all else that is drawn
 MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
@@ -42,7 +41,7 @@ Point = tuple[float, float]
 class SeenCar(msgspec.Struct, frozen=True):
     """One car; ``x``, ``y`` (m) are its centre and y grows downwards.
 
-    ``id`` and ``speed_mps`` are not drawn: a viewer's copy of the scene shows them.
+    Only a viewer's copy of the scene shows ``id`` and ``speed_mps``.
     """
 
     x: float
@@ -56,7 +55,7 @@ class SeenCar(msgspec.Struct, frozen=True):
 
 
 class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
-    """What is drawn: roads, lane lines and the path as polylines, the goal, and the cars."""
+    """The drawn scene: roads, lane lines and the path as polylines, the goal, and the cars."""
 
     roads: Sequence[Sequence[Point]] = ()
     road_width_m: float = 4.0
@@ -67,7 +66,7 @@ class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode was begun: with ``Scene.applied``, all that ``bridge fork`` needs of it.
+    """How an episode was begun: with ``Scene.applied``, all that ``bridge fork`` needs.
 
     The fields are the options of ``bridge simulate``; ``seed`` is the episode's own.
     """
@@ -83,12 +82,12 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Scene(SeenScene, frozen=True, kw_only=True):
-    """The scene on the wire, with its place in time and what the simulator says beside it.
+    """The scene on the wire, with its place in time and the simulator's own facts.
 
     ``task`` says how to read the states. ``picture`` is a JPEG of an environment that has no
     ``scene()`` and draws itself; empty otherwise. ``applied`` is the action of the step that led
-    here, by whoever decided it, and ``braked`` whether the brake was pressed in it. ``ridden`` is
-    its place in an earlier command's plan; 0: it is of none.
+    here, whoever decided it, ``braked`` whether the brake was pressed in it, and ``ridden`` its
+    place in an earlier command's plan, 0 for none.
     """
 
     episode: int
@@ -107,11 +106,11 @@ class Scene(SeenScene, frozen=True, kw_only=True):
 
 
 STAMPS = tuple(n for n in Scene.__struct_fields__ if n not in SeenScene.__struct_fields__)
-"""What of a scene the simulator adds to the environment's own ``scene()``."""
+"""Fields that the simulator adds to the environment's own ``scene()``."""
 
 
 def plain(value: Any) -> Any:
-    """What msgspec asks for where it cannot encode: NumPy's arrays and numbers as Python's."""
+    """Return NumPy's arrays and numbers as Python's, for msgspec to encode."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
@@ -125,7 +124,7 @@ def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
 
 
 def read_scene(scene: Mapping[str, Any]) -> SeenScene:
-    """An environment's ``scene()`` as what is drawn; ValueError where it cannot be drawn."""
+    """Decode an environment's ``scene()``; ValueError where it cannot be drawn."""
     seen = msgspec.msgpack.decode(ENCODER.encode(scene), type=SeenScene)
     if not _is_drawable(seen):
         raise ValueError("a scene with numbers that cannot be drawn")
@@ -133,20 +132,19 @@ def read_scene(scene: Mapping[str, Any]) -> SeenScene:
 
 
 def period_of(state: wire.State) -> float:
-    """The control period in seconds as a state tells it; 0 for the first of an episode."""
+    """Return the control period in seconds that a state implies; 0 for an episode's first."""
     return state.sim_time_s / state.step if state.step else 0.0
 
 
 def is_picture(entry: Entry) -> bool:
-    """Whether an observation's entry is drawn as a picture: bytes in two dimensions or more."""
+    """Return whether an entry is drawn as a picture: bytes in two dimensions or more."""
     return entry.dtype == "uint8" and len(entry.shape) > 1
 
 
 def images_of(array: np.ndarray) -> np.ndarray | None:
-    """An observation's array as images [count, height, width, 1 or 3]; None where it is none.
+    """Return an observation's array as images [count, height, width, 1 or 3], or None.
 
-    Bytes in two dimensions or more are images: with a last axis of 3 in colour, else grey ones
-    one after the other.
+    Bytes in two dimensions or more are images: colour with a last axis of 3, else grey.
     """
     if array.dtype != np.uint8 or array.ndim < 2:
         return None
@@ -156,7 +154,7 @@ def images_of(array: np.ndarray) -> np.ndarray | None:
 
 
 def decode_scene(payload: bytes) -> Scene | wire.Rejection:
-    """The scene, or that it is none."""
+    """Decode a scene, or say why not."""
     rejected = wire.Rejection(wire.Reason.MALFORMED, "not a scene")
     if len(payload) > MAX_STATE_BYTES:
         return rejected
@@ -176,13 +174,13 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "health": wire.decode_health,
     "scene": decode_scene,
 }
-"""Topic -> decoder; for what is not valid it returns a ``Rejection``."""
+"""Topic -> decoder, which returns a ``Rejection`` for an invalid message."""
 
 
 def decode(heard: Heard) -> Any:
-    """What was heard, of one of the topics of DECODERS; a ``Rejection`` where it is not valid.
+    """Decode a message of a topic of DECODERS; return a ``Rejection`` where it is not valid.
 
-    Also where its numbers fit their types and still have no place in a plot or on a time axis.
+    Numbers that fit their types and still have no place in a plot or on a time axis are not valid.
     """
     message = DECODERS[heard.topic](heard.payload)
     if isinstance(message, wire.Rejection):
@@ -197,7 +195,7 @@ def decode(heard: Heard) -> Any:
 
 
 def _is_drawable(value: Any) -> bool:
-    """Whether each floating-point number in it is finite, and no larger than MOST."""
+    """Return whether every floating-point number in the value is finite, and at most MOST."""
     if isinstance(value, float):
         return abs(value) <= MOST  # False of NaN
     if isinstance(value, dict):
@@ -208,14 +206,14 @@ def _is_drawable(value: Any) -> bool:
 
 
 class Pace:
-    """Passes one message an interval on average, at most two at once; all where it is 0 s."""
+    """Passes one message an interval on average, at most two at once; all for 0 s."""
 
     def __init__(self, interval_s: float) -> None:
         self._interval_s = interval_s
         self._free_s = -math.inf  # When the next one is due
 
     def due(self, now_s: float) -> bool:
-        """Whether a message may pass now."""
+        """Return whether a message may pass now."""
         # One interval early will do, so that the jitter of a stream at the pace costs no message.
         if self._interval_s and now_s < self._free_s - self._interval_s:
             return False

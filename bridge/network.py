@@ -1,12 +1,12 @@
-"""The injected network: what becomes of a message between two ends, drawn from a seed.
+"""The simulated network: when a message between two ends arrives, drawn from a seed.
 
 Pure: no clock, no socket, no global. The caller passes the time in and gets the times at which the
 message comes out at the other end: none if it is lost, two if it is duplicated. The same model
 serves lock-step and training (virtual time), and real time (timers).
 
-A specification (`LatencySpec`) says what the network does in each direction; `parse_spec` reads
-one as a person writes it. The way of a message (`LatencyModel`): queue and line, outage, loss, time
-under way, held back or not, duplicated or not, and in order if order is kept.
+`LatencySpec` says what the network does in each direction; `parse_spec` reads it as a person writes
+it. The way of a message (`LatencyModel`): queue and line, outage, loss, time under way, held back
+or not, duplicated or not, and in order if order is kept.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ ORDERS = ("free", "kept")
 
 
 class Kind(NamedTuple):
-    """How the value of a setting is read (as None where it does not fit) and written."""
+    """How the value of a setting is read (None where it does not fit) and written."""
 
     read: Callable[[str], Any]
-    write: Callable[[Any], str]
+    write: Callable[[Any], str] = str
     limit: str = ""  # What a message about a wrong value says besides the example
 
 
@@ -45,14 +45,13 @@ def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kin
         return value if least <= value <= most else None
 
     def write(value: float) -> str:
-        # The shortest text that reads back as the same value.
-        return repr(float(value)).removesuffix(".0") + next(iter(units))
+        return repr(float(value)).removesuffix(".0") + next(iter(units))  # Reads back as the same
 
     return Kind(read, write, f", at most {write(most)}")
 
 
 def _choice(words: Sequence[str]) -> Kind:
-    return Kind(lambda text: text if text in words else None, str)
+    return Kind(lambda text: text if text in words else None)
 
 
 MS = _measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
@@ -65,17 +64,14 @@ RATE = _measure(_RATES, most=1e9, least=math.ulp(0.0))
 
 @dataclass(frozen=True)
 class Outage:
-    """A window in which nothing gets through, once or again and again.
-
-    Time 0 is the episode's start.
-    """
+    """A window in which nothing gets through, once or again and again; the episode begins at 0."""
 
     length_s: float
     start_s: float  # When the (first) window begins
     period_s: float | None = None  # From one window's begin to the next; None: there is only one
 
     def covers(self, now_s: float) -> bool:
-        """Whether a message sent at ``now_s`` falls into a window (its end is outside)."""
+        """Return whether a message sent at ``now_s`` falls into a window (its end is outside)."""
         since_s = now_s - self.start_s
         if since_s < 0:
             return False
@@ -83,7 +79,7 @@ class Outage:
 
 
 def _read_outages(text: str) -> tuple[Outage, ...] | None:
-    """Windows with a plus between: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
+    """Read windows with a plus between: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
     # A plus also stands inside an exponent, where it is followed by a bare number.
     windows = [_read_outage(part) for part in re.split(r"(?<!e)\+", text)]
     return None if None in windows else tuple(window for window in windows if window)
@@ -103,12 +99,12 @@ def _read_outage(text: str) -> Outage | None:
 
 
 def _write_outages(outages: tuple[Outage, ...]) -> str:
-    """The windows; a start that is the period is left out."""
+    """Write the windows; a start that is the period is left out."""
     return "+".join(
-        SECONDS.write(one.length_s)
-        + ("" if one.period_s is None else "/" + SECONDS.write(one.period_s))
-        + ("" if one.start_s == one.period_s else "@" + SECONDS.write(one.start_s))
-        for one in outages
+        SECONDS.write(outage.length_s)
+        + ("" if outage.period_s is None else "/" + SECONDS.write(outage.period_s))
+        + ("" if outage.start_s == outage.period_s else "@" + SECONDS.write(outage.start_s))
+        for outage in outages
     )
 
 
@@ -121,7 +117,7 @@ def _setting(default: Any, name: str, kind: Kind, example: str) -> Any:
 
 @dataclass(frozen=True)
 class DirectionSpec:
-    """One direction of the link: the table of settings. UserError for a burst that cannot be.
+    """One direction of the network: the table of settings. UserError for impossible bursts.
 
     Messages are treated one by one, as datagrams are, unless ``order`` is kept.
     """
@@ -173,13 +169,13 @@ class DirectionSpec:
 
     @property
     def bad_share(self) -> float:
-        """The share of messages in the bad state, so that the overall loss is the asked one."""
+        """Share of messages in the bad state that makes the overall loss the asked one."""
         return (self.loss_percent - self.clear_loss_percent) / (
             self.burst_loss_percent - self.clear_loss_percent
         )
 
     def written(self, prefix: str = "") -> list[str]:
-        """The settings that are not the default, as a person writes them."""
+        """Return the settings that are not the default, as a person writes them."""
         return [
             f"{prefix}{row.metadata['name']}={row.metadata['kind'].write(value)}"
             for row in fields(self)
@@ -238,7 +234,7 @@ def parse_spec(text: str) -> LatencySpec:
 
 
 def _parse_part(part: str, text: str) -> list[tuple[str, Any]]:
-    """Names and values of one part: one setting, or delay and jitter in their short form."""
+    """Return names and values of a part: a setting, or delay and jitter in their short form."""
     name, is_named, word = part.partition("=")
     pairs = [(name, word)]
     if not is_named and part[:1].isdigit() and part.count("+-") + part.count("±") < 2:
@@ -284,7 +280,7 @@ The delay is ``delay + jitter * shape``, so rows with the same delay and jitter 
 their tail; netem's distribution tables are used the same way. All shapes are increasing functions
 of one standard normal draw: the same seed delays the same messages, and only how far differs.
 
-A long-tailed link has a floor (propagation) little below its mean and rare, very late messages:
+A long-tailed network has a floor (propagation) little below its mean and rare, very late messages:
 at least ``delay - 0.76 jitter`` with ``lognormal`` and ``delay - 0.58 jitter`` with ``pareto``.
 """
 
@@ -314,7 +310,7 @@ class BurstLoss:
         self._bad = bool(rng.random() < share)
 
     def percent(self) -> float:
-        """Chance of the next message to be lost, in percent; the chain goes on by one step."""
+        """Return the chance of the next message to be lost, in percent, and step the chain."""
         percent = self._loss_percent[self._bad]
         leave = self._to_good if self._bad else self._to_bad
         if self._rng.random() < leave:
@@ -323,7 +319,7 @@ class BurstLoss:
 
 
 class LatencyModel:
-    """One direction of the link. Not thread-safe; time must not run backwards.
+    """One direction of the network. Not thread-safe; time must not run backwards.
 
     Each feature draws from a stream of its own, for every message, so that two specifications with
     the same seed meet the same luck and differ only in what was specified.
@@ -341,7 +337,7 @@ class LatencyModel:
         self._line_free_s = self._newest_arrival_s = float("-inf")
 
     def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
-        """When a message handed over at ``now_s`` arrives (s, same clock), earliest first.
+        """Return when a message handed over at ``now_s`` arrives (s, same clock), earliest first.
 
         Empty if it is lost, two times if it is duplicated. ``size_bytes`` matters with a rate.
         """
@@ -363,7 +359,7 @@ class LatencyModel:
         return tuple(times)
 
     def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
-        """When the message's last byte has left; None if the queue is full. No rate: at once."""
+        """Return when the message's last byte has left; None if the queue is full."""
         if not self.spec.rate_kbps:
             return now_s
         begin_s = max(now_s, self._line_free_s)
@@ -377,14 +373,14 @@ class LatencyModel:
         return max(0.0, under_way_ms) * 1e-3
 
 
-class Link(NamedTuple):
+class Network(NamedTuple):
     """The two directions of one episode."""
 
     up: LatencyModel
     down: LatencyModel
 
 
-def make_link(spec: LatencySpec, seed: int) -> Link:
+def make_network(spec: LatencySpec, seed: int) -> Network:
     """Make both directions, each with its own stream of the seed."""
     up, down = np.random.SeedSequence(seed).spawn(2)
-    return Link(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
+    return Network(LatencyModel(spec.up, up), LatencyModel(spec.down, down))

@@ -1,13 +1,15 @@
-"""Writing a policy file; and ``python -m deploy policy``, which makes one of any ONNX model.
+"""Write policy files; and ``python -m deploy policy``, which makes one of any ONNX model.
 
-What a model is for is read from its environment: the names, shapes and ranges of what goes in and
-out, and the control period. The model is then driven in the environment for a while, by what the
-board itself would load.
+The manifest comes from the environment: names, shapes and ranges of observations and actions, and
+the control period. The model then drives the environment for a while, in the board's own runtime.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import re
+from collections.abc import Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,11 +19,10 @@ import msgspec
 import numpy as np
 import onnx
 
-from bridge.environments import Environment, changed, describe, known_stops, make_environment
-from bridge.episode import Actuators, pack
-from edge_runtime.cli import Command, examples, positive_number
+from bridge.environments import Adapter, Environment, describe, known_stops, make_environment
+from edge_runtime.cli import Subcommand, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.manifest import MANIFEST_KEY, Manifest, Task
+from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Task, check_task
 from edge_runtime.policy import (
     MAX_POLICY_MIB,
     OUTPUT,
@@ -42,21 +43,21 @@ FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
-    change = "what the environment does not say: action.N.stop (a number, or null to hold the last"
-    change += " action), slew_per_s, unit, meaning; may be repeated"
+    change = "set action.N.stop (a number, or null to hold the last action), slew_per_s, unit or"
+    change += " meaning of an action; may be repeated"
     add("model", metavar="MODEL.onnx", type="path", help="the model, in one file")
     add("--env", metavar="ENV", required=True, help=env)
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
     add("--key", metavar="KEY", type="path", help="the private key that signs it (deploy keys)")
     add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
-    period = "seconds of a step (default: what the environment says, else its render_fps)"
+    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
-    algorithm = "what trained it, for the manifest"
+    algorithm = "the training's algorithm, for the manifest"
     add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Make, check and sign the policy file."""
+    """Make, check and sign a policy file."""
     out, key = Path(arguments.out), arguments.key
     if out.suffix != ".onnx":
         raise UserError(f"--out {out}: a policy file's name ends in .onnx")
@@ -96,11 +97,38 @@ def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> 
             raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
 
 
-def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
-    """The policy file's bytes: the model with its manifest in it.
+def changed(task: Task, changes: Sequence[str]) -> Task:
+    """Return the task with changes such as ``action.0.stop=-1``; the value is JSON or plain text.
 
-    A single input and a single output may have any name: they get the manifest's. Raises UserError
-    for what is no ONNX model that the board can run.
+    ``stop``, ``slew_per_s``, ``meaning`` and ``unit`` of an action can be changed. Raises UserError
+    for anything else.
+    """
+    actions = list(task.action)
+    for change in changes:
+        match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)=(.*)", change)
+        if match is None or int(match[1]) >= len(actions):
+            most = len(actions) - 1
+            form = f"action.N.stop=VALUE, or slew_per_s, meaning, unit, with N from 0 to {most}"
+            raise UserError(f"--set {change}: expected {form}")
+        try:
+            value = json.loads(match[3])
+        except ValueError:
+            value = match[3]
+        row = msgspec.to_builtins(actions[int(match[1])]) | {match[2]: value}
+        try:
+            actions[int(match[1])] = msgspec.convert(row, Action)
+        except msgspec.ValidationError as error:
+            raise UserError(f"--set {change}: {error}") from None
+    task = msgspec.structs.replace(task, action=actions)
+    check_task(task)
+    return task
+
+
+def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, Any]) -> bytes:
+    """Return a policy file's bytes: the model with its manifest in it.
+
+    A single input and a single output may have any name and get the manifest's. Raises UserError
+    for anything but an ONNX model that the board can run.
     """
     check_graph(model)
     graph = onnx.load_from_string(model)
@@ -124,7 +152,7 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
 
 
 def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
-    """Rename a value wherever it stands; another of the new name makes room."""
+    """Rename a value wherever it stands; another value of the new name makes room."""
     swap = {old: new, new: f"{new}_of_the_model"} if old != new else {}
     for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
         value.name = swap.get(value.name, value.name)
@@ -134,22 +162,22 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
 
 
 def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.ndarray]:
-    """The least and largest actions, float [n], in REAL_OBSERVATIONS steps of the environment.
+    """Return the least and largest actions, float [n], over REAL_OBSERVATIONS steps.
 
-    Every other episode is driven by random actions: a policy that stands sees little.
+    Random actions drive every other episode: a policy that stands sees little.
     Raises UserError for an action that the environment cannot take.
     """
     actions: list[np.ndarray] = []
     space: Any = environment.action_space
     space.seed(0)
-    actuators = Actuators(environment, policy.manifest.action)
+    adapter = Adapter(environment, policy.manifest)
     episode, over = 0, True
     seen: Any = None
     while len(actions) < REAL_OBSERVATIONS:
         if over:
             seen, _ = environment.reset(seed=episode)
             episode += 1
-        packed = pack(policy.layout, environment, seen)
+        packed = adapter.pack(seen)
         try:
             action = policy.act(policy.layout.arrays(packed))
         except UserError:
@@ -159,7 +187,7 @@ def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.nda
         check_answer(action, policy.manifest, "a real observation")
         actions.append(action)
         wanted = space.sample() if episode % 2 == 0 else action
-        seen, _, terminated, truncated, _ = environment.step(actuators.within(wanted))
+        seen, _, terminated, truncated, _ = environment.step(adapter.within(wanted))
         over = terminated or truncated
     return np.min(actions, axis=0), np.max(actions, axis=0)
 
@@ -184,4 +212,4 @@ EXAMPLE = examples(
     "    --out pendulum.onnx --key keys/policy.key",
     "python -m deploy policy mine.onnx --env my_package:MyRobot-v0 --out robot.onnx",
 )
-POLICY = Command(EXAMPLE, _add_arguments, _run)
+POLICY = Subcommand(EXAMPLE, _add_arguments, _run)

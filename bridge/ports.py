@@ -1,11 +1,8 @@
-"""Both ends of the bridge on Zenoh: the simulator's port, and what a listener hears.
+"""Both ends of the bridge on Zenoh, the options that commands share, and ``bridge router``.
 
-The port publishes states and hands on what comes back. A listener (viewer, recorder) hears
-every topic through a bounded queue. Zenoh's threads only put into it, so a listener that falls
-behind loses messages and never holds up the vehicle.
-
-After them stands what the commands share: their options, which say where an end is, and how they
-wait. Last comes ``python -m bridge router``, which connects simulators, edge runtimes and viewers.
+The simulator's port publishes states and hands on what comes back. A listener (viewer, recorder)
+hears every topic through a bounded queue. Zenoh's threads only put into it, so a listener that
+falls behind loses messages and never holds up the vehicle.
 """
 
 from __future__ import annotations
@@ -28,11 +25,11 @@ from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
-from edge_runtime.cli import Command, examples, not_negative, seconds, sigterm_as_interrupt
+from edge_runtime.cli import Subcommand, examples, not_negative, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
 
@@ -44,17 +41,16 @@ TOKEN_S = 1.0  # A simulator that is there has this time to say so, however shor
 QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 EDGE_POLL_S = 0.1
 QUERY_S = 1.0
-PayloadHandler = Callable[[bytes], None]
-_UNDRAWN: set[type[Exception]] = set()  # What was said already
+_UNDRAWN: set[type[Exception]] = set()  # Already reported
 
 
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
-    """The scene as it is sent, or else the environment's picture, where that can be drawn."""
+    """Encode the scene, or else the environment's picture, if it can be drawn."""
     try:
         if (scene := scene_of(environment)) is not None:
             return encode_scene(scene, stamps)
         stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
-    except Exception as error:  # Of any kind: it is somebody else's code, and the drive goes on.
+    except Exception as error:  # Somebody else's code; the drive goes on
         if type(error) not in _UNDRAWN:  # Not at every step, whose number may be in its text
             _UNDRAWN.add(type(error))
             print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
@@ -81,11 +77,8 @@ class SimulatorPort:
         self._declared: list[Any] = [self._states, self._scenes, token]
         self.hear("health", self.edge_counts.observe_message)
 
-    def hear(self, topic: str, handler: PayloadHandler) -> None:
-        """Call ``handler(payload)`` for every message of the vehicle's topic.
-
-        It is called on Zenoh's thread: it must be quick.
-        """
+    def hear(self, topic: str, handler: Callable[[bytes], None]) -> None:
+        """Call ``handler(payload)``, which must be quick, for every message of the topic."""
         own = key(self.vehicle_id, topic)
         hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
         self._declared.append(self._zenoh.declare_subscriber(own, hear))
@@ -117,12 +110,12 @@ class SimulatorPort:
             time.sleep(EDGE_POLL_S)
 
     def note_edge_counts(self) -> None:
-        """Ask the edge runtime for its counts now: before and after the drive."""
+        """Ask the edge runtime for its counts, before and after the drive."""
         for status in self._statuses():
             self.edge_counts.observe_status(status)
 
     def edge_manifest(self) -> Manifest | None:
-        """Return the manifest of the edge runtime's policy; None if it says nothing."""
+        """Return the manifest of the edge runtime's policy; None without an answer."""
         for status in self._statuses():
             with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError, KeyError):
                 fields = msgspec.json.decode(status, type=dict[str, msgspec.Raw])
@@ -130,13 +123,13 @@ class SimulatorPort:
         return None
 
     def _edge_is_there(self) -> bool:
-        """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
+        """Return whether its token is there or it answers: Zenoh can lose the token for a while."""
         alive = key(self.vehicle_id, "alive")
         tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
         return any(reply.ok for reply in tokens) or any(True for _ in self._statuses())
 
     def _statuses(self) -> Iterator[bytes]:
-        """The edge runtime's answers to the status query."""
+        """Yield the edge runtime's answers to the status query."""
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
             if reply.ok is not None:
                 yield reply.ok.payload.to_bytes()
@@ -179,23 +172,23 @@ def open_port(
 
 
 class WireListener:
-    """The messages in order of arrival, and whether their simulators are there."""
+    """Queues messages in order of arrival, and knows whether their simulators are there."""
 
     def __init__(self) -> None:
         self.simulator_seen = threading.Event()
         self.dropped = 0
-        self.end_s = math.inf  # Unix time: its certificate's
+        self.end_s = math.inf  # Unix time at which its certificate ends
         self._simulators: set[str] = set()
         self._queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
         self._zero_ns = time.time_ns() - time.monotonic_ns()
 
     @property
     def waiting(self) -> int:
-        """Return how many messages wait in the queue."""
+        """How many messages wait in the queue."""
         return self._queue.qsize()
 
     def next(self, timeout_s: float) -> Heard | None:
-        """Return the next message, None if there is none within ``timeout_s``."""
+        """Return the next message, or None after ``timeout_s``."""
         with contextlib.suppress(queue.Empty):
             return self._queue.get(timeout=timeout_s)
         return None
@@ -203,10 +196,10 @@ class WireListener:
     def until_gone(
         self, duration_s: float | None, linger_s: float = LINGER_S
     ) -> Iterator[Heard | None]:
-        """Yield messages, and None where none comes, until the time is over, or no simulator has
-        been there for ``linger_s`` and the queue is empty.
+        """Yield messages, and None where none comes, until the duration is over or the queue is
+        empty and no simulator has been there for ``linger_s``.
 
-        An edge runtime behind a router goes on sending: that is no drive to wait for.
+        An edge runtime behind a router goes on sending without a simulator.
         """
         now_s = seen_s = time.monotonic()
         end_s = math.inf if duration_s is None else now_s + duration_s
@@ -284,7 +277,7 @@ def open_listener(
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
-    """Open a client; try again for ``wait_s``: both ends are often started together."""
+    """Open a client, trying again for ``wait_s``: both ends are often started together."""
     give_up_s = time.monotonic() + wait_s
     while True:
         try:
@@ -299,27 +292,26 @@ ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
 _FOLDER = {"metavar": "DIR", "type": "path"}
 _VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
-_TLS, _WAIT = "ca.pem, cert.pem, key.pem of this party", "how long to wait for"
-_SIMULATOR = "where the simulator or the router listens"
-_UNTIL = "stop after this many seconds (otherwise when no simulator is left)"
-_NETWORK = "injected network: " + GRAMMAR.replace("%", "%%")
+_TLS = "folder with ca.pem, cert.pem and key.pem (python -m deploy certs), for tls/... endpoints"
+_UNTIL = "stop after this time, in s (default: when no simulator is left)"
+_NETWORK = "simulated network: " + GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--listen": {**ENDPOINT, "help": "where the edge runtime and viewers connect to"},
-    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": _SIMULATOR},
-    "--tls": {**_FOLDER, "help": f"{_TLS} (python -m deploy certs); endpoint tls/..."},
+    "--listen": {**ENDPOINT, "help": "endpoint for edge runtimes and viewers"},
+    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": "simulator or router"},
+    "--tls": {**_FOLDER, "help": _TLS},
     "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
-    "--wait-s": {**_SECONDS, "default": 10.0, "help": f"{_WAIT} a simulator, in seconds"},
+    "--wait-s": {**_SECONDS, "default": 10.0, "help": "longest wait for a simulator, in s"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},
-    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": f"{_WAIT} an edge runtime, in seconds"},
+    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "longest wait for an edge, in s"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
-    "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "of delays and losses"},
+    "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "random seed"},
     "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
 }
-"""The options that several commands have; their types raise UserError for a bad value."""
+"""Options of several commands; their types raise UserError for a bad value."""
 
 
 def add_options(parser: Any, *names: str, **changes: Any) -> None:
-    """Declare options of the table; ``changes`` are this command's own help, default and so on."""
+    """Declare options of the table, with ``changes`` such as another help or default."""
     for name in names:
         parser.add_argument(name, **{**OPTIONS[name], **changes})
 
@@ -337,13 +329,13 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
 
 
 def _add_router_arguments(parser: Any) -> None:
-    help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
+    help_text = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
     add_options(parser, "--listen", action="append", help=help_text)
     add_options(parser, "--tls")
-    vehicle = "a vehicle whose parties have rights here, with --tls; may be repeated"
+    vehicle = "with --tls: a vehicle whose parties have rights here; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "all settings from a file of `python -m deploy router`, and no other option"
+    config = "settings from a file of `python -m deploy router`, without other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
@@ -353,7 +345,7 @@ def _run_router(arguments: Any) -> int:
     tls, rules, ready = None, None, f"config={arguments.config}"
     if arguments.config is None:
         ready = f"listen={','.join(listens)}"
-        tls = access.tls_for(arguments.tls, *listens)
+        tls = tls_for(arguments.tls, *listens)
     elif arguments.listen or arguments.tls or arguments.vehicle_id:
         raise UserError("--config goes with no other option: the file says it all")
     if tls is not None:
@@ -379,4 +371,4 @@ ROUTER_EXAMPLE = examples(
     "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
     "    --vehicle-id hunter01 --vehicle-id hunter02",
 )
-ROUTER = Command(ROUTER_EXAMPLE, _add_router_arguments, _run_router)
+ROUTER = Subcommand(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

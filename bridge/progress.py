@@ -1,4 +1,4 @@
-"""How far a command is: a bar on stderr, or a line now and then where stderr is no terminal."""
+"""A command's progress: a bar on stderr, or a line now and then if stderr is no terminal."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ LINE_INTERVAL_S = 15.0  # Between two lines of progress where stderr is no termi
 
 
 class ProgressBar:
-    """Counts to ``total`` and shows a few live figures on stderr: a bar, or now and then a line.
-
-    Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
-    """
+    """Counts to ``total`` and shows live figures, e.g. ``{"success": "0.85"}``, on stderr."""
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.done = what, total, done
@@ -39,7 +36,7 @@ class ProgressBar:
         self._bar.stop()
 
     def show(self, text: str) -> None:
-        """Show beside the bar what happens now; nothing without a bar."""
+        """Show a text beside the bar; nothing without a bar."""
         self._bar.update(self._task, figures=text)
 
     def say(self, line: str) -> None:
@@ -47,7 +44,7 @@ class ProgressBar:
         self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def advance(self, figures: dict[str, str], count: int = 1, told: str = "") -> None:
-        """Count ``count`` more as done and show the figures; without a bar, print ``told``."""
+        """Count ``count`` more and show the figures; without a bar, print ``told``."""
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         self._bar.update(self._task, completed=self.done, figures=text)

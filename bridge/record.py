@@ -1,13 +1,12 @@
-"""``python -m bridge record``: MCAP files of the wire.
+"""``python -m bridge record``: write an MCAP file of the wire.
 
-The recorder is a listener of its own. It keeps the exact payloads for replay, and copies that
-viewers can draw:
+The file holds the exact payloads for replay, and copies that viewers can draw:
 
 | topic | encoding |
 |---|---|
 | ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
 | ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
-| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t; so each picture array |
+| ``view/<id>/frames`` | ``foxglove.RawImage`` of each picture array: frame t-1 above frame t |
 | ``view/<id>/<topic>``, of every topic of the wire | ``phil.State`` and so on |
 | ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
 
@@ -40,10 +39,10 @@ from bridge.ports import (
 )
 from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
-from edge_runtime.cli import Command, examples, quit_on_signals, seconds, sigterm_as_interrupt
+from edge_runtime.cli import Subcommand, examples, quit_on_signals, seconds, sigterm_as_interrupt
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
-from edge_runtime.tls import tls_for
+from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, counted
 
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
@@ -52,14 +51,14 @@ CHUNK_BYTES = 1 << 20
 NOT_COPIED = (
     "observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal",
 )  # fmt: skip
-"""Fields that no viewer plots: bytes, lists of lists, and how a state is to be read."""
+"""Fields that no viewer plots."""
 ENCODING, SCHEMA_ENCODING = "json", "jsonschema"
 INFO, WARNING = 2, 3  # Of ``foxglove.Log.level``
 NEVER_OVER = "choose another name: no recording is lost"
 
 
 def new_recording(path: str) -> str:
-    """The path, absolute; UserError where a recording could not be begun there later."""
+    """Return the absolute path; UserError where no recording could be begun there."""
     check_writable(path)
     if Path(path).exists():
         raise UserError(f"{path} exists; {NEVER_OVER}")
@@ -67,19 +66,19 @@ def new_recording(path: str) -> str:
 
 
 def _add_record_arguments(parser: Any) -> None:
-    out = "the recording; it must not exist yet"
+    out = "the recording, which must not exist yet"
     parser.add_argument("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     help_text = "record this vehicle only (otherwise all)"
     add_options(parser, "--vehicle-id", default=None, help=help_text)
-    linger = "how long to go on without any simulator: it may come back, in seconds"
+    linger = "longest wait for a simulator that has gone to come back, in s"
     parser.add_argument(
         "--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger
     )
 
 
 def _run_record(arguments: Any) -> int:
-    """Run the command until the simulators go, the time is over, or somebody interrupts."""
+    """Record until the simulators go, the time is over, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
@@ -126,14 +125,14 @@ def _listen(
 
 
 class ViewerCopies:
-    """Makes copies that viewers can draw, and hands each to ``add``. Used by one thread."""
+    """Makes copies that viewers can draw, and hands each to ``add``. Not thread-safe."""
 
     def __init__(self, add: Callable[[str, Schema, int, bytes], None]) -> None:
         self._add = add
         self._layouts: dict[str, Layout | None] = {}  # By the vehicle, as its scenes say
 
     def write(self, heard: Heard) -> None:
-        """Copy one message, or tell of it as an event."""
+        """Copy a message, or log an event about it."""
         if heard.topic in TOKEN_TOPICS:
             who = "edge runtime" if heard.topic == "alive" else "simulator"
             what = "is here" if heard.payload == b"\x01" else "has gone"
@@ -182,7 +181,7 @@ class ViewerCopies:
 
 
 class RecordingWriter:
-    """Writes one recording; used by one thread. OSError from any call where the disk is full."""
+    """Writes one recording. Not thread-safe; any call raises OSError where the disk is full."""
 
     def __init__(self, path: Path) -> None:
         """Make the file; UserError where it exists already."""
@@ -206,7 +205,7 @@ class RecordingWriter:
             self._copies.write(heard)
 
     def flush(self) -> None:
-        """End the chunk: from here on a kill does not lose what has been written."""
+        """End the chunk: a kill does not lose what was written before."""
         self._mcap.flush()
 
     def finish(self, dropped: int) -> None:
@@ -258,13 +257,13 @@ def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
 
 
 def close_torn(stream: BinaryIO) -> None:
-    """Close a file that may have failed: it tries once more what the disk did not take."""
+    """Close a file whose last bytes the disk may not take."""
     with contextlib.suppress(OSError):
         stream.close()
 
 
-class Time(msgspec.Struct):
-    """Since 1970."""
+class Stamp(msgspec.Struct):
+    """Time since 1970."""
 
     sec: int
     nsec: int
@@ -273,7 +272,7 @@ class Time(msgspec.Struct):
 class RawImage(msgspec.Struct):
     """``foxglove.RawImage``."""
 
-    timestamp: Time
+    timestamp: Stamp
     width: int
     height: int
     encoding: str
@@ -285,7 +284,7 @@ class RawImage(msgspec.Struct):
 class Log(msgspec.Struct):
     """``foxglove.Log``, of which we fill time, level, text and sender."""
 
-    timestamp: Time
+    timestamp: Stamp
     level: int
     message: str
     name: str
@@ -293,8 +292,8 @@ class Log(msgspec.Struct):
     line: int = 0
 
 
-def _stamp(time_ns: int) -> Time:
-    return Time(*divmod(time_ns, 10**9))
+def _stamp(time_ns: int) -> Stamp:
+    return Stamp(*divmod(time_ns, 10**9))
 
 
 class Schema(NamedTuple):
@@ -306,7 +305,7 @@ class Schema(NamedTuple):
 
 @functools.cache
 def describe(kind: type[msgspec.Struct]) -> Schema:
-    """What of a struct is copied for viewers. A field that may be None is then left out."""
+    """Return the schema of the fields that are copied for viewers; None is never copied."""
     _, parts = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
     fields = parts.pop(kind.__name__)["properties"].items()
     copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
@@ -319,4 +318,4 @@ RECORD_EXAMPLE = examples(
     "python -m bridge record --out drive.mcap",
     "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
 )
-RECORD = Command(RECORD_EXAMPLE, _add_record_arguments, _run_record)
+RECORD = Subcommand(RECORD_EXAMPLE, _add_record_arguments, _run_record)

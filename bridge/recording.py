@@ -1,11 +1,10 @@
-"""Reads MCAP recordings: whole ones, ones that a kill or a full disk has cut off, and damaged ones.
+"""Read MCAP recordings, also those cut off by a kill or a full disk, and damaged ones.
 
-`Recording` reads every recording of ours. A chunk has a checksum: one that is not as it was written
-is left out and counted. Where even the length of a record is broken, reading goes on at the next
-chunk, which is looked for byte by byte.
+A chunk has a checksum: one that does not match is left out and counted. Where even the length of a
+record is broken, reading goes on at the next chunk, which is searched byte by byte.
 
-Anybody may have made the file. What a chunk announces is looked at before it is unpacked, and
-reading is limited by the length of the file.
+Anybody may have made the file. The size that a chunk announces is checked before it is unpacked,
+and the work of reading is limited by the length of the file.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -36,12 +35,12 @@ MAX_RECORD_BYTES = 8 << 20
 MAX_WORK = 200
 """Bytes read for each byte of the file, above one record."""
 RECORD_BYTES = 256
-"""What a record in a chunk counts as: taking it apart costs as much, however empty it is."""
+"""Work that a record in a chunk counts as, however empty it is."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
 )  # fmt: skip
-"""What the libraries raise for bytes that are no MCAP."""
+"""Exceptions of the libraries for bytes that are no MCAP."""
 LANDMARK = re.compile(
     rb"\x06(?=.{4}\x00{4}.{28}\x04\x00{3}zstd)"  # a chunk as we write it
     rb"|\x0c(?=.{4}\x00{4}\x04\x00{3}phil)"  # our metadata
@@ -61,18 +60,19 @@ class Stored(NamedTuple):
 
 
 class Recording:
-    """One MCAP file; what is missing of it is known when ``messages`` came to the end."""
+    """One MCAP file; what is missing of it is known once ``messages`` has come to the end."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.invalid_messages = 0  # Of the last pass of `valid_messages`
         self._begin()
 
     def _begin(self) -> None:
         self.metadata: dict[str, str] = {}
         self.cut_off = False
-        """The file ends without its index, between two records or within one: a kill."""
+        """The file ends without its index, between two records or within a record: a kill."""
         self.torn_bytes = 0  # Of the record within which the file stops
-        self.damaged_places = 0  # Between them, all that is whole is read
+        self.damaged_places = 0
         self.damaged_bytes = 0
         self.nameless_messages = 0  # Whole ones whose topic stood in a broken part alone
         self._work_bytes = 0
@@ -83,7 +83,7 @@ class Recording:
         return self.damaged_places > 0 or self.nameless_messages > 0
 
     def trouble(self) -> str:
-        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
+        """Return what is wrong with the file, as a verb with its object; empty: nothing."""
         places = counted(self.damaged_places, "damaged place")
         messages = counted(self.nameless_messages, "message")
         parts = {
@@ -96,13 +96,20 @@ class Recording:
         return f"{what} ({missing})" if missing else what
 
     def say_trouble(self, taken: str = "") -> None:
-        """Tell of it in one line on stderr, with how much is taken; nothing where all is whole."""
+        """Print the trouble, if any, in one line on stderr, with how much is taken."""
         if trouble := self.trouble():
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line + taken, file=sys.stderr, flush=True)
 
+    def say_missing(self) -> None:
+        """Say on stderr what `valid_messages` could not read, and what it left out."""
+        self.say_trouble()
+        if self.invalid_messages:
+            left_out = f"left out: {counted(self.invalid_messages, 'message')} not valid"
+            print(f"{self.path}: {left_out}", file=sys.stderr, flush=True)
+
     def messages(self) -> Iterator[Stored]:
-        """Yield the messages as they stand in the file, which is the order of their arrival.
+        """Yield the messages in the order of the file, which is that of their arrival.
 
         UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
         reading than its size accounts for.
@@ -174,7 +181,7 @@ class Recording:
                 at = end
 
     def _spend(self, count: int) -> None:
-        """Count what was read; UserError for more than damage explains."""
+        """Count the bytes read; UserError for more than damage explains."""
         self._work_bytes += count
         if self._work_bytes > MAX_RECORD_BYTES + MAX_WORK * self._size:
             raise UserError(
@@ -184,9 +191,9 @@ class Recording:
 
 
 def _parts(record: McapRecord, size: int, said: int) -> list[McapRecord]:
-    """A record that took ``size`` bytes and is ``said`` to have so many, a chunk as what it holds.
+    """Return a record that took ``size`` bytes and announced ``said``; a chunk as its contents.
 
-    Raises one of TORN: it is not whole.
+    Raises one of TORN if it is not whole.
     """
     builder = RecordBuilder()
     record.write(builder)
@@ -203,7 +210,7 @@ def _parts(record: McapRecord, size: int, said: int) -> list[McapRecord]:
 
 
 def _find_landmark(stream: BinaryIO, at: int) -> int:
-    """Where the next record begins that can be recognised; the file's end where none does."""
+    """Return where the next record begins that can be recognised, or the file's end."""
     while True:
         stream.seek(at)
         block = stream.read(BLOCK_BYTES + LANDMARK_BYTES)
@@ -215,7 +222,7 @@ def _find_landmark(stream: BinaryIO, at: int) -> int:
 
 
 def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
-    """The vehicle of that id, or the only one; UserError where it is not in the recording."""
+    """Return the vehicle of that id, or the only vehicle; UserError where that fails."""
     there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
     names = ", ".join(sorted(there)) or "none"
     if vehicle_id is not None and vehicle_id not in there:
@@ -226,10 +233,7 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
 
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
-    """The wire's messages of one vehicle as a listener would have heard them, in their order.
-
-    The recording may be cut off or damaged, and says so afterwards.
-    """
+    """Yield the wire's messages of one vehicle as a listener would have heard them."""
     for stored in recording.messages():
         vehicle, topic = _wire_topic(stored)
         if vehicle == vehicle_id:
@@ -237,18 +241,20 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
             yield Heard(key, topic, message.data, message.log_time, len(message.data))
 
 
-def say_missing(recording: Recording, vehicle_id: str) -> None:
-    """Say on stderr what cannot be read, and how many messages of the vehicle nobody can use."""
-    wire = (heard for heard in heard_of(recording, vehicle_id) if heard.topic in DECODERS)
-    invalid = sum(isinstance(decode(heard), Rejection) for heard in wire)
-    recording.say_trouble()
-    if invalid:
-        messages = counted(invalid, "message")
-        print(f"{recording.path}: left out: {messages} not valid", file=sys.stderr, flush=True)
+def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
+    """Yield a vehicle's messages, heard and decoded; the invalid are left out and counted."""
+    recording.invalid_messages = 0
+    for heard in heard_of(recording, vehicle_id):
+        if heard.topic in DECODERS:
+            message = decode(heard)
+            if isinstance(message, Rejection):
+                recording.invalid_messages += 1
+            else:
+                yield heard, message
 
 
 def _wire_topic(stored: Stored) -> tuple[str, str]:
-    """The vehicle and the topic of a wire message; empty for a copy for viewers."""
+    """Return vehicle and topic of a wire message; empty for a copy for viewers."""
     parts = stored.channel.topic.split("/")
     if stored.channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
         return "", ""

@@ -1,8 +1,7 @@
-"""What a run of episodes has come to: results, safe stops, and the report with the contract's keys.
+"""Results of episodes, safe stops, and the report with the contract's keys (section 2).
 
 `EpisodeResult` and `summarise` serve driving in process (trainer) and over the wire (bridge); the
-rest is for ``bridge simulate``. Pure: numbers in, a dict or a line of text out (contract, section
-2). `TrackingLog` says how well a vehicle in the loop follows.
+rest is for ``bridge simulate``. `TrackingLog` measures how well a vehicle in the loop follows.
 """
 
 from __future__ import annotations
@@ -10,52 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.outcomes import COLLISION, GOAL, UNTOLD, settled
 from bridge.virtual_link import BRAKE_PERIODS, NO_COMMAND, Decision
 from edge_runtime.util import counted, printable
 from edge_runtime.wire import Command, Feedback
-
-GOAL, FAILED = "goal", "failed"
-UNKNOWN = "ended"
-"""An environment that reports neither ``outcome`` nor ``is_success`` says no more than that."""
-TRUNCATED, TIMEOUT = "truncated", "timeout"
-"""Gymnasium's limit of steps has ended an episode of which the environment says nothing: a timeout
-as soon as it says of any other how that ended (`settled`)."""
-COLLISION = "collision"
-STOPPED, RESTARTED = "stopped", "restarted"  # The person ended the episode
-DISCARDED = "discarded"
-"""The person threw it away: it is shown, and nothing learns from it."""
-UNTOLD = {UNKNOWN, TRUNCATED, STOPPED, RESTARTED, DISCARDED}
-
-
-def failed(outcome: str) -> bool:
-    """Whether an episode missed its goal; not where none is known, or where a person ended it."""
-    return outcome != GOAL and outcome not in UNTOLD
-
-
-def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
-    """How an episode has ended, by the environment's last ``info``.
-
-    Where that does not say: TRUNCATED for one that only a limit of steps has ended, else UNKNOWN.
-    """
-    if info.get("outcome"):
-        return str(info["outcome"])
-    success = info.get("is_success")
-    if success is None:
-        return TRUNCATED if only_truncated else UNKNOWN
-    return GOAL if success else FAILED
-
-
-def settled(outcomes: Iterable[str]) -> list[str]:
-    """The same, with TIMEOUT for TRUNCATED as soon as any tells how its episode ended."""
-    outcomes = list(outcomes)
-    is_told = not UNTOLD.issuperset(outcomes)
-    return [TIMEOUT if is_told and one == TRUNCATED else one for one in outcomes]
-
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
 
@@ -84,15 +46,14 @@ class EpisodeResult:
 def summarise(
     results: Sequence[EpisodeResult], scenario: str, condition: str, policy_id: str, seed: int
 ) -> dict[str, Any]:
-    """The contract's summary of `results`. `std` is over the episodes (population, ddof 0).
+    """Settle the outcomes of `results` and return the contract's summary.
 
-    It settles their outcomes. None are mean and deviation of what no episode tells.
-
-    Raises ValueError for no episode at all: a mean of nothing is no number.
+    `std` is over the episodes (population, ddof 0). Mean and deviation are None for a quantity that
+    no episode reports. Raises ValueError for no episode.
     """
     if not results:
         raise ValueError("no episode to summarise")
-    for result, outcome in zip(results, settled(one.outcome for one in results), strict=True):
+    for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
     fields = {
@@ -118,7 +79,7 @@ def summarise(
 
 
 def of_known(values: Iterable[float | None], figure: Any = np.mean) -> float | None:
-    """The figure of those values that are known; None where none is."""
+    """Return the figure of the values that are not None; None if all are."""
     known = [value for value in values if value is not None]
     return float(figure(known)) if known else None
 
@@ -147,8 +108,8 @@ class SafeStopEvent:
 class SafeStopLog:
     """Collects the events of a whole run.
 
-    Where one of an episode's first states is answered, the wait for that answer was a round trip:
-    the car brakes after 2 T of it, and that is no stop.
+    The car also brakes after 2 T without the first command of an episode. Where one of the first
+    states is answered, that was a round trip and is no stop.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -205,7 +166,7 @@ def make_report(
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``facts`` are rows of the report as they are: what was asked for, counts, ``policy_ids`` and
+    ``facts`` are further rows of the report: what was asked for, counts, ``policy_ids`` and
     ``wall_s``. The report's policy_id is that of the policy that appeared last.
     """
     policy_id = next(reversed(facts["policy_ids"]), "")
@@ -225,7 +186,7 @@ def make_report(
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:
-    """The lines of a table in Markdown and an empty one; a ``|`` in a cell becomes a ``/``."""
+    """Yield the lines of a Markdown table and an empty line; ``|`` in a cell becomes ``/``."""
     yield f"| {' | '.join(head)} |"
     yield "|---" * len(head) + "|"
     for row in rows:
@@ -272,7 +233,7 @@ def episode_line(
 
 
 def _reasons(noun: str, counts: Mapping[str, int]) -> str:
-    """As in "3 safe stops (2 no_command, 1 vehicle_fault)"."""
+    """Return text like "3 safe stops (2 no_command, 1 vehicle_fault)"."""
     each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
     return counted(sum(counts.values()), noun) + (f" ({each})" if each else "")
 
@@ -281,24 +242,24 @@ MAX_LAG_S = 2.0
 LAG_STEP_S = 0.005
 LEAST_SPREAD = 0.02
 """Standard deviation (of full action, or in m/s) below which too little was asked to tell a lag."""
-MOST_FAULTS = 32
-"""Different words that are counted: a list made up by anybody must not fill the memory."""
+MOST_FAULTS = 32  # Different words that are counted: no list of a stranger's fills the memory
 
-Numbers = NDArray[np.float64]
+Rows = list[tuple[int, float]]  # Stamp in ns, and value
 
 
-@dataclass
 class Series:
-    """One quantity in one episode: when what was asked for, and when what was reached."""
+    """One quantity in one episode: when what was asked for, and when what was reached.
 
-    asked_s: Numbers
-    asked: Numbers
-    reached_s: Numbers
-    reached: Numbers
-    held: bool  # What was asked for holds until the next; otherwise it is interpolated
+    ``held``: what was asked for holds until the next; otherwise it is interpolated.
+    """
 
-    def errors(self, delay_s: float = 0.0) -> Numbers:
-        """Reached minus what was asked for ``delay_s`` before."""
+    def __init__(self, asked: Rows, reached: Rows, held: bool) -> None:
+        self.held, start_ns = held, reached[0][0]
+        self.asked_s, self.asked = _columns(asked, start_ns)
+        self.reached_s, self.reached = _columns(reached, start_ns)
+
+    def errors(self, delay_s: float = 0.0) -> NDArray[np.float64]:
+        """Return what was reached minus what was asked for ``delay_s`` before."""
         at_s = self.reached_s - delay_s
         if not self.held:
             return self.reached - np.interp(at_s, self.asked_s, self.asked, left=self.reached[0])
@@ -306,79 +267,79 @@ class Series:
         return self.reached - values[np.searchsorted(self.asked_s, at_s, side="right")]
 
 
+def _columns(rows: Rows, start_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times (s) and values, ascending even where a clock was set."""
+    times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
+    times_s = np.array([(time_ns - start_ns) / 1e9 for time_ns in times_ns])
+    return times_s, np.array(values, np.float64)
+
+
 def errors(series: Sequence[Series]) -> dict[str, float | None]:
-    """Return rmse and max of the tracking error, as it happened, with the lag in it."""
+    """Return rmse and max of the tracking error, with the lag in it."""
     if not series:
         return {"rmse": None, "max": None}
-    found = np.concatenate([one.errors() for one in series])
+    found = np.concatenate([each.errors() for each in series])
     return {"rmse": float(np.sqrt(np.mean(found**2))), "max": float(np.abs(found).max())}
 
 
 def lag_ms(series: Sequence[Series]) -> float | None:
-    """Return the delay that aligns asked and reached best, in ms; None where nothing can be said.
+    """Return the delay that aligns asked and reached best, in ms.
 
-    It is that, from 0 to MAX_LAG_S in steps of LAG_STEP_S, with the least mean square of
-    reached(t) - asked(t - delay); the middle where several are as good, for feedback at 20 Hz
-    cannot tell steps apart that fall between two reports. For a dead time with a first-order
-    response behind it, it lies between the dead time and the sum of both, and near the sum where
-    what is asked changes slowly. None where next to nothing changed, and where the best delay is
-    the end of what is tried.
+    It has the least mean square of reached(t) - asked(t - delay), from 0 to MAX_LAG_S in steps of
+    LAG_STEP_S; the middle where several are as good, for feedback at 20 Hz cannot tell steps apart
+    that fall between two reports. For a dead time followed by a first-order response, it lies
+    between the dead time and the sum of both, and near the sum where what is asked changes slowly.
+    None where next to nothing changed, and where the best delay is the end of what is tried.
     """
-    if not series or np.std(np.concatenate([one.asked for one in series])) < LEAST_SPREAD:
+    if not series or np.std(np.concatenate([each.asked for each in series])) < LEAST_SPREAD:
         return None
     delays_s = np.arange(0.0, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-    squares = [sum(float(np.sum(one.errors(d) ** 2)) for one in series) for d in delays_s]
+    squares = [sum(float(np.sum(each.errors(d) ** 2)) for each in series) for d in delays_s]
     best_s = delays_s[np.isclose(squares, min(squares), rtol=1e-6, atol=1e-12)]
     return None if best_s[-1] == delays_s[-1] else round(float(best_s.mean()) * 1e3, 3)
-
-
-class _Episode(NamedTuple):
-    commands: list[Command]
-    feedback: list[Feedback]
 
 
 class TrackingLog:
     """What a vehicle was asked and what it reached, by episode; between two nothing counts.
 
     All times are the edge runtime's stamps, of commands and feedback alike, so that neither the
-    way to the simulator nor another clock is in any of it. An action is asked for from its command
-    on until the next one; a speed set-point, which the driver moves all the time, is interpolated.
-    Each episode begins at rest, so before its first command what was reached is what was asked.
-
-    A vehicle that brakes by itself follows nobody meanwhile: that feedback is left out.
+    way to the simulator nor another clock is in any of them. An action is asked for from its
+    command on until the next command; a speed set-point, which the driver moves all the time, is
+    interpolated. Each episode begins at rest, so before its first command what was reached is what
+    was asked. Feedback of a vehicle that brakes by itself is left out.
     """
 
     def __init__(self) -> None:
         self.faults: Counter[str] = Counter()
         """Words of the vehicle, by the feedback messages that held them."""
         self.vehicle = ""
-        self._episodes: list[_Episode] = []
-        self._open: _Episode | None = None
+        self._episodes: list[tuple[list[Command], list[Feedback]]] = []
+        self._is_open = False
 
     def begin(self) -> None:
         """Note that an episode begins."""
-        self._open = _Episode([], [])
-        self._episodes.append(self._open)
+        self._is_open = True
+        self._episodes.append(([], []))
 
     def end(self) -> None:
-        """Note that it has ended."""
-        self._open = None
+        """Note that the episode has ended."""
+        self._is_open = False
 
     def command(self, command: Command) -> None:
         """Take a command, in order."""
-        if self._open is not None:
-            self._open.commands.append(command)
+        if self._is_open:
+            self._episodes[-1][0].append(command)
 
     def feedback(self, feedback: Feedback) -> None:
         """Take a feedback, in order."""
         self.vehicle = feedback.vehicle
-        if self._open is None:
+        if not self._is_open:
             return
         for words in feedback.faults:
             if words in self.faults or len(self.faults) < MOST_FAULTS:
                 self.faults[words] += 1
         if not feedback.self_braking:
-            self._open.feedback.append(feedback)
+            self._episodes[-1][1].append(feedback)
 
     def report(self, action_names: Sequence[str]) -> dict[str, Any]:
         """Return errors and lags; ``action_names`` in the order of a command's action.
@@ -387,34 +348,22 @@ class TrackingLog:
         """
         speed = []
         actions: dict[str, list[Series]] = {name: [] for name in action_names}
-        for episode in self._episodes:
-            commands, feedback = episode.commands, episode.feedback
+        for commands, feedback in self._episodes:
             if told := [f for f in feedback if f.commanded_speed_mps is not None]:
                 asked = [(f.sent_ns, f.commanded_speed_mps or 0.0) for f in told]
-                reached = [(f.sent_ns, f.speed_mps) for f in told]
-                speed.append(_series(asked, reached, held=False))
+                speed.append(Series(asked, [(f.sent_ns, f.speed_mps) for f in told], held=False))
             for index, name in enumerate(action_names if commands and feedback else ()):
                 asked = [(c.sent_ns, c.action[index]) for c in commands]
                 reached = [(f.sent_ns, f.action[index]) for f in feedback]
-                actions[name].append(_series(asked, reached, held=True))
-        lags_ms = {name: lag_ms(series) for name, series in actions.items()}
+                actions[name].append(Series(asked, reached, held=True))
         return {
             "name": self.vehicle,
-            "samples": sum(len(episode.feedback) for episode in self._episodes),
+            "samples": sum(len(feedback) for _, feedback in self._episodes),
             "speed_error_mps": errors(speed),
             "action_error": {name: errors(series) for name, series in actions.items()},
-            "lag_ms": {"speed": lag_ms(speed), **lags_ms},
+            "lag_ms": {
+                "speed": lag_ms(speed),
+                **{name: lag_ms(series) for name, series in actions.items()},
+            },
             "faults": dict(self.faults),
         }
-
-
-def _series(
-    asked: Sequence[tuple[int, float]], reached: Sequence[tuple[int, float]], held: bool
-) -> Series:
-    """Rows of stamp (ns) and value as columns, ascending even where a clock was stepped."""
-    columns: list[Numbers] = []
-    for rows in (asked, reached):
-        times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
-        columns.append(np.array([(time_ns - reached[0][0]) / 1e9 for time_ns in times_ns]))
-        columns.append(np.array(values, dtype=np.float64))
-    return Series(columns[0], columns[1], columns[2], columns[3], held)

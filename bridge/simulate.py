@@ -1,4 +1,4 @@
-"""``python -m bridge simulate``: serve an environment to an edge runtime, and report."""
+"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bridge.environments import (
     make_environment,
     scenarios,
 )
-from bridge.episode import EpisodeRunner, policy_action, vehicle_action
+from bridge.episode import EpisodeRunner, OnTick, policy_action, vehicle_action
 from bridge.inbound import CommandCheck
 from bridge.messages import Origin
 from bridge.ports import SimulatorPort, add_options, open_port
@@ -35,8 +35,7 @@ from edge_runtime.cli import (
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.run import rearm_command
-from edge_runtime.tls import tls_for
-from edge_runtime.transport import DEFAULT_ENDPOINT
+from edge_runtime.transport import DEFAULT_ENDPOINT, tls_for
 from edge_runtime.util import UserError, printable
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
@@ -49,25 +48,24 @@ EXAMPLE = examples(
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     env = f"scenario ({', '.join(scenarios())}), gymnasium id or module:id"
     scene = "scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items())
-    clock = "lockstep waits for each command; realtime waits for nobody"
-    loop = "the car does what the policy commands, or (realtime only) what the vehicle behind"
-    loop += " the edge runtime reports to have done"
-    standing = "the car starts every episode at rest, as with --loop vehicle it always does"
+    clock = "lockstep waits for each command, realtime never waits"
+    loop = "the car follows the policy's commands, or (realtime only) the reports of the vehicle"
+    loop += " behind the edge runtime"
+    standing = "begin every episode at rest (always so with --loop vehicle)"
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
-    period = "seconds of a step (default: what the environment says, else its render_fps)"
+    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
     add("--standing", action="store_true", help=standing)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
-    help_text = "share a router with other vehicles instead of listening"
+    help_text = "a router to share with other vehicles, instead of listening"
     add_options(where, "--connect", default=None, help=help_text)
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
     add_options(parser, "--vehicle-id", help="the vehicle to simulate")
@@ -75,7 +73,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Run the command; UserError for anything the caller can put right."""
+    """Run the command."""
     if arguments.loop == VEHICLE and arguments.clock != REALTIME:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     arguments.standing |= arguments.loop == VEHICLE
@@ -121,29 +119,16 @@ def _drive(
     network, manifest = str(asked.latency), port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
-    rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
-    edge, waited = port.edge_counts, False
-
-    def on_tick(episode: int, step: int, decision: Decision) -> None:
-        nonlocal waited
-        reason = printable(decision.brake_reason)
-        doing = f"braking: {reason}" if reason else "driving"
-        bar.show(f"step {step:3d}  {doing[:40]}")
-        waits = edge.newest is not None and edge.newest.needs_rearm
-        if waits and not waited:
-            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
-        waited = waits
-
     runner = EpisodeRunner(
         environment,
         clock,
         port.publish_scene,
-        on_tick,
+        _shown_on(bar, port, rearm_command(asked.connect or asked.listen, asked.vehicle_id)),
         task,
         Origin(session=port.session, environment=asked.env, latency=network, **how),
         apply=vehicle_action if vehicle else policy_action,
     )
-    # Where it says nothing, the edge runtime compares by itself what the states say.
+    # Without a manifest, the edge runtime itself compares what the states say.
     if manifest is not None and manifest.text != task.text:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
@@ -163,7 +148,7 @@ def _drive(
         bar.advance({}, told=told)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
-    by_simulator = clock.rejected() + edge.unreadable
+    edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
     return make_report(
         results,
         runner.safe_stops.events,
@@ -187,3 +172,21 @@ def _drive(
             "vehicle": vehicle.report() if vehicle else None,
         },
     )
+
+
+def _shown_on(bar: ProgressBar, port: SimulatorPort, rearm: str) -> OnTick:
+    """Return what shows each tick on the bar, and says when the vehicle waits for a re-arm."""
+    waited = False
+
+    def on_tick(episode: int, step: int, decision: Decision) -> None:
+        nonlocal waited
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
+        bar.show(f"step {step:3d}  {doing[:40]}")
+        newest = port.edge_counts.newest
+        waits = newest is not None and newest.needs_rearm
+        if waits and not waited:
+            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
+        waited = waits
+
+    return on_tick

@@ -1,15 +1,15 @@
-"""The command that the simulated vehicle holds, and one episode's network in virtual time. Pure.
+"""The command that the simulated vehicle holds, and an episode's network in virtual time. Pure.
 
 `CommandHold` is the vehicle's side of the contract's safety rule, on every clock: the newest
 command is held from tick to tick; when none has arrived for 2 T, or when the command itself says
 ``safe_stop``, the vehicle brakes.
 
-`VirtualLink` is shared by lock-step and by training under latency. The caller gives the answers:
-those of a real edge runtime, or of a function. An answer takes no time.
+`VirtualLink` serves lock-step and training under latency. The caller gives the answers: those of a
+real edge runtime, or of a function. An answer takes no virtual time.
 
 In lock-step states come faster than in real time: a real edge runtime would not notice a gap in
-virtual time. The link runs the safety machine on virtual time itself, and what that would not drive
-becomes a safe stop. It begins each episode in standby: episodes do not depend on each other.
+virtual time. So the link runs the safety machine on virtual time itself, from standby at each
+episode's start, and turns into a safe stop what that machine would not drive.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from bridge.network import LatencySpec, make_link
-from edge_runtime.freshness import Freshness
+from bridge.network import LatencySpec, make_network
+from edge_runtime.latest import Freshness
 from edge_runtime.safety import (
     Event,
     Mode,
@@ -47,7 +47,7 @@ UNKNOWN_SAFE_STOP = "safe_stop"  # Brake reason when a safe_stop command gives n
 
 @dataclass(frozen=True)
 class Decision:
-    """What the vehicle does in one tick."""
+    """The vehicle's decision in one tick."""
 
     command: Command | None  # The newest command, held; None before the first of the episode
     fresh: bool  # It arrived since the decision before this one
@@ -59,7 +59,7 @@ class Decision:
     ridden: int = 0
     """Which action of its plan ``command`` has in the place of its own; 0: its own."""
     feedback: Feedback | None = None
-    """What the vehicle in the loop says of the tick; None without one, or where it is silent."""
+    """The vehicle in the loop about the tick; None without a vehicle, or where it is silent."""
     feedback_age_s: float | None = None
     """From its arrival here, before any injected delay."""
     waits: bool = False
@@ -79,7 +79,7 @@ class CommandHold:
 
     @property
     def newest_step(self) -> int:
-        """Return the step of the newest command; -1 before the first."""
+        """The step of the newest command; -1 before the first."""
         return -1 if self.newest is None else self.newest.step
 
     def admit(self, command: Command, now_s: float, sent_s: float) -> bool:
@@ -143,13 +143,13 @@ Message = TypeVar("Message")
 
 @dataclass(frozen=True)
 class Arrival(Generic[Message]):
-    """A state that has come to the edge runtime."""
+    """A state that has reached the edge runtime."""
 
     step: int
     arrived_s: float
     message: Message
     overtaken: bool
-    """One as new or newer came before it: an edge runtime rejects it, and does not answer."""
+    """An equally new or newer state came before: the edge runtime rejects this without answer."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class VirtualLink(Generic[Message]):
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
-        self._link = make_link(spec, seed)
+        self._link = make_network(spec, seed)
         self._on_heard, self._on_stale = on_heard, on_stale
         self._under_way: list[tuple[float, int, Any]] = []
         """A heap by arrival time; messages of the same time keep their order."""
@@ -198,7 +198,7 @@ class VirtualLink(Generic[Message]):
 
     def change(self, spec: LatencySpec, seed: int) -> None:
         """Let another network carry what is sent from now on; what is under way arrives."""
-        self._link = make_link(spec, seed)
+        self._link = make_network(spec, seed)
 
     def send_state(self, step: int, message: Message) -> None:
         """Begin tick ``step``: its state leaves the vehicle."""
@@ -208,7 +208,7 @@ class VirtualLink(Generic[Message]):
             self._push(arrival_s, (step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
-        """Let time run to the next state's arrival at the edge runtime; None: the window ends."""
+        """Let time run to the next state's arrival at the edge runtime; None at window end."""
         while self._under_way and self._under_way[0][0] <= self._window_end_s + ROUNDING_S:
             now_s, _, message = heapq.heappop(self._under_way)
             if isinstance(message, _Answer):
@@ -242,14 +242,14 @@ class VirtualLink(Generic[Message]):
             self._push(arrival_s, answer)
 
     def decide(self, edge_silence_s: float | None = None) -> Decision:
-        """What the vehicle does in this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
+        """Decide this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
         # Answered already, the vehicle acts at once: nothing newer can come in this tick.
         answered = self.hold.newest_step >= self._step
         acts_s = self._admitted_s if answered else self._window_end_s
         return self.hold.decide(acts_s, edge_silence_s)
 
     def _note_arrival(self, step: int, now_s: float) -> None:
-        """What the edge runtime's safety machine makes of a newest state's moment."""
+        """Let the edge runtime's safety machine judge the arrival of a newest state."""
         gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
             self._safety = advance(self._safety, gap)

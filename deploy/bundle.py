@@ -1,70 +1,62 @@
 """``python -m deploy bundle``: all that a board needs to drive one policy, in one signed archive.
 
 The same inputs give the same bytes: the archive holds no time, place or user name. A lock names
-every wheel of a kind of board by version and hash. A folder keeps the wheels between runs, so a
-bundle made from a full folder needs no network. After a change of versions in a lock,
-``python -m deploy lock TARGET`` writes the new hashes.
+every wheel of a kind of board by version and hash. A folder keeps the wheels between runs, so that
+only the first bundle needs a network.
 """
 
 from __future__ import annotations
 
 import argparse
-import configparser
-import contextlib
 import functools
 import hashlib
-import importlib.metadata
 import io
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
-import tomllib
 import zipfile
-from collections.abc import Sequence
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
-from packaging.tags import compatible_tags, cpython_tags
-from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 
-import deploy.installer
 import edge_runtime
 from deploy.certs import DEFAULT_KEY, write_private
-from deploy.installer.layout import CONFIG, NO_ZIP, POLICY, PUBLIC_KEY, TLS, WHEELS
-from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
+from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
+from deploy.installer.verify import MANIFEST, NAMESPACE, BundleManifest, Target, to_json
 from edge_runtime import tls
-from edge_runtime.cli import Command, examples
+from edge_runtime.cli import Subcommand, examples
 from edge_runtime.config import BUILT_IN, NONE, Config, load_config
 from edge_runtime.controller import shared_limits
 from edge_runtime.files import check_writable, make_directory, write_atomic
-from edge_runtime.policy import MAX_POLICY_MIB, Policy, load_policy
-from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, open_regular, read_bytes
-from edge_runtime.vehicles import GROUP, find_vehicle, vehicle_limits
+from edge_runtime.manifest import Manifest
+from edge_runtime.policy import MAX_POLICY_MIB, load_policy
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes, read_toml
+from edge_runtime.vehicles import GROUP, vehicle_limits
 
+ROOT = Path(__file__).parents[1]
+UNITS = ROOT / "deploy/systemd"
 NAME = "install.pyz"
-EDGE_PACKAGE = "phil-edge-runtime"
-DEFAULT_OUT = "build/bundles"
-UNITS = Path(__file__).parent / "systemd"
+DEFAULT_OUT, DEFAULT_FOLDER = "build/bundles", "build/wheels"
 HOLD = "../../state/hold"  # Seen from a release's folder: what the installer locks while it judges
 _OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
 _DIGITS = 8
-_MAIN = (
-    "import sys\n\nif sys.version_info < (3, 8):\n"
-    '    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")\n'
-    "    sys.exit(2)\n\n"
-    "from deploy.installer.__main__ import main\n\n"
-    'if __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
-)
+_MAIN = """\
+import sys
 
-ROOT = Path(__file__).parents[1]
-LOCKS = ROOT / "requirements"
-DEFAULT_FOLDER = "build/wheels"
+if sys.version_info < (3, 8):
+    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")
+    sys.exit(2)
+
+from deploy.installer.__main__ import main
+
+sys.exit(main(sys.argv[1:]))
+"""
 TARGETS = {
     name: Target(name, python, machine, glibc="2.31")
     for name, python, machine in (
@@ -74,16 +66,16 @@ TARGETS = {
     )
 }
 _PATCH = 2  # pip reads 3.9 as 3.9.0, which cryptography excludes; Debian bullseye has 3.9.2.
-_LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
-_SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
 _EPOCH_S = 315532800
 """1980-01-01, the first day that a ZIP file knows: the built wheel's files bear it."""
 
 
 class Inputs(NamedTuple):
-    """What a bundle is made of: a policy with its signature beside it and the signer's public key,
-    the private key that signs the bundle, settings of `run` (None for its defaults), the vehicle's
-    folder of `deploy certs`, and all wheels, a vehicle's driver among them.
+    """What a bundle is made of.
+
+    `policy` has its signature beside it, and `public_key` is its signer's; `key` signs the bundle.
+    `config` holds settings of `run` (None for its defaults), `tls` is the vehicle's folder of
+    `deploy certs`, and `wheels` are all wheels, a vehicle's driver among them.
     """
 
     policy: Path
@@ -95,121 +87,113 @@ class Inputs(NamedTuple):
 
 
 class Made(NamedTuple):
-    """A bundle on the disk, and the size of each file in it, bytes."""
+    """A bundle on the disk."""
 
     path: Path
-    manifest: Manifest
-    sizes: dict[str, int]
+    manifest: BundleManifest
 
 
 def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--target", choices=TARGETS, required=True, help="the board's kind")
+    parser.add_argument("--target", choices=TARGETS, required=True, help="kind of board")
     add = functools.partial(parser.add_argument, type=Path, metavar="FILE")
     add("--policy", required=True, help="signed policy file")
     add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
     add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="public key of the policy's signer")
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
     add = functools.partial(parser.add_argument, type=Path, metavar="DIR")
-    add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
+    add("--tls", help="the vehicle's folder of `deploy certs`, such as certs/edge-hunter01")
     driver = "another wheel to install, such as a vehicle's driver; may be repeated"
     parser.add_argument(
         "--with", dest="more", action="append", type=Path, default=[], metavar="WHEEL", help=driver
     )
-    add("--wheels", default=DEFAULT_FOLDER, help="wheels are kept here")
-    add("--out", default=DEFAULT_OUT, help="where the archive goes")
+    add("--wheels", default=DEFAULT_FOLDER, help="folder that keeps the wheels")
+    add("--out", default=DEFAULT_OUT, help="folder for the bundle")
 
 
 def _run_bundle(arguments: argparse.Namespace) -> int:
-    """Make a bundle and print its size and contents."""
-    target, out = TARGETS[arguments.target], arguments.out
+    target, out, more = TARGETS[arguments.target], arguments.out, arguments.more
     given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
-    inputs = Inputs(**given, wheels=arguments.more)
-    # Before minutes of downloads: the inputs, and where it goes.
-    check_inputs(inputs)
-    check_wheels(arguments.more, target)
-    check_writable(out / "bundle.tar")
-    wheels = arguments.more + gather(target, lock_path(target), arguments.wheels / target.name)
+    inputs = Inputs(**given, wheels=more)
+    kept = arguments.wheels / target.name
+    # All that can be wrong, before minutes of downloads.
+    for folder in (out, kept):
+        check_writable(folder / "file")
+    collect(inputs, target)
     with tempfile.TemporaryDirectory() as place:
-        wheels.append(build_edge_wheel(Path(place)))
-        made = make_bundle(inputs._replace(wheels=wheels), target, out)
-    for name, size in made.sizes.items():
-        print(f"{size:>12,}  {name}")
-    print(f"{sum(s for n, s in made.sizes.items() if n.startswith(WHEELS)):>12,}  of that, wheels")
-    size, manifest = made.path.stat().st_size, made.manifest
-    print(f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB), signed by {made.path.name}.sig")
-    print(
-        f"version {manifest.version}, for {manifest.vehicle_id}, Python {target.python}"
-        f" on {target.machine} with glibc {target.glibc} or newer"
-    )
+        if more:  # pip refuses those that do not fit the target.
+            _download(target, Path(place), "--no-index", *map(str, more))
+        build_edge_wheel(Path(place))
+        wheels = gather(target, lock_path(target), kept, Path(place))
+        path, manifest = make_bundle(inputs._replace(wheels=wheels), target, out)
+    print(f"{path}  ({path.stat().st_size / 1e6:.1f} MB), signed by {path.name}.sig")
+    print(f"version {manifest.version}, for {manifest.vehicle_id}, {target} or newer")
     return 0
 
 
 def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
     """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`.
 
-    Raises UserError, with nothing written, for a policy that may not drive or was not signed by
-    the public key's owner, settings that do not hold, certificates of another party, and a key
-    that cannot sign.
+    Raises UserError as `collect` does, with nothing written.
     """
-    key, policy, config, text = check_inputs(inputs)
-    contents = {
-        NAME: build_installer(),
-        POLICY: read_bytes(inputs.policy, "policy file", MAX_POLICY_MIB),
-        f"{POLICY}.sig": read_bytes(f"{inputs.policy}.sig", "signature"),
-        PUBLIC_KEY: read_bytes(inputs.public_key, "public key"),
-        CONFIG: text.encode(),
-    }
-    for path in sorted(UNITS.glob("*.*")):
-        contents[f"units/{path.name}"] = path.read_bytes()
-    for path in inputs.wheels:
-        # NAME-VERSION: the tags were pip's concern, and make some names too long for a tar.
-        name = "-".join(path.name.split("-")[:2])
-        if f"{WHEELS}{name}.whl" in contents:
-            raise UserError(f"wheel {path}: the bundle has another {name}")
-        contents[f"{WHEELS}{name}.whl"] = path.read_bytes()
-    if inputs.tls is not None:  # The party's three files, and none that may stand beside them.
-        for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
-            contents[f"{TLS}{name}"] = read_bytes(inputs.tls / name, "TLS file")
-    manifest = _manifest(contents, target, config.vehicle_id, policy.policy_id)
-    path = out / f"phil-{target.name}-{config.vehicle_id}-{manifest.version}.tar"
-    packed = _pack({MANIFEST: to_json(manifest), **contents})
-    signature = _sign(packed, key)
-    write_atomic(f"{path}.sig", signature)
+    contents, manifest = collect(inputs, target)
+    path = out / f"phil-{target.name}-{manifest.vehicle_id}-{manifest.version}.tar"
+    packed = pack({MANIFEST: to_json(manifest), **contents})
+    write_atomic(f"{path}.sig", sign(packed, tls.read_signing_key(inputs.key)))
     try:
         write_private(path, packed)  # it holds a private key
     finally:
         if not path.exists():
             Path(f"{path}.sig").unlink()
-    return Made(path, manifest, {name: len(data) for name, data in sorted(contents.items())})
+    return Made(path, manifest)
 
 
-def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str]:
-    """The key, the policy, the settings and their text; UserError for what no bundle may hold."""
-    key = tls.read_signing_key(inputs.key)
-    if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
-        # Here, because load_policy would name a flag that no bundle has.
-        raise UserError(
-            f"policy {inputs.policy} is not signed ({inputs.policy.name}.sig is missing);"
-            " `python -m trainer export ... --key KEY` signs it"
-        )
-    policy = load_policy(inputs.policy, inputs.public_key)
-    config, text = _config(inputs)
-    _check_vehicle(config, policy, set().union(*map(_drivers_in, inputs.wheels)))
-    if inputs.tls is not None:
-        tls.check_name(tls.load_tls(inputs.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
-    return key, policy, config, text
+def collect(inputs: Inputs, target: Target) -> tuple[dict[str, bytes], BundleManifest]:
+    """The files of a bundle but its manifest, by path, and the manifest.
 
-
-def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
-    """Raise UserError for a vehicle that the board could not load, or whose settings do not hold.
-
-    Those of another package's driver are read where it is installed here, too: it need not be.
+    Raises UserError for a policy that may not drive or was not signed by the public key's owner,
+    settings that do not hold, certificates of another party, and a key that cannot sign.
     """
+    tls.read_signing_key(inputs.key)
+    contents = {
+        NAME: build_installer(),
+        POLICY: read_bytes(inputs.policy, "policy file", MAX_POLICY_MIB),
+        f"{POLICY}.sig": read_bytes(f"{inputs.policy}.sig", "signature"),
+        PUBLIC_KEY: read_bytes(inputs.public_key, "public key"),
+        **{f"units/{path.name}": path.read_bytes() for path in UNITS.iterdir()},
+    }
+    policy = load_policy(inputs.policy, inputs.public_key)
+    config, contents[CONFIG] = _settings(inputs)
+    _check_vehicle(config, policy.manifest, inputs.wheels)
+    if inputs.tls is not None:  # The party's three files, and none that may stand beside them.
+        tls.check_name(tls.load_tls(inputs.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
+        for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
+            contents[f"{TLS}{name}"] = read_bytes(inputs.tls / name, "TLS file")
+    packages = set()
+    for path in inputs.wheels:
+        package, _, rest = path.name.partition("-")
+        if package.lower() in packages:
+            raise UserError(f"wheel {path}: the bundle has another {package}")
+        packages.add(package.lower())
+        # Without the tags, which were pip's concern and make some names too long for a tar.
+        name = f"{WHEELS}{package}-{rest.split('-')[0]}.whl"
+        contents[name] = read_bytes(path, "wheel")
+    # The version ends with a hash of all the rest, so it always means the same bytes.
+    draft = BundleManifest("draft", target, config.vehicle_id, policy.policy_id)
+    digest = hashlib.sha256(to_json(draft))
+    for name, data in sorted(contents.items()):
+        digest.update(f"{name} {hashlib.sha256(data).hexdigest()}\n".encode())
+    hashes = policy.policy_id[:_DIGITS], digest.hexdigest()[:_DIGITS]
+    return contents, draft._replace(version="-".join([edge_runtime.__version__, *hashes]))
+
+
+def _check_vehicle(config: Config, manifest: Manifest, wheels: list[Path]) -> None:
+    """Raise UserError for a vehicle that no wheel brings, or settings that do not hold."""
     name, colon, _ = config.vehicle.partition(":")
-    if name in (NONE, *BUILT_IN) or (name in brought and _is_readable(name)):
-        limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
-        shared_limits(policy.manifest.action, limits)
-    elif name + colon not in brought:
+    brought = set().union(*map(_drivers_in, wheels))
+    if name in (NONE, *BUILT_IN):
+        limits = vehicle_limits(config.vehicle, config.vehicle_settings, manifest)
+        shared_limits(manifest.action, limits)
+    elif (name.split(".")[0] if colon else name) + colon not in brought:
         known = ", ".join((NONE, *BUILT_IN))
         raise UserError(
             f"vehicle {config.vehicle!r} is in no wheel of the bundle: name its driver's with"
@@ -217,102 +201,24 @@ def _check_vehicle(config: Config, policy: Policy, brought: set[str]) -> None:
         )
 
 
-def _is_readable(name: str) -> bool:
-    """Whether a driver can be loaded here, and says its limits without being opened."""
-    try:
-        return hasattr(find_vehicle(name), "limits")
-    except UserError:
-        return False
-
-
 def _drivers_in(path: Path) -> set[str]:
-    """The vehicles that a wheel names in its entry points, and all of its modules, as `module:`."""
+    """The vehicles that a wheel names in its entry points, and its top modules, as `module:`."""
     try:
-        with open_regular(path) as stream, zipfile.ZipFile(stream) as wheel:
+        with zipfile.ZipFile(path) as wheel:
             names = wheel.namelist()
-            read = [wheel.read(one) for one in names if one.endswith(".dist-info/entry_points.txt")]
-        points = configparser.ConfigParser(delimiters=("=",), interpolation=None)
-        points.optionxform = str  # type: ignore[assignment,method-assign]  # Else in small letters
-        points.read_string("\n".join(text.decode() for text in read))
-    except (OSError, *NO_ZIP, configparser.Error, ValueError) as error:
+    except (OSError, zipfile.BadZipFile) as error:
         raise UserError(f"wheel {path} cannot be read: {error}") from None
-    modules = {re.sub(r"(/__init__)?\.py$", "", one).replace("/", ".") + ":" for one in names}
-    return modules | (set(points[GROUP]) if GROUP in points else set())
+    points = [point for each in distributions(path=[str(path)]) for point in each.entry_points]
+    modules = {name.split("/")[0].removesuffix(".py") for name in names}
+    return {point.name for point in points if point.group == GROUP} | {f"{m}:" for m in modules}
 
 
-def check_wheels(wheels: Sequence[Path], target: Target) -> None:
-    """Raise UserError for a wheel that the target cannot run, or whose package it has anyway."""
-    version = tuple(map(int, target.python.split(".")))
-    platforms = [*_platforms(target), f"linux_{target.machine}"]  # The last: built on the board
-    fits = set(cpython_tags(version, platforms=platforms))
-    interpreter = f"cp{version[0]}{version[1]}"
-    fits.update(compatible_tags(version, interpreter, platforms))
-    own = {canonicalize_name(pin.name) for pin in read_lock(lock_path(target))} | {EDGE_PACKAGE}
-    for path in wheels:
-        try:
-            name, _, _, tags = parse_wheel_filename(path.name)
-        except InvalidWheelFilename as error:
-            raise UserError(f"wheel {path}: {error}") from None
-        if not tags & fits:
-            board = f"Python {target.python} on {target.machine} with glibc {target.glibc}"
-            raise UserError(f"wheel {path} does not fit {board}")
-        if name in own:
-            raise UserError(f"wheel {path}: the bundle has a {name} of its own")
-
-
-def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: str) -> Manifest:
-    """The version ends with a hash of all the rest, so it always means the same bytes."""
-    draft = Manifest("draft", target, vehicle, policy)
-    digest = hashlib.sha256(to_json(draft))
-    for name, data in sorted(contents.items()):
-        digest.update(f"{name} {hashlib.sha256(data).hexdigest()}\n".encode())
-    version = f"{edge_runtime.__version__}-{policy[:_DIGITS]}-{digest.hexdigest()[:_DIGITS]}"
-    return draft._replace(version=version)
-
-
-def _pack(contents: dict[str, bytes]) -> bytes:
-    """A tar of files in the order of their names: owner 0, time 0, mode 0600."""
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for name, data in sorted(contents.items()):
-            member = tarfile.TarInfo(name)
-            member.size, member.mode = len(data), 0o600
-            try:
-                tar.addfile(member, io.BytesIO(data))
-            except ValueError:
-                raise UserError(f"the name {name} is too long for a bundle") from None
-    return packed.getvalue()
-
-
-def _sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
-    """The signature that the board's `ssh-keygen -Y verify` takes; the same one each time.
-
-    ssh-keygen reads the key from a file in memory: no copy of it comes onto the disk.
-    """
-    pem = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
-    with open(os.memfd_create("key"), "wb") as file:
-        os.fchmod(file.fileno(), 0o600)  # it takes no key that others could read
-        file.write(pem)
-        file.flush()
-        command = ["ssh-keygen", "-q", "-Y", "sign", "-n", NAMESPACE, "-f",
-                   f"/proc/self/fd/{file.fileno()}"]  # fmt: skip
-        try:
-            done = subprocess.run(
-                command, input=data, capture_output=True, check=False, pass_fds=[file.fileno()]
-            )
-        except FileNotFoundError:
-            raise UserError("ssh-keygen is not installed here (openssh-client)") from None
-    if done.returncode != 0:
-        raise UserError(f"ssh-keygen does not sign: {done.stderr.decode(errors='replace')}")
-    return done.stdout
-
-
-def _config(inputs: Inputs) -> tuple[Config, str]:
+def _settings(inputs: Inputs) -> tuple[Config, bytes]:
     """The settings, checked as `run` checks them, and the file that the board gets."""
-    flags = {"policy": str(inputs.policy), **({"tls": str(inputs.tls)} if inputs.tls else {})}
+    flags = {"policy": str(inputs.policy), "tls": inputs.tls and str(inputs.tls)}
     config = load_config(inputs.config, flags)
-    given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
-    keys = tomllib.loads(given).keys()
+    given = inputs.config.read_text("utf-8") if inputs.config else ""
+    keys = read_toml(inputs.config, "config file") if inputs.config else {}
     for name in _OF_THE_BUNDLE:
         if name in keys:
             raise UserError(f"config file {inputs.config}: the bundle sets {name}; leave it out")
@@ -331,17 +237,47 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
         "",
         given.strip(),
     ]
-    text = "\n".join(lines).rstrip() + "\n"
-    return config, text
+    return config, ("\n".join(lines).rstrip() + "\n").encode()
+
+
+def pack(contents: dict[str, bytes]) -> bytes:
+    """Make a tar of files in the order of their names: owner 0, time 0, mode 0600."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name, data in sorted(contents.items()):
+            member = tarfile.TarInfo(name)
+            member.size, member.mode = len(data), 0o600
+            tar.addfile(member, io.BytesIO(data))
+    return packed.getvalue()
+
+
+def sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
+    """Make the signature that the board's `ssh-keygen -Y verify` takes; the same one each time.
+
+    ssh-keygen reads the key from a file in memory: no copy of it comes onto the disk.
+    """
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
+    with open(os.memfd_create("key"), "wb", buffering=0) as file:
+        os.fchmod(file.fileno(), 0o600)  # it takes no key that others could read
+        file.write(pem)
+        command = ["ssh-keygen", "-q", "-Y", "sign", "-n", NAMESPACE, "-f",
+                   f"/proc/self/fd/{file.fileno()}"]  # fmt: skip
+        done = subprocess.run(
+            command, input=data, capture_output=True, check=False, pass_fds=[file.fileno()]
+        )
+    if done.returncode != 0:
+        raise UserError(f"ssh-keygen does not sign: {done.stderr.decode(errors='replace')}")
+    return done.stdout
 
 
 def build_installer() -> bytes:
-    """The bytes of `install.pyz`."""
-    folder = Path(deploy.installer.__file__).parent
+    """Make `install.pyz`."""
+    sources = [
+        *sorted((ROOT / "deploy/installer").glob("*.py")),
+        *(ROOT / f"edge_runtime/{name}.py" for name in ("__init__", "cli", "files", "util")),
+    ]
     members = {"__main__.py": _MAIN, "deploy/__init__.py": ""}
-    shared = (ROOT / "edge_runtime" / f"{name}.py" for name in ("__init__", "cli", "util"))
-    for path in (*sorted(folder.glob("*.py")), *shared):
-        members[path.relative_to(ROOT).as_posix()] = path.read_text()
+    members.update((path.relative_to(ROOT).as_posix(), path.read_text()) for path in sources)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
         for name, text in members.items():
@@ -351,63 +287,41 @@ def build_installer() -> bytes:
     return packed.getvalue()
 
 
-class Pin(NamedTuple):
-    """One line of a lock; `sha256` in hex, of the one wheel that fits the target."""
-
-    name: str
-    version: str
-    sha256: str
-
-
 def lock_path(target: Target) -> Path:
-    """The file that names every wheel of a target by version and hash."""
-    return LOCKS / f"bundle-{target.name}.txt"
+    """The file that names every wheel of a target by version and hash, as pip reads it."""
+    return ROOT / f"requirements/bundle-{target.name}.txt"
 
 
-def read_lock(path: Path) -> list[Pin]:
-    """The pins of a lock: `NAME==VERSION --hash=sha256:HEX`, one wheel a line."""
-    pins = []
-    for line in read_bytes(path, "lock").decode().splitlines():
-        if line.strip() and not line.startswith("#"):
-            found = _LINE.fullmatch(line.strip())
-            if found is None:
-                raise UserError(f"lock {path}: not NAME==VERSION --hash=sha256:HEX: {line}")
-            pins.append(Pin(*found.groups()))
-    return pins
+def gather(target: Target, lock: Path, kept: Path, place: Path) -> list[Path]:
+    """Bring the lock's wheels to `place`, by way of the folder where they are kept.
+
+    pip checks every hash, and asks an index only where a wheel is missing.
+    """
+    make_directory(kept)
+    locked = ("--require-hashes", "--requirement", str(lock), "--find-links", str(kept))
+    try:
+        _download(target, place, "--no-index", *locked)
+    except UserError:
+        _download(target, kept, *locked)
+        _download(target, place, "--no-index", *locked)
+    return sorted(place.glob("*.whl"))
 
 
-def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
-    """The lock's wheels in `folder`, in the lock's order; pip fetches what is missing."""
-    pins = read_lock(lock)
-    found = _by_hash(folder)
-    if any(pin.sha256 not in found for pin in pins):
-        download(target, ["--require-hashes", "--requirement", str(lock)], folder)
-        found = _by_hash(folder)
-    missing = [pin.name for pin in pins if pin.sha256 not in found]
-    if missing:
-        raise UserError(f"no wheel with the lock's hash in {folder} for {', '.join(missing)}")
-    return [found[pin.sha256] for pin in pins]
-
-
-def download(target: Target, wanted: list[str], folder: Path) -> None:
-    """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
-    make_directory(folder)
+def _download(target: Target, folder: Path, *wanted: str) -> None:
+    """Let pip bring wheels for another computer. Raises UserError with pip's own line."""
+    newest = int(target.glibc.split(".")[1])
+    tags = [*(f"manylinux_2_{minor}" for minor in range(newest + 1)), "manylinux1", "manylinux2010",
+            "manylinux2014", "linux"]  # fmt: skip
     pip(
         "download", "--only-binary=:all:", "--no-deps",
         f"--python-version={target.python}.{_PATCH}",
-        *(f"--platform={platform}" for platform in _platforms(target)),
+        *(f"--platform={tag}_{target.machine}" for tag in tags),
         "--dest", str(folder), *wanted,
     )  # fmt: skip
 
 
-def _platforms(target: Target) -> list[str]:
-    newest = int(target.glibc.split(".")[1])
-    tags = [*(f"_2_{minor}" for minor in range(newest + 1)), "1", "2010", "2014"]
-    return [f"manylinux{tag}_{target.machine}" for tag in tags]
-
-
 def build_edge_wheel(folder: Path) -> Path:
-    """The edge runtime's wheel, the same bytes from the same sources and the same setuptools."""
+    """Make the edge runtime's wheel, the same bytes from the same sources and setuptools."""
     with tempfile.TemporaryDirectory() as place:
         # Of a copy: building writes into its source folder.
         source = Path(place) / "edge_runtime"
@@ -415,22 +329,13 @@ def build_edge_wheel(folder: Path) -> Path:
         shutil.copytree(ROOT / "edge_runtime", source, ignore=ignored)
         for path in source.rglob("*"):
             path.chmod(0o755 if path.is_dir() else 0o644)  # the umask of whoever cloned it
-        made = Path(place) / "made"
-        # With the setuptools that is here, if it is new enough: no index is asked then.
-        options = []
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
-            if int(importlib.metadata.version("setuptools").split(".")[0]) >= _SETUPTOOLS:
-                options = ["--no-build-isolation"]
-        pip("wheel", "--no-deps", *options, "--wheel-dir", str(made), str(source))
-        make_directory(folder)
-        return Path(shutil.move(next(made.glob("*.whl")), folder))
+        # With the setuptools that is here: no index is asked.
+        pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(source))
+    return next(folder.glob("phil_edge_runtime-*.whl"))
 
 
 def pip(*arguments: str) -> None:
-    """Run pip; on a terminal with its own progress.
-
-    Raises UserError with the last line that begins with ERROR.
-    """
+    """Run pip, on a terminal with its progress. Raises UserError with its last line of an error."""
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": str(_EPOCH_S)}
     shown = sys.stderr if sys.stderr.isatty() else subprocess.DEVNULL
@@ -442,33 +347,29 @@ def pip(*arguments: str) -> None:
         raise UserError(f"pip {arguments[0]}: {(lines or ['failed'])[-1]}")
 
 
-def _by_hash(folder: Path) -> dict[str, Path]:
-    wheels = sorted(folder.glob("*.whl"))
-    return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
-
-
 def _add_lock_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("target", choices=TARGETS, help="the board's kind")
+    parser.add_argument("target", choices=TARGETS, help="kind of board")
 
 
 def _run_lock(arguments: argparse.Namespace) -> int:
-    """Download each `NAME==VERSION` of the lock and write the hash of what came beside it."""
+    """Download each NAME==VERSION of the lock and write the hash of its wheel beside it."""
     target = TARGETS[arguments.target]
     path = lock_path(target)
-    lines = read_bytes(path, "lock").decode().splitlines()
+    lines = path.read_text().splitlines()
     for number, line in enumerate(lines):
-        if line.strip() and not line.startswith("#"):
+        if "==" in line and not line.startswith("#"):
             pin = line.split()[0]
             with tempfile.TemporaryDirectory() as place:
-                download(target, [pin], Path(place))
-                (digest,) = _by_hash(Path(place))
+                _download(target, Path(place), pin)
+                (wheel,) = Path(place).iterdir()
+                digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
             lines[number] = f"{pin} --hash=sha256:{digest}"
     write_atomic(path, ("\n".join(lines) + "\n").encode())
     print(path)
     return 0
 
 
-BUNDLE = Command(
+BUNDLE = Subcommand(
     examples(
         "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
         "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
@@ -479,4 +380,4 @@ BUNDLE = Command(
     _add_bundle_arguments,
     _run_bundle,
 )
-LOCK = Command(examples("python -m deploy lock jetpack5"), _add_lock_arguments, _run_lock)
+LOCK = Subcommand(examples("python -m deploy lock jetpack5"), _add_lock_arguments, _run_lock)

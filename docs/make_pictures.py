@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import sys
@@ -19,8 +20,15 @@ from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
 from edge_runtime.cli import run_cli
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_json
-from hil_tests.campaign import draw_axes
-from hil_tests.processes import POLICY, PUBLIC_KEY, drive_shown, run_command
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
+from hil_tests.sweep import draw_axes
+from hil_tests.testing.browser import (
+    PERSON_DRIVES,
+    POLICY_DRIVES,
+    open_browser,
+    quit_sitting,
+    until,
+)
 from trainer.drivers import load_driver
 from trainer.environments import make_environment
 from trainer.pictures import write_figure
@@ -39,6 +47,7 @@ NETWORK = ("--clock", "realtime", "--latency", "50ms+-10ms,outage=0.4s@3s", "--e
            "--seed", "8")  # fmt: skip
 LOOP_TIME_S = 8.0
 TRUST = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
+TAKE_OVERS = 12  # Before the picture of the cockpit
 SOME_MISSING = 1  # Exit status where a picture could not be made here
 Make = Callable[[Path, Path], None]
 """Writes a picture, given its path and a directory for what is made on the way."""
@@ -150,14 +159,38 @@ def screenshot(rrd: Path, timeline: str, **moment: Any) -> bytes:
             raise UserError(f"rerun's viewer does not draw here ({error}): {needs}") from None
 
 
+def cockpit(out: Path, work: Path) -> None:
+    """A training in the browser, in the middle of a take-over; it needs Chromium."""
+    often = ("--set", "evaluate_every_steps=60", "--set", "evaluation_runs=10")
+    words = ("--human", "web", "--seed", "1", *often, "--out", str(work / "cockpit"))
+    with Process("trainer", "train", *words) as training:
+        training.wait_for_line("cockpit: open ")
+        url = next(line for line in training.output.splitlines() if line.startswith("cockpit: "))
+        asyncio.run(_take_over(url.split()[-1], out))
+        training.succeed()
+
+
+async def _take_over(url: str, out: Path) -> None:
+    async with open_browser() as page:
+        await page.goto(url)
+        for key, count, seconds in (("ArrowUp", TAKE_OVERS, 1.5), ("ArrowDown", 1, 0.5)):
+            for _ in range(count):  # The coach needs something to say.
+                await until(page, POLICY_DRIVES)
+                await asyncio.sleep(2.5)
+                await page.keyboard.down(key)
+                await until(page, PERSON_DRIVES)
+                await asyncio.sleep(seconds)
+                if key == "ArrowDown":
+                    await page.screenshot(path=out, full_page=True)
+                await page.keyboard.up(key)
+        await quit_sitting(page)
+
+
 PICTURES: dict[str, Make] = {
     "left_turn.png": _from_above("left_turn"),
     "congestion.png": _from_above("congestion"),
     "policy_sees.png": policy_sees,
-    # In the middle of a take-over; needs Chromium.
-    "cockpit.png": lambda out, _work: run_command(
-        "hil_tests.testing.browser", "--picture", str(out)
-    ),
+    "cockpit.png": cockpit,
     "success_against_latency.png": success_against_latency,
     "rerun.png": rerun_loop,
     "rerun_training.png": rerun_training,

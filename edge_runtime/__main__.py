@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
-import threading
 
 from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "check": ("edge_runtime.commands:CHECK", "say whether a policy may drive, and how fast it is"),
-    "run": ("edge_runtime.run", "answer states with commands until a signal ends it"),
-    "status": ("edge_runtime.commands:STATUS", "print how a running edge runtime is"),
+    "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
+    "status": ("edge_runtime.commands:STATUS", "print the status of a running edge runtime"),
     "rearm": ("edge_runtime.commands:REARM", "let a vehicle drive again after a safe stop"),
 }
 
@@ -28,13 +26,9 @@ main = program(
 
 
 def script() -> None:
-    """The entry point of `phil-edge`."""
-    status = run_cli(main)
-    if not all(one.daemon for one in threading.enumerate() if one is not threading.main_thread()):
-        if sys.stderr is not None:
-            sys.stderr.flush()
-        os._exit(status)  # a driver left a thread of its own, and the exit would wait for that
-    sys.exit(status)
+    status = run_cli(main)  # it has flushed what it printed
+    # The interpreter's exit would wait for a thread that hangs, or that a driver left behind.
+    os._exit(status)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """What every command of the repository shares: a parser whose errors are one line and whose help
-has defaults and examples, types of options with limits, exit statuses, and signals as ^C.
+has defaults and examples, option types with limits, exit statuses, and signals as ^C.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import difflib
 import errno
 import math
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -23,6 +24,7 @@ from edge_runtime.util import UserError, ending_signals, printable, take_signals
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+BROKEN_PIPE = 141
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 0.3  # A second signal so soon is the same one: `timeout` signals process and group
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
@@ -55,37 +57,36 @@ class HelpFormatter(argparse.HelpFormatter):
 
 
 class ArgumentParser(argparse.ArgumentParser):
-    """argparse with an error of one line and exit status 2. Use it for subparsers, too."""
+    """argparse with an error of one line and exit status 2. Use it for subparsers, too.
+
+    The type "path" makes a path absolute at once: a simulator may change the working directory.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         kwargs.setdefault("formatter_class", HelpFormatter)
         # A guessed abbreviation would change its meaning when an option is added.
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(*args, **kwargs)
-        # Absolute, as soon as it is read: a simulator may change the working directory.
         self.register("type", "path", os.path.abspath)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse, but an empty value is an error: no option here means anything by it.
+        """Parse, and refuse empty values and, before a missing option, one that does not exist.
 
-        An unset shell variable expands to an empty string, which as a path is the current
-        directory. An unknown option is told before one that is missing.
+        An unset shell variable is an empty value, which as a path is the current directory.
         """
         given = sys.argv[1:] if args is None else list(args)
-        before = ""
-        # A command's own parser says it for its arguments.
-        for value in given if self._subparsers is None else ():
-            if not value:
-                self.error(f"an empty value after {before}" if before else "an empty value")
-            if value.startswith("--") and value.find("=") == len(value) - 1:
-                self.error(f"an empty value after {value[:-1]}")
-            before = value
-        for value in takewhile("--".__ne__, given if self._subparsers is None else ()):
-            name, known = value.partition("=")[0], self._option_string_actions
-            if name.startswith("--") and " " not in value and name not in known:
-                near = difflib.get_close_matches(name, known, 1)
-                guess = f"; did you mean {near[0]}?" if near else ""
-                self.error(f"there is no option {name}{guess}")
+        if self._subparsers is None:  # else the command's own parser does it
+            for before, value in zip(["", *given], given):
+                option = re.fullmatch("(--[^=]*)=", value)
+                if not value or option:
+                    place = option.group(1) if option else before
+                    self.error(f"an empty value after {place}" if place else "an empty value")
+            known = self._option_string_actions
+            for name in (value.partition("=")[0] for value in takewhile("--".__ne__, given)):
+                if name.startswith("--") and " " not in name and name not in known:
+                    near = difflib.get_close_matches(name, known, 1)
+                    guess = f"; did you mean {near[0]}?" if near else ""
+                    self.error(f"there is no option {name}{guess}")
         return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -95,43 +96,44 @@ class ArgumentParser(argparse.ArgumentParser):
 
 
 def examples(*commands: str) -> str:
-    """A parser's epilog: commands as a person would type them, continued after a backslash."""
+    """Format a parser's epilog: commands as a person types them, continued after a backslash."""
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
 
 
-def add_public_key(parser: argparse.ArgumentParser) -> None:
-    """``--public-key``, of every command that reads a policy."""
+def add_public_key(parser: Any) -> None:
+    """Add ``--public-key``, of every command that reads a policy, to a parser or group."""
     parser.add_argument(
         "--public-key",
         metavar="FILE",
-        # One that is missing is named as it was typed.
+        # One that is missing is named in the error as it was typed.
         type=lambda text: os.path.abspath(text) if os.path.exists(text) else text,
-        help="Ed25519 public key of the policy's signer, PEM (default: keys/policy.pub where it"
-        " exists; where an unsigned policy may drive, first policy.pub beside the policy)",
+        help="public key that verifies the policy's signature, Ed25519 as PEM (default:"
+        " keys/policy.pub where it exists; with --allow-unsigned first policy.pub beside the"
+        " policy)",
     )
 
 
-class Command(NamedTuple):
-    """A command, in a module that has several."""
+class Subcommand(NamedTuple):
+    """A command of `program`; its module may hold several."""
 
     EXAMPLE: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
 
 
-def command(place: str, *shown: str) -> Callable[[Callable[[Any], None]], Command]:
-    """Decorate what declares a command's options; `module:function` at `place` is loaded to run."""
+def command(place: str, *shown: str) -> Callable[[Callable[[Any], None]], Subcommand]:
+    """Decorate a function that adds options; `module:function` at `place` is loaded to run."""
     text = examples(*shown)
-    return lambda add: Command(text, add, lambda arguments: int(_load(place)(arguments)))
+    return lambda add: Subcommand(text, add, lambda arguments: int(_load(place)(arguments)))
 
 
 def program(
     name: str, description: str, commands: Dict[str, Tuple[str, str]], *shown: str
 ) -> Callable[[List[str]], int]:
-    """The `main(argv)` of many commands: runs one of them. `shown` are examples of the help.
+    """Make the `main(argv)` that runs one of many commands. `shown` are examples for its help.
 
     `commands` has for each name a place and one line on what it does. The place is a module with
-    EXAMPLE, `add_arguments(parser)` and `run(arguments)`, or `module:name` of a `Command` in it.
+    EXAMPLE, `add_arguments(parser)` and `run(arguments)`, or `module:name` of a `Subcommand`.
     Only the command that is asked for is loaded: a mock of a chassis need not wait for torch.
     """
 
@@ -146,11 +148,11 @@ def program(
         chosen: Any = None
         for command, (place, summary) in commands.items():
             text = f"{summary[0].upper()}{summary[1:]}."
-            one = parsers.add_parser(command, help=summary, description=text)
+            subparser = parsers.add_parser(command, help=summary, description=text)
             if command == word:
                 chosen = _load(place)
-                one.epilog = chosen.EXAMPLE
-                chosen.add_arguments(one)
+                subparser.epilog = chosen.EXAMPLE
+                chosen.add_arguments(subparser)
         arguments = parser.parse_args(argv or ["--help"])
         return int(chosen.run(arguments))
 
@@ -158,7 +160,7 @@ def program(
 
 
 def _load(place: str) -> Any:
-    """A module, or `module:name` in it."""
+    """Import a module, or `module:name` in it."""
     module, _, name = place.partition(":")
     found = import_module(module)
     return getattr(found, name) if name else found
@@ -167,9 +169,9 @@ def _load(place: str) -> Any:
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:
     """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
 
-    UserError becomes one line on stderr and status 2, and so does a file that the system does not
-    let us use, or a full disk, also behind stdout; ^C status 130, and a reader that closed the
-    pipe (`| head`) status 141 as the shell would show it. Use: `sys.exit(run_cli(main))`.
+    UserError, an OSError about a file and a full disk, also behind stdout, become one line on
+    stderr and status 2. ^C is status 130; a reader that closed the pipe (`| head`) is 141.
+    Use: `sys.exit(run_cli(main))`.
     """
     try:
         try:
@@ -178,23 +180,23 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
             if sys.stdout is not None:  # now: at the exit nobody could say what is wrong
                 sys.stdout.flush()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print("interrupted", file=sys.stderr, flush=True)
         return INTERRUPTED
     except BrokenPipeError:
         _drop_stdout()
-        return 141
+        return BROKEN_PIPE
     except OSError as error:
         if error.filename is not None:
             what = printable(str(error.filename))
         elif error.errno in _DISK_IS_FULL:
             what = "cannot write"
-            _drop_stdout()  # it may be that which takes no more
+            _drop_stdout()  # it may be stdout that takes no more
         else:
-            raise  # nothing that a person named
-        print(f"error: {what}: {error.strerror}", file=sys.stderr)
+            raise
+        print(f"error: {what}: {error.strerror}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
 
@@ -204,7 +206,7 @@ def _drop_stdout() -> None:
 
 
 def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
-    """A type: a whole number between two limits, both included."""
+    """Make an option type: a whole number between two limits, both included."""
     limits = f", at least {least}" if most == _LARGEST else f" from {least} to {most}"
 
     def read(text: str) -> int:
@@ -221,7 +223,7 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
 
 
 def number(limits: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """A type: a finite number that ``fits``; ``limits`` says in words which do."""
+    """Make an option type: a finite number that ``fits``; ``limits`` says in words which do."""
 
     def read(text: str) -> float:
         value = math.nan
@@ -244,7 +246,7 @@ share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, and all else that would end this process, raise KeyboardInterrupt in the block.
+    """Raise KeyboardInterrupt in the block for SIGTERM and all else that would end this process.
 
     So sessions are closed and files are finished. Outside of the main thread it does nothing.
     """
@@ -278,7 +280,7 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
 
 
 def _once(handler: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
-    """The handler, but not for what comes within ``AGAIN_S`` of the signal that it had."""
+    """Ignore signals within ``AGAIN_S`` of the last one that was handled."""
     had_s = -math.inf
 
     def handle(number: int, frame: Any) -> None:

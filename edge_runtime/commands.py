@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import Any, Dict, Optional
 
 import msgspec
 
-from edge_runtime.cli import Command, examples
+from edge_runtime.cli import Subcommand, examples
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_quality import link_words
 from edge_runtime.policy import infer, load_policy, probes
 from edge_runtime.service import peak_memory_mb, quantiles_ms
-from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
-from edge_runtime.transport import check_endpoint, open_session
+from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name
+from edge_runtime.transport import check_endpoint, open_session, tls_for
 from edge_runtime.util import UserError, parse_json, printable
 from edge_runtime.wire import key
 
@@ -26,8 +26,8 @@ _STRANGER = "what answers for {} is no edge runtime of this kind"
 
 
 def _add_check(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("policy", metavar="POLICY.onnx", help="the policy file")
-    parser.add_argument("--out", metavar="FILE.json", help="write the report here, too")
+    parser.add_argument("policy", metavar="POLICY.onnx", help="policy file to check")
+    parser.add_argument("--out", metavar="FILE.json", help="also write the report to this file")
     add_trust(parser)
 
 
@@ -67,12 +67,11 @@ def _add_operator(parser: argparse.ArgumentParser) -> None:
 
 def _add_status(parser: argparse.ArgumentParser) -> None:
     _add_operator(parser)
-    parser.add_argument("--out", metavar="FILE.json", help="write all of it here, as JSON")
+    parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def _status(arguments: argparse.Namespace) -> int:
-    """Print the runtime's status as a table, or as JSON."""
     check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
@@ -85,7 +84,6 @@ def _status(arguments: argparse.Namespace) -> int:
 
 
 def _rearm(arguments: argparse.Namespace) -> int:
-    """Let the runtime drive again. Raises UserError where it refuses."""
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     if tls is not None:
         check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
@@ -100,7 +98,10 @@ def _rearm(arguments: argparse.Namespace) -> int:
 def ask(
     connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
 ) -> Dict[str, Any]:
-    """The JSON reply of a queryable of wire.TOPICS. Raises UserError where none comes in 2 s."""
+    """Query a runtime for its JSON reply. Raises UserError where none comes in 2 s.
+
+    `topic` is "status" or "rearm".
+    """
     selector = key(vehicle_id, topic)
     with open_session(connect=connect, mode="client", tls=tls) as session:
         for reply in session.get(selector, timeout=_TIMEOUT_S):
@@ -117,53 +118,27 @@ def ask(
     )
 
 
-# What a row says of a reply; a runtime of an earlier version may not tell all of it.
-_ROWS: List[Tuple[str, Callable[[Dict[str, Any]], str]]] = [
-    ("vehicle", lambda s: f"{s['vehicle_id']}, driver {s['vehicle']}"),
-    ("mode", lambda s: _mode(s)),
-    ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),
-    ("vehicle fault", lambda s: s.get("vehicle_fault") or "none"),
-    ("link", lambda s: link_words(s.get("link", {}))),
-    ("rejected", lambda s: _counts(s["rejected"])),
-    ("safe stops", lambda s: str(s["safe_stops"])),
-    ("deadline misses", lambda s: str(s["deadline_misses"])),
-    ("inference", lambda s: _quantiles(s["inference_ms"])),
-    ("state to command", lambda s: _quantiles(s.get("command_ms", {}))),
-    ("policy", lambda s: f"{s['policy_id'][:12]} ({s['manifest']['task']})"),
-    ("uptime", lambda s: f"{s['uptime_s']:.0f} s"),
-    ("temperature", lambda s: _temperature(s.get("temperature_c"))),
-    ("load", lambda s: f"{s.get('load_1min', 0.0):.2f} over 1 min"),
-    ("memory", lambda s: f"{s.get('rss_mb', 0.0):.0f} MB"),
-    ("other runtimes", lambda s: f"{s.get('rivals', 0)} seen with this vehicle id"),
-    ("version", lambda s: str(s["version"])),
-]
+_NOT_SHOWN = ("manifest", "schema", "sent_ns")
 
 
 def render_status(status: Dict[str, Any]) -> str:
-    """One line for each row; `status` is the reply of the queryable."""
-    width = max(len(label) for label, _ in _ROWS)
-    return "\n".join(f"{label:<{width}}  {printable(say(status))}" for label, say in _ROWS)
+    """Render the reply of the queryable: a line for each field, some in words."""
+    rows = {
+        **{name: value for name, value in status.items() if name not in _NOT_SHOWN},
+        "policy_id": f"{status['policy_id'][:12]} ({status['manifest']['task']})",
+        "link": link_words(status.get("link", {})),
+    }
+    width = max(map(len, rows))
+    return "\n".join(f"{name:<{width}}  {printable(_words(rows[name]))}" for name in rows)
 
 
-def _mode(status: Dict[str, Any]) -> str:
-    reason = f", because of {status['reason']}" if status["reason"] else ""
-    rearm = "; waits for `rearm`" if status["needs_rearm"] else ""
-    return f"{status['mode']}{reason}{rearm}"
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(each)}" for name, each in value.items()) or "none"
+    return f"{value:.2f}" if isinstance(value, float) else str(value) or "none"
 
 
-def _counts(counts: Dict[str, int]) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
-
-
-def _quantiles(summary: Dict[str, float]) -> str:
-    return ", ".join(f"{label} {value:.2f} ms" for label, value in summary.items()) or "unknown"
-
-
-def _temperature(value_c: Any) -> str:
-    return "no sensor" if value_c is None else f"{value_c:.0f} degC"
-
-
-CHECK = Command(
+CHECK = Subcommand(
     examples(
         "python -m edge_runtime check my.onnx \\\n    --public-key keys/policy.pub",
         "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
@@ -171,7 +146,7 @@ CHECK = Command(
     _add_check,
     _check,
 )
-STATUS = Command(
+STATUS = Subcommand(
     examples(
         "python -m edge_runtime status",
         "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01 --json",
@@ -179,7 +154,7 @@ STATUS = Command(
     _add_status,
     _status,
 )
-REARM = Command(
+REARM = Subcommand(
     examples(
         "python -m edge_runtime rearm",
         "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"

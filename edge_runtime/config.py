@@ -11,6 +11,7 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Type, Ty
 import msgspec
 
 from edge_runtime import log
+from edge_runtime.cli import add_public_key
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, check_fits
 from edge_runtime.util import PathLike, UserError, read_toml
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
@@ -27,7 +28,7 @@ _S = TypeVar("_S", bound=msgspec.Struct)
 
 
 class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[ride_through]: for so long the last plan is played where nothing newer comes; 0: off."""
+    """[ride_through]: for how long the last plan is played while nothing newer comes; 0: off."""
 
     max_s: float = 0.0
 
@@ -35,7 +36,7 @@ class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory.
 
-    `vehicle_settings` are the tables [vehicle.NAME], by name; what they hold is the driver's.
+    `vehicle_settings` are the tables [vehicle.NAME], by name; each driver checks its own.
     """
 
     policy: Optional[str] = None
@@ -55,23 +56,36 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     lock_memory: bool = False
     vehicle_settings: Dict[str, Dict[str, Any]] = msgspec.field(default_factory=dict)
 
+    @property
+    def is_armed_at_start(self) -> bool:
+        """Whether a vehicle may drive at once; nobody sees what follows when a hold ends."""
+        return self.armed_at_start and self.hold is None
+
 
 # The settings that are flags as well: metavar and help.
 _FLAGS: Dict[str, Tuple[str, str]] = {
-    "policy": ("POLICY.onnx", "the policy file"),
-    "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
-    "tls": ("DIR", "this party's ca.pem, cert.pem, key.pem (deploy certs); endpoint tls/..."),
-    "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
-    "vehicle": (f"{'|'.join((NONE, *BUILT_IN))}|NAME|MODULE:CLASS", "the vehicle to move, if any"),
-    "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
-    "log_level": ("|".join(log.LEVELS), "lowest level that is logged to stderr"),
-    "log_format": ("|".join(log.FORMATS), "each event as a line of text, or as a JSON object"),
+    "policy": ("POLICY.onnx", "policy file to drive; its signature is POLICY.onnx.sig beside it"),
+    "connect": ("PROTOCOL/HOST:PORT", "address at which the simulator or its router listens"),
+    "tls": (
+        "DIR",
+        "encrypt the connection: directory with this party's certificate (ca.pem, cert.pem and"
+        " key.pem of `python -m deploy certs`); --connect must then be tls/HOST:PORT",
+    ),
+    "vehicle_id": ("ID", "name of the vehicle; simulator, runtime and operator must use the same"),
+    "vehicle": (
+        "NAME",
+        f"vehicle to move: {', '.join((NONE, *BUILT_IN))}, the name of an installed driver, or"
+        " MODULE:CLASS of your own; none answers the simulator only",
+    ),
+    "bus": ("INTERFACE:CHANNEL", "CAN bus of --vehicle hunter, such as socketcan:can0"),
+    "log_level": ("LEVEL", f"log events of this level or above: {', '.join(log.LEVELS)}"),
+    "log_format": ("FORMAT", "format of the log on stderr: text, or json (one object a line)"),
 }
 
 
-def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
-    """The flags of these settings, or of all. One that is not given is None: the file has it."""
-    for name in names or _FLAGS:
+def add_flags(parser: Any, *names: str) -> None:
+    """Add the flags of these settings to a parser or group; a flag that is not given is None."""
+    for name in names:
         metavar, text = _FLAGS[name]
         kind = "path" if name in ("policy", "tls") else str
         default = getattr(Config(), name, None)
@@ -79,21 +93,30 @@ def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
         parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, type=kind, help=shown)
 
 
-def add_trust(parser: argparse.ArgumentParser) -> None:
-    """The flags that say which policy may drive."""
-    from edge_runtime.cli import add_public_key  # Here: only a command line needs it.
-
+def add_trust(parser: Any) -> None:
+    """Add the flags that say which policy may drive to a parser or group."""
     add_public_key(parser)
-    text = "also take a policy whose origin cannot be verified"
+    text = "also drive a policy that is not signed, or whose signer's public key is not known"
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
-def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: bool = True) -> Config:
-    """The file's settings with the given flags (those that are not None) in their place.
+def add_run_flags(parser: argparse.ArgumentParser) -> None:
+    policy = parser.add_argument_group("policy")
+    add_flags(policy, "policy")
+    add_trust(policy)
+    add_flags(parser.add_argument_group("simulator"), "connect", "tls", "vehicle_id")
+    add_flags(parser.add_argument_group("vehicle"), "vehicle", "bus")
+    more = parser.add_argument_group("settings and log")
+    text = "settings file (edge_runtime/config.example.toml explains each); options override it"
+    more.add_argument("--config", metavar="FILE.toml", help=text)
+    add_flags(more, "log_level", "log_format")
 
-    Raises UserError for a file that is no TOML, an unknown key, and a value out of range; where
-    one value of the file is wrong, the error names it. The vehicle's driver checks its own table.
-    Where no link is opened, no flag could mend one that is incomplete.
+
+def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: bool = True) -> Config:
+    """Load the file's settings; flags that are not None take their place.
+
+    `opens_link` False: TLS settings are not held against the address, for nothing is connected.
+    Raises UserError for a file that is no TOML, an unknown key, and a value out of range.
     """
     given = {name: value for name, value in flags.items() if value is not None}
     from_file = Config()
@@ -115,27 +138,28 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
         return config
     if config.vehicle != "hunter":
         raise UserError(f"--bus needs --vehicle hunter; the vehicle is {config.vehicle}")
-    tables = {**config.vehicle_settings}
-    tables["hunter"] = {**tables.get("hunter", {}), "bus": bus}
-    return msgspec.structs.replace(config, vehicle_settings=tables)
+    hunter = {**config.vehicle_settings.get("hunter", {}), "bus": bus}
+    return msgspec.structs.replace(
+        config, vehicle_settings={**config.vehicle_settings, "hunter": hunter}
+    )
 
 
 def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
     """`vehicle` is a driver, or a table: `driver`, and a table of settings for each vehicle."""
-    given = tables.get("vehicle")
     if "vehicle_settings" in tables:
         raise UserError("vehicle_settings is no setting; write [vehicle.NAME]")
+    given = tables.get("vehicle")
     if not isinstance(given, dict):
         return tables
-    for name, table in given.items():
-        if name != "driver" and not isinstance(table, dict):
+    settings = {name: table for name, table in given.items() if name != "driver"}
+    for name, table in settings.items():
+        if not isinstance(table, dict):
             raise UserError(f"vehicle: {name} is no table, and not `driver`; write [vehicle.NAME]")
-    driver = given.pop("driver", NONE)
-    return {**tables, "vehicle": driver, "vehicle_settings": given}
+    return {**tables, "vehicle": given.get("driver", NONE), "vehicle_settings": settings}
 
 
 def convert(settings: Mapping[str, Any], kind: Type[_S], table: str = "") -> _S:
-    """A table's settings as a struct. Raises UserError that names the key, and the known ones."""
+    """Convert a table to a struct. Raises UserError that names the key, and the known ones."""
     try:
         return msgspec.convert(settings, kind)
     except msgspec.ValidationError as error:
@@ -152,10 +176,9 @@ def _check(config: Config) -> None:
     check_vehicle_id(config.vehicle_id)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
-    priority = config.realtime_priority
-    if not 0 <= priority <= MAX_PRIORITY:
+    if not 0 <= config.realtime_priority <= MAX_PRIORITY:
         words = f"use 1 to {MAX_PRIORITY}, or 0 for none"
-        raise UserError(f"realtime_priority {priority} is not valid: {words}")
+        raise UserError(f"realtime_priority {config.realtime_priority} is not valid: {words}")
     if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
         raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
 

@@ -1,32 +1,31 @@
 """The decisions of the edge runtime: state, answer and time in, orders out. No clock, no socket.
 
-First how an action is cut to what a vehicle may do; then the controller. Times are monotonic
-seconds. The caller serialises the calls (loop.py holds one lock). Contract, section 5.
+First how an action is limited, and the plan of a ride-through; then the controller. Times are
+monotonic seconds. The caller serialises the calls (loop.py holds one lock). Contract, section 5.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Sequence, Union
+from typing import Dict, List, NamedTuple, Optional, Sequence, Union
 
 import msgspec
 import numpy as np
 
 from edge_runtime import safety as rules
-from edge_runtime.freshness import Freshness
+from edge_runtime.latest import Freshness
+from edge_runtime.manifest import Action
 from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
-from edge_runtime.wire import DRIVE, SAFE_STOP, Command, State, is_foreign
+from edge_runtime.wire import DRIVE, MAX_PLAN, MAX_RIDE_S, SAFE_STOP, Command, State, is_foreign
 
-if TYPE_CHECKING:
-    from edge_runtime.manifest import Action
-    from edge_runtime.ride import Ride
+LATE_PERIODS = 1.2  # So late the next command counts as missing: T, and a fifth of it for jitter
 
 
 class ActionLimit(NamedTuple):
-    """What one action may be: its range, and the fastest change (inf: at once).
+    """The range of one action, and its fastest change (inf: at once).
 
-    `stop` is its value in a safe stop, None to hold the last one: the policy's, no vehicle's.
+    `stop` is its value in a safe stop, None to hold the last one; a vehicle's limits leave it out.
     """
 
     low: float
@@ -39,7 +38,7 @@ Limits = Dict[str, ActionLimit]  # by the action's name
 
 
 def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
-    """The manifest's range cut to the vehicle's, for each action in the policy's order.
+    """Cut the manifest's range to the vehicle's, for each action in the policy's order.
 
     An empty table (no vehicle) leaves the manifest's range and any speed of change.
     Raises UserError where a vehicle lacks an action of the policy.
@@ -62,7 +61,7 @@ def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
 def limit_action(
     wanted: Sequence[float], last: Sequence[float], limits: Limits, elapsed_s: float
 ) -> List[float]:
-    """`wanted` within each range, and as near to `last` as the time between them demands.
+    """Clamp `wanted` to each range, and to the change from `last` that `elapsed_s` allows.
 
     A limit that does not bite leaves the number as it is, to the last bit.
     """
@@ -76,14 +75,65 @@ def limit_action(
 
 
 def neutral_action(limits: Limits) -> List[float]:
-    """Where the limits start before the first command: 0, or the nearest the range allows."""
+    """Return the action before the first command: 0, or the nearest that the range allows."""
     return [min(max(0.0, limit.low), limit.high) for limit in limits.values()]
 
 
 def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
-    """Each action's stop, at once; the last value of one that has none, like a steering."""
+    """Return each action's stop, or its last value where it has none, like a steering."""
     pairs = zip(limits.values(), last)
     return [value if limit.stop is None else limit.stop for limit, value in pairs]
+
+
+class Ride:
+    """Makes the plan of each drive command. Where it `plays`, it keeps the newest one.
+
+    A plan asks once more for what the policy wanted, in each further period: fading to neutral, a
+    learnt plan and predicted pictures served no better (docs/ride_through.md).
+    `max_s` becomes whole periods. Raises UserError where no plan can be as long.
+    """
+
+    def __init__(self, max_s: float, period_s: float, limits: Limits, plays: bool) -> None:
+        within = 0.0 < max_s <= MAX_RIDE_S  # nor is NaN
+        self.periods = int(max_s / period_s + 1e-9) if within else 0
+        if not 1 <= self.periods <= MAX_PLAN:
+            most_s = min(MAX_RIDE_S, MAX_PLAN * period_s)
+            words = f"for this policy's T use {period_s:g} to {most_s:g} s, or 0 for off"
+            raise UserError(f"ride_through.max_s {max_s:g} is not valid: {words}")
+        self.max_s = self.periods * period_s
+        self._period_s, self._limits, self._plays = period_s, limits, plays
+        self._left: List[List[float]] = []
+        self._next_s = math.inf
+
+    def begin(self, wanted: List[float], action: List[float], now_s: float) -> List[List[float]]:
+        """Plan the actions after the command `action`, on towards what the policy `wanted`.
+
+        Each action is limited like the command's own.
+        """
+        plan = []
+        for _ in range(self.periods):
+            action = limit_action(wanted, action, self._limits, self._period_s)
+            plan.append(action)
+        if self._plays:
+            self._left, self._next_s = list(plan), now_s + LATE_PERIODS * self._period_s
+        return plan
+
+    @property
+    def due_s(self) -> float:
+        """When the next action is due for the vehicle; inf where none is left."""
+        return self._next_s if self._left else math.inf
+
+    def play(self, now_s: float) -> Optional[List[float]]:
+        """Return the action that is due, None where none is. Missed ones are left out."""
+        action = None
+        while now_s >= self.due_s:
+            action = self._left.pop(0)
+            self._next_s += self._period_s
+        return action
+
+    def end(self) -> None:
+        """Forget the plan: there is a stop."""
+        self._left = []
 
 
 class Received(NamedTuple):
@@ -119,7 +169,6 @@ class Order(NamedTuple):
     ridden: bool = False
 
     def command(self, policy_id: str, sent_ns: int) -> Command:
-        """As it goes out."""
         state = self.answers.state
         return Command(
             session=state.session,
@@ -136,41 +185,49 @@ class Order(NamedTuple):
         )
 
 
+class ControllerConfig(NamedTuple):
+    """What a controller decides by.
+
+    `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop. `task`
+    is the policy's; a state that names another one is a fault. `ride_s` is [ride_through] max_s.
+    """
+
+    limits: Limits
+    control_period_s: float
+    needs_rearm: bool = False
+    armed_at_start: bool = True
+    task: str = ""
+    ride_s: float = 0.0
+
+
 class Controller:
     """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. Raises
+    UserError where no plan can be as long as `ride_s`.
     """
 
-    def __init__(
-        self,
-        limits: Limits,
-        control_period_s: float,
-        needs_rearm: bool,
-        armed_at_start: bool = True,
-        task: str = "",
-        ride: Optional[Ride] = None,
-    ) -> None:
-        self.safety = Safety(control_period_s, ride_s=ride.max_s if ride else 0.0)
-        self._ride = ride
+    def __init__(self, config: ControllerConfig) -> None:
+        self._limits, self._period_s = config.limits, config.control_period_s
+        self._needs_rearm, self._task = config.needs_rearm, config.task
+        self._ride: Optional[Ride] = None
+        if config.ride_s:
+            self._ride = Ride(config.ride_s, self._period_s, self._limits, self._needs_rearm)
+        self.safety = Safety(self._period_s, ride_s=self._ride.max_s if self._ride else 0.0)
         self._freshness = Freshness(self.safety.answer_s)
         self._lag_s = 0.0  # of the newest state
         self._fresh_before_s: Optional[float] = None  # `last_fresh_s` before the newest state
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
-        self._policy_is_dead = False
-        self._period_s = control_period_s
-        self._task = task  # the policy's; states that name another one are a fault
         self._latched_fault = ""  # what stopped it, until it is re-armed
-        self._limits = limits
-        self._needs_rearm = needs_rearm
-        self._last_action = neutral_action(limits)
+        self._policy_is_dead = False
+        self._last_action = neutral_action(self._limits)
         self._ordered_s = -math.inf  # when that was ordered
         self._newest: Optional[Received] = None
         self._driven: Optional[Received] = None  # the state whose plan is played
         self._begun_s: Optional[float] = None
         self._next_stop_s = math.inf  # nothing is repeated before a first safe stop
-        if needs_rearm and not armed_at_start:
+        if self._needs_rearm and not config.armed_at_start:
             self._apply(Event.NOT_ARMED)
 
     @property
@@ -185,16 +242,20 @@ class Controller:
         return self.vehicle_fault or self._latched_fault
 
     def begin(self, received: Received, now_s: float) -> None:
-        """The policy starts on the newest state."""
-        session, final = received.state.session, received.state.final
+        """Note that the policy starts on the newest state."""
+        session, arrived_s = received.state.session, received.arrived_s
         # The gap counts even where the watchdog did not get to run within it.
-        event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
+        event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)
         if event is not None and not (event is Event.SILENT and self._stopped_late):
             self._apply(event)
-        stands = self.safety.mode is Mode.SAFE_STOP
-        sent_s, arrived_s = received.state.sent_ns * 1e-9, received.arrived_s
-        trip_s = received.trip_s
-        self._lag_s = self._freshness.lag_s(session, sent_s, arrived_s, trip_s, stands, final)
+        self._lag_s = self._freshness.lag_s(
+            session,
+            received.state.sent_ns * 1e-9,
+            arrived_s,
+            received.trip_s,
+            stands=self.safety.mode is Mode.SAFE_STOP,
+            final=received.state.final,
+        )
         self._fresh_before_s = self.safety.last_fresh_s
         if not self._is_late:
             self.safety = rules.note_arrival(self.safety, session, arrived_s)
@@ -204,7 +265,7 @@ class Controller:
     def finish(
         self, output: Optional[np.ndarray], inference_ns: int, now_s: float
     ) -> Optional[Order]:
-        """The policy's answer to the state of `begin`; no order where it came too late.
+        """Order what the policy answers to the state of `begin`; None where it came too late.
 
         An answer that is not float32 [n], or None, is a failed inference.
         """
@@ -226,7 +287,7 @@ class Controller:
         form = (np.float32, (len(self._limits),))
         if output is not None and (output.dtype, output.shape) == form:
             wanted = output.tolist()
-        event = self._event_of(wanted)
+        event = self._event_of(self._newest.state, wanted)
         self._apply(event)
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + self._period_s
@@ -243,13 +304,13 @@ class Controller:
         return order._replace(plan=self._ride.begin(wanted, order.action, now_s))
 
     def policy_died(self) -> None:
-        """Nobody finishes what was begun, or begins again. It stops for good; `tick` is due."""
+        """Note that the policy's thread has ended: a stop for good, which `tick` orders at once."""
         self._policy_is_dead = True
         self._begun_s, self._next_stop_s = None, -math.inf
         self._apply(Event.DEAD)
 
     def tick(self, now_s: float) -> Optional[Order]:
-        """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
+        """Order what is due by time alone: a stop, its repetition, or a step of a plan."""
         if self._begun_s is not None and now_s - self._begun_s > self._period_s:
             return self._give_up(now_s)
         was, owed = self.safety.mode, self._newest is not None and not self._stopped_late
@@ -272,7 +333,7 @@ class Controller:
         return self._stop_order(0, now_s)
 
     def next_deadline_s(self) -> Optional[float]:
-        """When `tick` must be called next; None while nothing is due by time alone."""
+        """Return when `tick` must be called next; None while nothing is due by time alone."""
         due = []
         if self._begun_s is not None:
             due.append(self._begun_s + self._period_s)
@@ -284,7 +345,7 @@ class Controller:
         return min(due) if due else None
 
     def rearm(self, now_s: float) -> str:
-        """An operator's permission to drive again. Empty when taken, else why it is refused."""
+        """Take an operator's permission to drive again; returns why it is refused, or ""."""
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
         if self._policy_is_dead:
@@ -302,16 +363,14 @@ class Controller:
         return ""
 
     def farewell(self) -> Optional[Order]:
-        """The safe stop that goes out when the runtime is ended while it answers a simulator."""
+        """Order the safe stop of a runtime that is ended while it answers a simulator."""
         if self.safety.mode is Mode.STANDBY or self._newest is None:
             return None
         return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
-    def _event_of(self, wanted: List[float]) -> Event:
-        """Which event an answer is; `wanted` is empty where it has another form."""
-        assert self._newest is not None
-        final = self._newest.state.final
-        if self._task and is_foreign(self._newest.state, self._task):
+    def _event_of(self, state: State, wanted: List[float]) -> Event:
+        """Return the event of an answer; `wanted` is empty where it has another form."""
+        if self._task and is_foreign(state, self._task):
             return Event.OTHER_TASK
         if not wanted:
             return Event.FAILED
@@ -321,8 +380,8 @@ class Controller:
         if self.vehicle_fault:
             return Event.VEHICLE
         if self._is_late:  # the end of the episode ends the drive, however late it is
-            return Event.FINAL if final and self.safety.mode is Mode.DRIVE else Event.LATE
-        return rules.classify_fresh(self.safety, final, self._needs_rearm)
+            return Event.FINAL if state.final and self.safety.mode is Mode.DRIVE else Event.LATE
+        return rules.classify_fresh(self.safety, state.final, self._needs_rearm)
 
     @property
     def _is_late(self) -> bool:
@@ -330,7 +389,7 @@ class Controller:
 
     @property
     def _stopped_late(self) -> bool:
-        """Whether it stands and states come late: that there are no others goes without saying."""
+        """Whether it stands while states come late; then the lack of fresh states is no news."""
         return self._is_late and self.safety.mode is Mode.SAFE_STOP
 
     def _give_up(self, now_s: float) -> Order:
@@ -342,7 +401,7 @@ class Controller:
         return self._stop_order(0, now_s)
 
     def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
-        """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
+        """Keep repetitions on a grid, so that late wake-ups do not lower the rate of 1/T."""
         grid_s = self._next_stop_s + self._period_s
         self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + self._period_s
 

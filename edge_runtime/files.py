@@ -21,9 +21,8 @@ from edge_runtime.util import PathLike, UserError, open_regular
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
-    A symbolic link stays, and the file behind it is written. Its directory is made. Raises
-    UserError when that cannot be made or written, and for a path that is there and is no regular
-    file.
+    A symbolic link stays, and the file behind it is written. Missing directories are made. Raises
+    UserError where that fails, and for a path that is there and is no regular file.
     """
     target = _checked(path)
     make_directory(target.parent)
@@ -45,28 +44,28 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
 
 
 def _temporary(target: Path) -> BinaryIO:
-    """A file beside the target, held by its writer; those that dead writers have left go."""
+    """Open a locked file beside the target; delete those of writers that were killed."""
     begin = f".{zlib.crc32(os.fsencode(target.name)):08x}-"
     for left in target.parent.glob(f"{begin}*"):
         with contextlib.suppress(OSError), open_regular(left) as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             left.unlink()
     stream = target.with_name(f"{begin}{secrets.token_hex(8)}").open("xb")
-    with contextlib.suppress(OSError):  # No locks here: then nothing is cleared away.
+    with contextlib.suppress(OSError):  # No locks on this file system: then nothing is deleted.
         fcntl.flock(stream, fcntl.LOCK_EX)
-    # Another writer may have come just before the lock.
+    # Another writer may have deleted it just before the lock.
     return stream if os.fstat(stream.fileno()).st_nlink else _temporary(target)
 
 
 def behind_link(path: PathLike) -> Path:
-    """The file that a symbolic link leads to, there or not; any other path as it is."""
+    """Follow a symbolic link, also to a file that is not there; any other path stays."""
     return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
 
 
 def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
-    """Its absolute path; UserError now if `write_json_out(path)` would fail after the long work.
+    """Return the absolute path; UserError now if `write_json_out(path)` would fail later.
 
-    It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
+    It makes no directory: a command that is refused for another reason leaves nothing behind.
     """
     if path is None:
         return None
@@ -80,7 +79,7 @@ def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
 
 
 def make_directory(path: PathLike) -> None:
-    """Make a directory, and those above it, where it is not there; UserError where it cannot be."""
+    """Make a directory and those above it where they are missing; UserError where that fails."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -88,7 +87,7 @@ def make_directory(path: PathLike) -> None:
 
 
 def write_json(path: PathLike, value: Any) -> None:
-    """`write_atomic` of indented JSON. NaN and infinity are refused (they are not JSON)."""
+    """`write_atomic` of indented JSON; ValueError for NaN and infinity, which are not JSON."""
     write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
@@ -99,19 +98,16 @@ def write_json_out(path: Optional[PathLike], value: Any) -> None:
 
 
 def _checked(path: PathLike) -> Path:
-    """What to replace. A rename would put a plain file in the place of a device or a pipe."""
+    """Return the file to replace; UserError for a directory, a device or a pipe."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
         target = behind_link(path)
-        if os.path.islink(path) and not target.parent.is_dir():  # a disk that is not there?
-            where = f"it leads to {target.parent}, which does not exist"
-            raise UserError(f"cannot write {path}: {where}") from None
+        if os.path.islink(path) and not target.parent.is_dir():  # perhaps a disk is not mounted
+            raise UserError(f"cannot write {path}: {target.parent} does not exist") from None
         return target
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
-    except ValueError as error:  # a NUL inside the name
-        raise UserError(f"cannot write {path!r}: {error}") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL inside the name
+        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', error)}") from None
     if stat.S_ISDIR(mode):
         raise UserError(f"{path} is a directory, not a file")
     if not stat.S_ISREG(mode):
@@ -120,47 +116,11 @@ def _checked(path: PathLike) -> Path:
 
 
 def try_to_lock_file(descriptor: int) -> bool:
-    """Hold a file until the descriptor is closed; False where another process holds it."""
+    """Lock a file until the descriptor is closed; False where another process holds it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # No locks here: then nobody can hold one.
+    except OSError:  # No locks on this file system: then nobody can hold one.
         pass
     return True
-
-
-class Hold:
-    """No command while an installer tries this release: neither on the wire nor to the vehicle.
-
-    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies silences no runtime. Once free, this process never asks
-    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._stream: Optional[BinaryIO] = None
-        try:
-            self._stream = open_regular(path)  # kept until it is free
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
-
-    def is_on(self) -> bool:
-        """Whether commands must stay here. Never waits."""
-        if self._stream is None:
-            return False
-        try:
-            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:  # No locks on this file system; if only for now, the next call asks.
-            return False
-        self._stream.close()
-        self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

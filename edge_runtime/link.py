@@ -13,19 +13,17 @@ import json
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Set
+from typing import Any, Callable, Dict, List, Optional, Set
 
 import msgspec
 import zenoh
 
 from edge_runtime import __version__, log
-from edge_runtime.transport import LEASE_MS, only_own
+from edge_runtime.manifest import Manifest
+from edge_runtime.reach import Listener
+from edge_runtime.transport import LEASE_MS
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health, Message, Rejection, encode, key
-
-if TYPE_CHECKING:
-    from edge_runtime.manifest import Manifest
-    from edge_runtime.reach import Listener
 
 OpenClient = Callable[[], zenoh.Session]
 
@@ -39,15 +37,20 @@ _LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
 
 
 class Link:
-    """Thin: it declares, sends and replies, and decides nothing."""
+    """Declares, sends and replies, and decides nothing. `listener` is None without TLS."""
 
-    def __init__(self, session: zenoh.Session, vehicle_id: str, manifest: Manifest) -> None:
-        self.vehicle_id = vehicle_id
+    def __init__(
+        self,
+        session: zenoh.Session,
+        vehicle_id: str,
+        manifest: Manifest,
+        listener: Optional[Listener] = None,
+    ) -> None:
+        self.vehicle_id, self.listener = vehicle_id, listener
+        self.gave_way = False  # another runtime speaks for this vehicle
         self._session, self._manifest = session, manifest
         self._declared: List[Any] = []
         self._presence: Optional[Presence] = None
-        self.gave_way = False  # another runtime speaks for this vehicle
-        self.listener: Optional[Listener] = None
         self._stop: Callable[[], None] = lambda: None
         self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
@@ -70,6 +73,9 @@ class Link:
         """Listen to states and answer queries. Call `appear` next, when it can answer."""
 
         def state_came(sample: zenoh.Sample) -> None:
+            # Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
+            if str(sample.key_expr) != state_key:
+                return
             # One byte too many is enough to be rejected; a huge message is not copied.
             is_huge = len(sample.payload) > max_state_bytes
             on_state(bytes(max_state_bytes + 1) if is_huge else bytes(sample.payload))
@@ -88,7 +94,7 @@ class Link:
         session, state_key = self._session, key(self.vehicle_id, "state")
         rearm_key = key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(state_key, _at_once(only_own(state_key, state_came))),
+            session.declare_subscriber(state_key, _at_once(state_came)),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(rearm_key, rearm_asked),
         ]
@@ -96,8 +102,8 @@ class Link:
     def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
         """Show that it is alive, and look for others with this vehicle id.
 
-        To an elder one this one gives way: it sends nothing more, and `stop` is called. That is
-        called, too, when its certificate has expired.
+        It gives way to an elder one: it sends nothing more, and calls `stop`. `stop` is called,
+        too, when its certificate has expired.
         """
         self._stop = stop
 
@@ -106,8 +112,7 @@ class Link:
             stop()
 
         alive = key(self.vehicle_id, "alive")
-        self._presence = Presence(self._session, alive, open_client, give_way)
-        self._presence.listener = self.listener
+        self._presence = Presence(self._session, alive, open_client, give_way, self.listener)
         self._declared.append(self._presence)
         self._presence.thread.start()
 
@@ -128,7 +133,7 @@ class Link:
             log.event("error", "not_sent", topic=topic, detail=error)
 
     def refusal(self, now_s: float) -> Optional[Rejection]:
-        """Why no state is taken at this Unix time, whatever it says."""
+        """Say why no state of this Unix time is taken, whatever it holds."""
         return self.listener.refusal(now_s) if self.listener else None
 
     def close(self) -> None:
@@ -141,7 +146,7 @@ class Link:
 
 
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
-    """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
+    """Let Zenoh's own thread call: no second thread to wake, and no queue of old states between.
 
     The callback must be quick, for nothing else is received meanwhile. A native thread that calls
     into Python builds a Python state and takes it down for each call: tens of microseconds. One
@@ -163,10 +168,10 @@ def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
 
 
 def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
-    """Whether a router answers. Raises UserError where another runtime has this vehicle id.
+    """Return whether a router answers. Raises UserError where another runtime has this vehicle id.
 
     Two peers do not hear each other through a router, so a client asks it. The token of a process
-    that was just killed may stay for a lease, so one that is found counts only if it outlasts that.
+    that was just killed may stay for a lease, so a token counts only if it outlasts that.
     """
     selector = f"{key(vehicle_id, 'alive')}/**"
     found = _ask(open_client, selector)
@@ -179,7 +184,7 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
 
 
 def taken(vehicle_id: str) -> UserError:
-    """The error of a runtime that must give way."""
+    """Make the error of a runtime that must give way."""
     first = "end that one first, or name this one with another --vehicle-id"
     return UserError(f"another edge runtime is connected with vehicle id {vehicle_id}; {first}")
 
@@ -189,21 +194,25 @@ class Presence:
 
     Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before.
     It has a thread of its own, because all of this may wait for the network and the watchdog
-    must not. `give_way` is called, once, where an elder claim than this one's is found.
+    must not. `give_way` is called where an elder claim than this one's is found.
     """
 
     def __init__(
-        self, session: zenoh.Session, alive_key: str, open_client: OpenClient, give_way: Callable
+        self,
+        session: zenoh.Session,
+        alive_key: str,
+        open_client: OpenClient,
+        give_way: Callable[[], None],
+        listener: Optional[Listener] = None,
     ) -> None:
         self.rivals = 0
-        self.listener: Optional[Listener] = None
         self._session, self._key, self._open_client = session, alive_key, open_client
-        self._give_way: Optional[Callable] = give_way
+        self._give_way, self._listener = give_way, listener
         self._known: Set[str] = set()
         self._seen_before: Set[str] = set()
         self._looks = 0
-        self._routers = self._seen_routers()
         self._tokens: List[Any] = []
+        self._routers = self._seen_routers()
         self._declare()
         self._stopping = threading.Event()
         self.thread = threading.Thread(target=self._run, name="presence", daemon=True)
@@ -213,11 +222,8 @@ class Presence:
         before, self._routers = self._routers, self._seen_routers()
         if not self._routers or self._routers == before:
             return False
-        if self.listener:
-            self.listener.look()  # before anybody sees the tokens, and sends
-        tokens, self._tokens = self._tokens, []
-        for token in tokens:
-            token.undeclare()
+        if self._listener:
+            self._listener.look()  # before anybody sees the tokens, and sends
         try:
             self._declare()
         except zenoh.ZError:
@@ -236,19 +242,18 @@ class Presence:
             log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
         self._seen_before = claims
         self._looks += 1
-        if self._give_way is not None and any(claim < self.claim for claim in seen_twice):
-            give_way, self._give_way = self._give_way, None
-            give_way()
+        if any(claim < self.claim for claim in seen_twice):
+            self._give_way()
 
     def undeclare(self) -> None:
         """Stop looking and take the tokens away."""
         self._stopping.set()
         if self.thread.is_alive() and self.thread is not threading.current_thread():
             self.thread.join(_JOIN_S)
-        for token in self._tokens:
-            token.undeclare()
+        self._take_back()
 
     def _declare(self) -> None:
+        self._take_back()
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
         self._seen_before, self._looks = set(), 0
@@ -256,6 +261,11 @@ class Presence:
             self._session.liveliness().declare_token(key)
             for key in (self._key, f"{self._key}/{self.claim}")
         ]
+
+    def _take_back(self) -> None:
+        tokens, self._tokens = self._tokens, []
+        for token in tokens:
+            token.undeclare()
 
     def _seen_routers(self) -> List[str]:
         return sorted(map(str, self._session.info.routers_zid()))
@@ -267,8 +277,8 @@ class Presence:
                 if self.refresh():
                     next_look_s = time.monotonic() + _FIRST_LOOKS_S
                 if self._routers and time.monotonic() >= next_look_s:
-                    if self.listener and self.listener.refusal(time.time()):
-                        self.listener.look()
+                    if self._listener and self._listener.refusal(time.time()):
+                        self._listener.look()
                     self.look()
                     pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
                     next_look_s = time.monotonic() + pause_s
@@ -284,7 +294,7 @@ def wait_for_router(session: zenoh.Session) -> None:
 
 
 def _ask(open_client: OpenClient, selector: str) -> Optional[List[str]]:
-    """The tokens that a router knows, None where none answers."""
+    """Return the tokens that a router knows, None where no router answers."""
     try:
         session = open_client()
     except UserError:

@@ -14,13 +14,12 @@ of section 10; each way has its own least time, for a command is paired with no 
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any, Deque, Dict, Mapping, Tuple
+from typing import Any, Deque, Dict, Mapping, Tuple
 
 import msgspec
 import numpy as np
 
-if TYPE_CHECKING:
-    from edge_runtime.wire import State
+from edge_runtime.wire import State
 
 # Windows in messages: 300 follow a change of the delay in 30 s at 10 Hz, and a share of 5 % needs
 # 1,200 to be good to half a point.
@@ -44,7 +43,7 @@ class _Way:
         self.newest = -1
 
     def note(self, number: int, came: int = 1) -> None:
-        """Count so many that came, the newest of them this one; a late one is no longer lost."""
+        """Count `came` messages up to this number; a late one is no longer lost."""
         self.sent += max(number - self.newest, 0)
         self.came += came
         self.newest = max(number, self.newest)
@@ -57,7 +56,7 @@ class _Way:
 
 
 class LinkQuality:
-    """Measures the link from what is noted of each message. Every call takes some microseconds."""
+    """Measures the link by each message that is noted. Every call takes some microseconds."""
 
     def __init__(self) -> None:
         self._session = ""
@@ -72,14 +71,13 @@ class LinkQuality:
         self._answered = -1  # the episode of the command that was heard last
 
     def note_command(self, episode: int, sent_ns: int) -> None:
-        """Note a command that goes out."""
         self._commands += 1
         self._sent[sent_ns] = (self._commands, episode)
         if len(self._sent) > TIMES:
             del self._sent[next(iter(self._sent))]
 
     def note_state(self, state: State, arrived_ns: int, is_new: bool = True) -> None:
-        """Note a state that came, a new one or one that was overtaken."""
+        """Note a state that came; `is_new` is False where a newer one has overtaken it."""
         if state.session != self._session:  # another simulator: another clock, another network
             if not is_new:
                 return  # it is the simulator before that is heard once more
@@ -113,10 +111,7 @@ class LinkQuality:
         self.down.times_ms.append((heard_ns - sent_ns) * 1e-6)
 
     def measured(self) -> Dict[str, float]:
-        """Return FIELDS: mean delays, the error of both, deviations, losses; empty if not known.
-
-        A clock that is set anew reads as jitter.
-        """
+        """Return FIELDS: mean delays, the error of both, deviations, losses; empty if not known."""
         ways = self.up, self.down
         if min(len(each) for way in ways for each in (way.times_ms, way.counts)) < KNOWN:
             return {}
@@ -130,7 +125,7 @@ class LinkQuality:
 
 
 def is_poor(link: Mapping[str, float], control_period_s: float, was_poor: bool = False) -> bool:
-    """Whether a way's mean delay is over 2 T or it loses over 5 %; an unknown link is as it was."""
+    """Return whether a way has a mean delay over 2 T or loses over 5 %; unknown: as it was."""
     if not link:
         return was_poor
     late = max(link["up_ms"], link["down_ms"]) / (MOST_PERIODS * control_period_s * 1e3)
@@ -139,7 +134,7 @@ def is_poor(link: Mapping[str, float], control_period_s: float, was_poor: bool =
 
 
 def link_words(link: Mapping[str, float]) -> str:
-    """The link for a person; another version's, with other fields, is not known."""
+    """Render the link for a person; that of another version, with other fields, is not known."""
     if not link.keys() >= set(FIELDS):
         return "not known yet"
     way = "{0} {{{0}_ms:.1f}} ms, jitter {{{0}_jitter_ms:.1f}}, {{{0}_lost_percent:.1f}} % lost"

@@ -1,7 +1,7 @@
-"""One line on stderr for each thing worth knowing: time, level, event, then its fields.
+"""Log to stderr, one line an event: time, level, event, then its fields.
 
 As text (`time LEVEL event key=value`) or as JSON, one object a line. A thread of its own writes
-the lines: a reader of stderr that stands still must not hold the thread that drives.
+the lines, so that a stalled reader of stderr cannot hold the thread that drives.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ def configure(level: str, log_format: str = "text") -> None:
 
 
 def event(level: str, name: str, /, **fields: Any) -> None:
-    """Log an event with its fields."""
     _LOGGER.log(logging.getLevelName(level.upper()), name, extra={"fields": fields})
 
 
 def close() -> bool:
-    """Write what still waits, for half a second at most. Call it before the process ends.
+    """Write the waiting lines before the process ends, for half a second at most.
 
-    Returns False where a reader of stderr stands still: the interpreter's exit would wait for it.
+    Returns False where a reader of stderr is stalled: the interpreter's exit would wait for it.
     """
     for handler in _LOGGER.handlers:
         handler.close()
@@ -49,7 +48,7 @@ def close() -> bool:
 
 
 class _Background(logging.Handler):
-    """Hands the lines to a thread; drops those for which there is no room."""
+    """Hands the lines to a thread; drops lines while its queue is full."""
 
     def __init__(self, target: logging.Handler) -> None:
         super().__init__()
@@ -81,7 +80,7 @@ class _Formatter(logging.Formatter):
         self._as_json = as_json
 
     def format(self, record: logging.LogRecord) -> str:
-        # Boards and workstations sit in one time zone: UTC.
+        # UTC, so that the logs of board and workstation can be compared.
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         at, level, name = f"{seconds}.{int(record.msecs):03d}Z", record.levelname, record.msg
         fields = getattr(record, "fields", {})

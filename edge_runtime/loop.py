@@ -18,22 +18,19 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Deque, Dict, Optional, Tuple
+from typing import TYPE_CHECKING, Deque, Dict, NamedTuple, Optional
 
-from edge_runtime import log, wire
+from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
 from edge_runtime.link_quality import LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
-from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
-from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Reason, Rejection, State
+from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms
+from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Reason, Rejection, is_foreign
 
-if TYPE_CHECKING:  # Loaded only where they are used.
-    import numpy as np
-
-    from edge_runtime.files import Hold
+if TYPE_CHECKING:  # Loaded only where there is a vehicle.
     from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / HEALTH_HZ
@@ -44,26 +41,28 @@ _FLOOD_PERIOD_S = 1.0
 _HUNG_S = 2.0
 
 
+class LoopParts(NamedTuple):
+    """What a loop connects. `rearm_command` is what the log names to an operator."""
+
+    policy: Policy
+    controller: Controller
+    link: Link
+    notifier: Notifier
+    vehicle: Optional[VehicleRunner] = None
+    hold: Optional[Hold] = None
+    rearm_command: str = ""
+
+
 class ControlLoop:
     """Answers states with commands until it is stopped."""
 
-    def __init__(
-        self,
-        policy: Policy,
-        controller: Controller,
-        link: Link,
-        vehicle: Optional[VehicleRunner],
-        notifier: Notifier,
-        hold: Optional[Hold] = None,
-        rearm_command: str = "",
-    ) -> None:
-        self._policy, self._controller, self._link = policy, controller, link
-        self._vehicle, self._notifier = vehicle, notifier
-        self._hold, self._rearm_command = hold, rearm_command
+    def __init__(self, parts: LoopParts) -> None:
+        self._policy, self._controller, self._link = parts.policy, parts.controller, parts.link
+        self._vehicle, self._notifier, self._hold = parts.vehicle, parts.notifier, parts.hold
+        self._rearm_command = parts.rearm_command
+        self._period_s = parts.policy.manifest.control_period_s
         self._link_quality, self._is_poor = LinkQuality(), False
-        self._period_s, self._layout = policy.manifest.control_period_s, policy.layout
         self._board = BoardWatch()
-        self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._latest = LatestState(self._period_s)
         self._inferences_ns: Deque[int] = deque(maxlen=WINDOW)
         self._commands_ns: Deque[int] = deque(maxlen=WINDOW)
@@ -71,7 +70,8 @@ class ControlLoop:
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged, self._logged_wait = controller.safety, False
+        self._logged, self._logged_wait = parts.controller.safety, False
+        self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -82,11 +82,11 @@ class ControlLoop:
         self._worker = threading.Thread(target=self._work, name="policy", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen. Call `run` next."""
+        """Begin to listen; call `run` next."""
         self._worker.start()
         if self._vehicle is not None:
             self._vehicle.on_fault = self._vehicle_failed
-        limit = self._layout.max_payload_bytes
+        limit = self._policy.layout.max_payload_bytes
         self._link.declare(self._on_state, self.health, self._rearm, limit)
 
     def run(self) -> None:
@@ -127,11 +127,11 @@ class ControlLoop:
         return not self._worker.is_alive()
 
     def has_heard(self) -> bool:
-        """Whether any state has come, also one that was rejected."""
+        """Return whether any state has come, also one that was rejected."""
         return bool(self._latest.accepted or self._latest.rejected)
 
     def health(self) -> Health:
-        """The message of the health topic and of the status query."""
+        """Make the message of the health topic and of the status query."""
         with self._lock:
             safety = self._controller.safety
             return Health(
@@ -158,8 +158,7 @@ class ControlLoop:
 
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
-        refusal = self._link.refusal(arrived_ns / 1e9)
-        state = refusal or wire.decode_state(payload, self._layout)
+        state = self._link.refusal(arrived_ns / 1e9) or self._policy.layout.decode(payload)
         with self._lock:
             if isinstance(state, Rejection):
                 self._log_rejection(self._latest.reject(state), arrived_s)
@@ -178,7 +177,8 @@ class ControlLoop:
 
     def _work(self) -> None:
         try:
-            self._answer()
+            while self._answer_next():
+                pass
         except BaseException as error:  # whatever it is, the watchdog must know
             with self._lock:
                 self._busy_since_s = None
@@ -188,36 +188,35 @@ class ControlLoop:
             where = f"{place.filename}:{place.lineno}"
             log.event("error", "policy_thread_dead", detail=repr(error), where=where)
 
-    def _answer(self) -> None:
-        while True:
-            self._wakes.get()
-            with self._lock:
-                if self._stopping or self._slot is None:
-                    return
-                received, self._slot = self._slot, None
-                self._busy_since_s = time.monotonic()
-                self._controller.begin(received, self._busy_since_s)
-            output, inference_ns = self._infer(received.state)
-            with self._lock:
-                self._busy_since_s = None
-                if self._stopping:
-                    return  # The farewell has been said.
-                self._inferences_ns.append(inference_ns)
-                self._look_at_vehicle(time.monotonic())
-                now_s = time.monotonic()
-                order = self._controller.finish(output, inference_ns, now_s)
-                self._send(order)
-                if order is not None:
-                    took_s = time.monotonic() - received.arrived_s
-                    self._commands_ns.append(int(took_s * 1e9))
-
-    def _infer(self, state: State) -> Tuple[Optional[np.ndarray], int]:
-        if wire.is_foreign(state, self._layout.task_text):
-            return None, 0  # nobody has looked whether its observation fits
-        return infer(self._policy, self._layout.arrays(state.observation))
+    def _answer_next(self) -> bool:
+        """Wait for a state and answer it; False once the loop is stopped."""
+        self._wakes.get()
+        with self._lock:
+            if self._stopping or self._slot is None:
+                return False
+            received, self._slot = self._slot, None
+            self._busy_since_s = time.monotonic()
+            self._controller.begin(received, self._busy_since_s)
+        layout, output, inference_ns = self._policy.layout, None, 0
+        # Nobody has looked whether the observation of a foreign task fits.
+        if not is_foreign(received.state, layout.task_text):
+            seen = layout.arrays(received.state.observation)
+            output, inference_ns = infer(self._policy, seen)
+        with self._lock:
+            self._busy_since_s = None
+            if self._stopping:
+                return False  # The farewell has been said.
+            self._inferences_ns.append(inference_ns)
+            self._look_at_vehicle(time.monotonic())
+            order = self._controller.finish(output, inference_ns, time.monotonic())
+            self._send(order)
+            if order is not None:
+                took_s = time.monotonic() - received.arrived_s
+                self._commands_ns.append(int(took_s * 1e9))
+        return True
 
     def _is_hung(self, now_s: float) -> bool:
-        """Whether policy or driver keep or lost their thread: only a new process may help."""
+        """Return whether policy or driver keep or lost their thread: a new process may help."""
         if not self._worker.is_alive():
             return True
         if self._vehicle is not None and self._vehicle.busy_s(now_s) > _HUNG_S:
@@ -293,7 +292,7 @@ class ControlLoop:
             log.event("warning" if poor else "info", "link", poor=poor, measured=link_words(link))
 
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
-        """The first of each reason, then one a second: all are counted in the health message."""
+        """Log the first of each reason, then one a second: health counts all of them."""
         reason = rejection.reason.value
         if now_s >= self._logged_rejection_s.get(reason, -math.inf) + _FLOOD_PERIOD_S:
             self._logged_rejection_s[reason] = now_s

@@ -1,20 +1,29 @@
-"""The manifest of a policy file: what the policy is for, sees and does. Contract, section 4.
+"""The manifest of a policy file: its task, observation and action. Contract, section 4.
 
 A Task is what an environment asks of a policy; a Manifest is a Task and where the policy comes
-from. Everything else follows it: the control period T, the size of a state, the safe stop.
+from. The control period T, the size of a state and the safe stop follow from it.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Tuple, Union
 
 import msgspec
 import numpy as np
 
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES, MAX_TEXT_CHARS, Reason, Rejection, Versioned
+from edge_runtime.wire import (
+    MAX_STATE_BYTES,
+    MAX_TEXT_CHARS,
+    Reason,
+    Rejection,
+    State,
+    Versioned,
+    decode_state,
+    is_foreign,
+)
 
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 2
@@ -72,7 +81,7 @@ class Car(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return math.sin(slip_rad) / (0.5 * self.wheelbase_m)
 
     def steering(self, curvature: float) -> float:
-        """The steering action of a path; not clamped. Inverse of the above."""
+        """Steering action of a path curvature; not clamped. The inverse of `curvature`."""
         slip_rad = math.asin(min(max(0.5 * self.wheelbase_m * curvature, -1.0), 1.0))
         return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
 
@@ -90,7 +99,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     def text(self) -> str:
         """All that both sides must agree on, as in `rover: camera uint8 48x64x3, left 0 to 1, ...`.
 
-        A text that is too long for the wire ends with a checksum of the whole.
+        A text that is too long for the wire ends with a checksum of the whole text.
         """
         seen = (
             f"{name} {entry.dtype} {'x'.join(map(str, entry.shape)) or 'number'}"
@@ -105,9 +114,9 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Manifest(Task, frozen=True, kw_only=True):
-    """All of it. `training` holds what is known of it: seed, episodes, config, source revision.
+    """A task and the policy's origin. `training`: seed, episodes, config, source revision.
 
-    `created` is ISO 8601 in UTC. Other fields are not looked at.
+    `created` is ISO 8601 in UTC. Other fields are ignored.
     """
 
     algorithm: str
@@ -117,7 +126,7 @@ class Manifest(Task, frozen=True, kw_only=True):
 
 
 def decode_manifest(text: str) -> Manifest:
-    """The manifest of a policy file. Raises UserError where it is none, or none we can drive."""
+    """Decode the manifest of a policy file. Raises UserError where no policy could drive by it."""
     try:
         # The schema first: another schema's fields need not fit.
         schema = msgspec.json.decode(text.encode(), type=Versioned).schema
@@ -132,7 +141,7 @@ def decode_manifest(text: str) -> Manifest:
 
 
 def check_task(task: Task) -> None:
-    """Raise UserError, with the first reason, where no policy could drive it here."""
+    """Raise UserError, with the first reason, where no policy could do this task here."""
     if not MIN_PERIOD_S <= task.control_period_s <= MAX_PERIOD_S:  # nor is NaN
         within = f"it must lie in {MIN_PERIOD_S} to {MAX_PERIOD_S} s"
         raise UserError(f"the control period is {task.control_period_s} s; {within}")
@@ -146,18 +155,16 @@ def check_task(task: Task) -> None:
             raise UserError(f"the observation {name!r} has the shape {entry.shape}")
     Layout(task)
     names = [row.name for row in task.action]
-    if not names or len(set(names)) != len(names):
-        found = f"an action twice: {', '.join(names)}" if names else "no action"
-        raise UserError(f"the manifest names {found}")
-    if len(names) > MAX_ACTIONS:
-        raise UserError(f"the manifest names {len(names)} actions; {MAX_ACTIONS} at most")
+    if not 1 <= len(names) <= MAX_ACTIONS or len(set(names)) != len(names):
+        raise UserError(f"the manifest names {len(names)} actions; 1 to {MAX_ACTIONS}, each once")
     for row in task.action:
+        its_range = f"range of {row.name}, {row.low} to {row.high},"
         if not (row.low < row.high and math.isfinite(row.low) and math.isfinite(row.high)):
-            found = f"the range of {row.name} is {row.low} to {row.high}"
-            raise UserError(f"{found}; it must be finite, and not empty")
+            raise UserError(f"the {its_range} must be finite, and not empty")
         if row.stop is not None and not row.low <= row.stop <= row.high:
-            found = f"the safe stop of {row.name} is {row.stop}"
-            raise UserError(f"{found}, outside its range of {row.low} to {row.high}")
+            raise UserError(
+                f"the safe stop {row.stop} lies outside the {its_range} of the manifest"
+            )
         if row.slew_per_s is not None and not 0.0 < row.slew_per_s < math.inf:
             raise UserError(f"the slew_per_s of {row.name} is {row.slew_per_s}; it must be above 0")
 
@@ -194,8 +201,19 @@ class Layout:
             found = f"the observation holds {self.size + names} bytes"
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
 
+    def decode(self, payload: bytes) -> Union[State, Rejection]:
+        """Decode a State with finite numbers whose observation is this task's.
+
+        A state that names another task is handed on as it is, so that its sender can be told; the
+        policy must not see it.
+        """
+        state = decode_state(payload, self.max_payload_bytes)
+        if isinstance(state, Rejection) or is_foreign(state, self.task_text):
+            return state
+        return self.refusal(state.observation) or state
+
     def refusal(self, observation: Mapping[str, bytes]) -> Optional[Rejection]:
-        """Why a state's observation is none of this task's, None where it is one."""
+        """Say why a state's observation is not this task's; None where it is."""
         if len(observation) != len(self.parts):
             names = ", ".join(part.name for part in self.parts)
             found = f"{len(observation)} arrays, not {names}"
@@ -212,7 +230,7 @@ class Layout:
         return None
 
     def arrays(self, observation: Mapping[str, bytes]) -> Dict[str, np.ndarray]:
-        """The read-only arrays of an observation that `refusal` has nothing against; no copies."""
+        """View an observation that was not refused as read-only arrays; no copies."""
         return {
             name: np.frombuffer(observation[name], dtype).reshape(shape)
             for name, dtype, shape, _ in self.parts

@@ -1,8 +1,8 @@
-"""A policy file: signed, whole in itself, with a manifest that fits it; and the network in it.
+"""A policy file: its signature, its ONNX graph, its manifest, and the network that it holds.
 
 The signature is Ed25519 over the whole file: `POLICY.onnx.sig`, 64 raw bytes; keys are PEM. Before
-onnxruntime loads the file it is walked field by field, without the onnx package: whatever could
-keep weights where nobody looks, or make the run time depend on the picture, is refused. The
+onnxruntime loads the file it is read field by field, without the onnx package: anything that could
+keep weights where nobody looks, or make the run time depend on the observation, is refused. The
 manifest (manifest.py) is JSON in its metadata under MANIFEST_KEY. Contract, section 4.
 """
 
@@ -41,20 +41,20 @@ _RANGE_TOLERANCE = 1e-5  # Of an action's whole range: the last bits of a networ
 
 
 class Policy(NamedTuple):
-    """A network that may drive, as `load_policy` makes it."""
+    """A network that may drive, made by `load_policy`."""
 
     session: onnxruntime.InferenceSession
     manifest: Manifest
     layout: Layout
     trust: str
     policy_id: str
-    public_key: Optional[str] = None  # The file of the key that it was verified by
+    public_key: Optional[str] = None  # The file of the key that verified it
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The action, float32 [n], for the arrays of `layout`. It may hold NaN: check it.
+        """Infer the action, float32 [n], from the arrays of `layout`. It may hold NaN: check it.
 
-        Raises UserError for another type or shape, which can depend on what it sees, and whatever
-        onnxruntime raises.
+        Raises UserError for another type or shape, which can depend on the observation, and
+        whatever onnxruntime raises.
         """
         inputs = {name: array[np.newaxis] for name, array in observation.items()}
         with _flushed():
@@ -67,7 +67,7 @@ class Policy(NamedTuple):
 def load_policy(
     path: PathLike, public_key: Optional[PathLike] = None, allow_unsigned: bool = False
 ) -> Policy:
-    """Load a policy that may drive: trusted, whole, probed, its manifest and graph agree.
+    """Load a policy that may drive: trusted, whole and probed, with a manifest that fits its graph.
 
     `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists, and with
     `allow_unsigned` before it a `policy.pub` beside the policy.
@@ -83,7 +83,7 @@ def load_policy(
 
 
 def open_policy(data: bytes, trust: str) -> Policy:
-    """The policy in a file's bytes, checked and probed but for its signature. Raises UserError."""
+    """Check and probe the policy in a file's bytes, without its signature. Raises UserError."""
     metadata = check_graph(data)
     if MANIFEST_KEY not in metadata:
         raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
@@ -107,12 +107,12 @@ def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
 
 
 def policy_id_of(data: bytes) -> str:
-    """The name of a policy: SHA-256 of its whole file, in hex. Two that act differently differ."""
+    """Name a policy: SHA-256 of its whole file, in hex."""
     return hashlib.sha256(data).hexdigest()
 
 
 def _check_tensor(what: str, found: list, name: str, kind: str, shape: Sequence[int]) -> None:
-    """Raise UserError unless it is one tensor like this behind a batch that is 1 or open."""
+    """Raise UserError unless one tensor is found, of this kind behind a batch that is 1 or open."""
     fits = (
         len(found) == 1
         and (found[0].name, found[0].type) == (name, kind)
@@ -126,16 +126,16 @@ def _check_tensor(what: str, found: list, name: str, kind: str, shape: Sequence[
 
 
 def open_network(data: bytes) -> onnxruntime.InferenceSession:
-    """The network in an ONNX file's bytes, on one thread. Raises UserError where it is none."""
+    """Load the network in an ONNX file's bytes, on one thread. Raises UserError."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     # One thread: so small a network gains nothing from more, and the board has other work.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    # Else numbers near zero, as of a dark picture, make a network ten times slower.
+    # Numbers near zero, as of a dark picture, would make a network ten times slower.
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    # Read as what was checked: bytes can be an ONNX file and one of onnxruntime's own format.
+    # The format that was checked: bytes can be an ONNX file and one of onnxruntime's own format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # It prints "EP Error" on stdout for some broken files; stdout belongs to our reports.
@@ -152,7 +152,7 @@ _libc.fegetenv(_flushing)
 
 @contextlib.contextmanager
 def _flushed() -> Iterator[None]:
-    """Keep to this block how a process's first session sets the processor: it does so for good."""
+    """Flush numbers near zero in this block only: a process's first session does so for good."""
     before = ctypes.create_string_buffer(64)
     _libc.fegetenv(before)
     _libc.fesetenv(_flushing)
@@ -164,7 +164,7 @@ def _flushed() -> Iterator[None]:
 
 
 def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
-    """What every policy must answer before it drives: zeros, middling values, seeded noise.
+    """Make the observations that a policy must answer first: zeros, middling values, seeded noise.
 
     Bytes over their range, floats from 0 to 1, integers 0 and 1.
     """
@@ -177,7 +177,7 @@ def probes(layout: Layout) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _probe(policy: Policy) -> None:
-    """Warm it up, too. Raises UserError for an unfit answer."""
+    """Warm the network up and check its answers. Raises UserError."""
     for seen in probes(policy.layout):
         try:
             action = policy.act(seen)
@@ -189,7 +189,7 @@ def _probe(policy: Policy) -> None:
 
 
 def check_answer(action: np.ndarray, task: Task, what: str) -> None:
-    """Raise UserError unless the answer to `what` is finite and within the manifest's ranges."""
+    """Raise UserError unless the answer to `what` is finite and in the manifest's ranges."""
     words = f"it answers {what} with"
     if not np.all(np.isfinite(action)):
         raise UserError(f"{words} {action.tolist()}, not finite")
@@ -203,10 +203,7 @@ def check_answer(action: np.ndarray, task: Task, what: str) -> None:
 def infer(
     policy: Policy, observation: Mapping[str, np.ndarray]
 ) -> tuple[Optional[np.ndarray], int]:
-    """The action, float32 [n], for an observation, and how long it took in nanoseconds.
-
-    Where the policy raises, the answer is None.
-    """
+    """Infer the action, float32 [n], and its duration in ns; no action where that fails."""
     begun_ns = time.perf_counter_ns()
     output: Optional[np.ndarray] = None
     try:
@@ -217,7 +214,7 @@ def infer(
 
 
 def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None:
-    """Raise UserError unless `signature` is the key owner's over exactly these bytes."""
+    """Raise UserError unless the owner of the key has signed exactly these bytes."""
     # Here: reading a manifest alone need not wait for it.
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -234,18 +231,16 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
     try:
         key.verify(signature, policy_bytes)
     except InvalidSignature:
-        raise UserError(
-            "the signature does not fit the policy file and public key:"
-            " the file was changed, or another key signed it"
-        ) from None
+        changed = "the file was changed, or another key signed it"
+        raise UserError(f"the signature does not fit file and public key: {changed}") from None
 
 
 def check_trust(
     path: PathLike, policy_bytes: bytes, public_key: Optional[PathLike], allow_unsigned: bool
 ) -> tuple[str, Optional[str]]:
-    """VERIFIED, BESIDE, UNVERIFIED or UNSIGNED for a policy that may drive; UserError for others.
+    """Verify a policy: VERIFIED, BESIDE, UNVERIFIED or UNSIGNED; UserError where it may not drive.
 
-    The second is the file of the public key that verified it, if any. A signature is always
+    Also returns the file of the public key that verified it, if any. A signature is always
     verified where a key is known; `allow_unsigned` lets through only what cannot be verified, never
     what fails to. With it, a key beside the policy comes before that of the working directory.
     Without it, such a key counts for nothing: who brings a policy could bring it, too.
@@ -279,8 +274,8 @@ def check_trust(
 
 
 # Field numbers of onnx.proto (ONNX 1.12 and later; they never change), by kind of message: plain
-# fields, messages by field, and what is refused by name. Any other field is refused, too: it could
-# keep weights where nobody looks, or in a file that nobody has signed.
+# fields, messages by field, and refused fields with a name. Any other field is refused, too: it
+# could keep weights where nobody looks, or in a file that nobody has signed.
 _SPARSE, _OUTSIDE = "sparse weights", "weights in another file (export it in one file)"
 # A loop may take any time, and a branch a time that no probe has met.
 _FLOW = "control flow (a Loop, an If or a Scan)"
@@ -300,8 +295,9 @@ _KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
     "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
 
-# Operators that are refused, why, and where one of which inputs is there (_RANDOM), or follows from
-# the observation, and not from weights and shapes alone (_COST); None: always.
+# Refused operators: why, which inputs matter, and the names. _RANDOM: refused where one of these
+# inputs is there; _COST: where one follows from the observation, not from weights and shapes alone.
+# None: always.
 _RANDOM, _COST = "answers at random", "takes as long as the observation makes it"
 _OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
     (_RANDOM, None, ("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
@@ -325,7 +321,7 @@ def check_graph(data: bytes) -> dict[str, str]:
     """Check a whole ONNX file, which onnxruntime does not, and return its metadata.
 
     Raises UserError for truncated or foreign bytes, for weights anywhere but in plain tensors
-    inside the file, and for another IR version or operator set.
+    inside the file, for a refused operator, and for another IR version or operator set.
     """
     try:
         model = _checked(memoryview(data), "model")
@@ -352,7 +348,7 @@ def check_graph(data: bytes) -> dict[str, str]:
 
 
 def _check_operators(graph: memoryview) -> None:
-    """Raise UserError for one of `_OPERATORS`, or that is not ONNX's own."""
+    """Raise UserError for an operator of `_OPERATORS`, or one that is not ONNX's own."""
     fields = list(_fields(graph))
     fixed = {"", *(_text(dict(_fields(tensor)).get(8)) for number, tensor in fields if number == 5)}
     for node in (list(_fields(value)) for number, value in fields if number == 1):
@@ -369,7 +365,7 @@ def _check_operators(graph: memoryview) -> None:
 
 
 def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:
-    """The fields of a message, when it and all within it hold nothing that is refused."""
+    """Return the fields of a message; UserError where it or one inside it holds a refused field."""
     plain, nested, refused = _KINDS[kind]
     fields = list(_fields(message))
     for number, value in fields:
@@ -386,10 +382,7 @@ def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:
 
 
 def _fields(message: memoryview) -> Iterator[tuple[int, Any]]:
-    """Number and value (int or memoryview) of each field.
-
-    See https://protobuf.dev/programming-guides/encoding/.
-    """
+    """Read number and value (int or memoryview) of each field; protobuf's wire format."""
     position = 0
     while position < len(message):
         tag, position = _varint(message, position)
@@ -413,7 +406,7 @@ def _fields(message: memoryview) -> Iterator[tuple[int, Any]]:
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:
-    """A number and where it ends."""
+    """Read a number; returns it and where it ends."""
     result = 0
     for index, byte in enumerate(message[position : position + 10]):
         result |= (byte & 0x7F) << (7 * index)

@@ -11,13 +11,11 @@ import errno
 import math
 import socket
 import ssl
-from typing import TYPE_CHECKING, Any, List, Optional, Tuple
+from typing import Any, List, Optional, Tuple
 
+from edge_runtime.tls import TlsFiles
 from edge_runtime.util import UserError
 from edge_runtime.wire import Reason, Rejection
-
-if TYPE_CHECKING:
-    from edge_runtime.tls import TlsFiles
 
 _LOOK_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
@@ -27,81 +25,63 @@ _MOST_KEPT = 100
 
 
 def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
-    """Whether anybody answers at `endpoint`, and why there is no link; "" if nothing forbids one.
+    """Return whether anybody answers at `endpoint`, and why there is no link; "" if one is likely.
 
-    An endpoint of udp or quic is only resolved: there is nothing to connect to, and Python has no
-    QUIC. Takes up to 1.3 s for each address of the host, and as long as the name server does.
+    Of udp and quic it knows nothing. Takes up to 1.3 s for each address of the host, and as long
+    as the name server does.
     """
     protocol, host, port = _parts(endpoint)
-    try:
-        _address(endpoint)
-    except OSError as error:
-        return False, f"host {host!r} cannot be resolved ({error.strerror}), port {port}"
     if _kind(protocol) != socket.SOCK_STREAM:
         return False, ""
     try:
         plain = socket.create_connection((host, port), timeout=_LOOK_S)
-    except ConnectionRefusedError:
-        return False, f"nobody listens on port {port} of {host} (connection refused)"
-    except socket.timeout:
-        return False, f"{host} does not answer within {_LOOK_S:.0f} s"
-    except OSError as error:
-        return False, f"{host} cannot be reached ({error.strerror})"
+    except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
+        words = str(getattr(error, "strerror", None) or error).lower()
+        return False, f"port {port} of {host}: {words}"
     with contextlib.closing(plain):
-        why = _why_not_plain(plain) if files is None else _why_not_tls(plain, host, files)
+        why = _why_not(plain, host, files)
     return True, why and f"{endpoint} {why}"
 
 
 def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
-    """Why a client that must have a link at once gets none, on one line."""
+    """Say on one line why a client that must have a link at once gets none."""
     answers, why = look(endpoint, files)
     if answers and why:
         return why
-    if endpoint.startswith("quic/"):  # such a link does not say why it fails
-        why = why or "or one end does not believe the other's certificate"
     help_ = "start the simulator or router there first, or name another address with --connect"
     return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
 
 
-def _why_not_plain(plain: socket.socket) -> str:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+def _why_not(plain: socket.socket, host: str, files: Optional[TlsFiles]) -> str:
+    """Shake hands; say what is wrong. Without files nobody should be able to."""
     try:
-        context.wrap_socket(plain).close()
-    except OSError as error:
-        if "ALERT" not in (getattr(error, "reason", "") or ""):  # as an SSLError has it
-            return "answers, but not as a simulator or a router does"
-    return "listens with TLS and wants --tls, with tls/ for tcp/"
-
-
-def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
-    try:
-        context = _context(files)
-    except OSError as error:  # They may be replaced at this moment.
-        return f"cannot be asked with the certificate of {files.name}: {error.strerror or error}"
-    shaken = False
-    try:
-        with context.wrap_socket(plain, server_hostname=host) as link:
-            shaken = True
+        with _context(files).wrap_socket(plain, server_hostname=host) as link:
             link.settimeout(_ALERT_S)
-            link.recv(1)
+            with contextlib.suppress(socket.timeout):  # it is silent: we are let in
+                link.recv(1)
     except ssl.SSLCertVerificationError as error:
         return f"shows a certificate that is not believed here: {error.verify_message}"
-    except ssl.SSLError as error:
-        reason = (error.reason or str(error)).lower().replace("_", " ")
-        if "alert" not in reason:
-            return f"does not speak TLS ({reason})"
+    except OSError as error:
+        reason = str(getattr(error, "reason", "") or error.strerror or error)
+        is_tls = "ALERT" in reason
+    else:
+        reason, is_tls = "", True
+    if files is None:
+        tls, other = "listens with TLS and wants --tls, with tls/ for tcp/", "answers, but not as"
+        return tls if is_tls else f"{other} a simulator or a router does"
+    if is_tls and reason:
         needs = "both need one authority, and certificates that have not expired"
         return f"refuses the certificate of {files.name} ({reason}): {needs}"
-    except OSError:  # A link that stays open, and silent, has been accepted.
-        return "" if shaken else "answers, but not with TLS"
-    return ""
+    return reason and f"gives no TLS link to {files.name}: {reason}"
 
 
-def _context(files: TlsFiles) -> ssl.SSLContext:
+def _context(files: Optional[TlsFiles]) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
-    context.load_verify_locations(files.ca)
-    context.load_cert_chain(files.certificate, files.key)
+    if files is None:
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    else:
+        context.load_verify_locations(files.ca)
+        context.load_cert_chain(files.certificate, files.key)
     return context
 
 
@@ -118,7 +98,7 @@ class Listener:
         self.look()
 
     def refusal(self, now_s: float) -> Optional[Rejection]:
-        """Why its states are not taken, at this Unix time."""
+        """Say why states of this Unix time are not taken; None where both certificates hold."""
         if now_s >= self.own_until_s:
             return Rejection(Reason.CERTIFICATE, f"our own, of {self._files.name}, has expired")
         if now_s >= self._until_s:
@@ -126,7 +106,7 @@ class Listener:
         return None
 
     def look(self) -> None:
-        """See what it shows now; the last time counts on where it shows nothing."""
+        """Read the certificate that the listener shows now; one that shows none keeps its last."""
         protocol, host, port = _parts(self._endpoint)
         if protocol != "tls":
             self._until_s = math.inf
@@ -145,28 +125,23 @@ class Listener:
 
 
 def check_port_is_free(endpoint: str) -> None:
-    """Raise UserError where it cannot be had: Zenoh names neither the port nor the cause."""
-    _, host, port = _parts(endpoint)
+    """Raise UserError where nothing can listen at an endpoint."""
+    protocol, host, port = _parts(endpoint)
     try:
-        family, kind, _, _, target = _address(endpoint)
-    except OSError:
-        raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
-    with socket.socket(family, kind) as probe:
-        if kind == socket.SOCK_STREAM:
+        found = socket.getaddrinfo(host, port, type=_kind(protocol))
+        family, kind, _, _, target = found[0]
+        with socket.socket(family, kind) as probe:
             # As the listener does: the last run's closed links are no bar.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == _kind("tcp")))
             probe.bind(target)
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                words = f"port {port} on {host} is in use; choose another with --listen"
-            else:
-                words = f"cannot listen on port {port} of {host}: {error.strerror}"
-            raise UserError(words) from None
+    except (OSError, UnicodeError) as error:
+        is_busy = getattr(error, "errno", None) == errno.EADDRINUSE
+        why = "is in use" if is_busy else f"cannot be listened at ({error})"
+        raise UserError(f"{endpoint} {why}; choose another with --listen") from None
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests.
+    """Return a Zenoh endpoint on loopback that nobody listens on, for demos and tests.
 
     A TCP port stays reserved until this process ends or has asked for a hundred more.
     """
@@ -191,12 +166,3 @@ def _parts(endpoint: str) -> Tuple[str, str, int]:
     protocol, address = endpoint.split("/", 1)
     host, port = address.rsplit(":", 1)
     return protocol, host.strip("[]"), int(port)
-
-
-def _address(endpoint: str) -> Any:
-    """The first of `socket.getaddrinfo`; OSError where the host cannot be resolved."""
-    protocol, host, port = _parts(endpoint)
-    try:
-        return socket.getaddrinfo(host, port, type=_kind(protocol))[0]
-    except UnicodeError as error:  # no host can have such a name
-        raise OSError(None, str(error)) from None

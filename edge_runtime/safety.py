@@ -1,7 +1,7 @@
 """When the policy may drive: a pure state machine over (mode, event, time). Contract, section 5.
 
-TRANSITIONS is all of it; the functions below it only decide which event a moment is. T is the
-control period of the policy that drives.
+TRANSITIONS holds every transition; the functions below it only choose the event. T is the control
+period of the policy that drives.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class Mode(str, Enum):
 
 
 class Event(str, Enum):
-    """What can happen. The first three are fresh states with a finite answer in time."""
+    """The first three are fresh states with a finite answer in time."""
 
     FRESH = "fresh_state"
     RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for longer than silence_s
-    LATE = "state_late"  # the state lags behind its stamps by more than answer_s (freshness.py)
+    LATE = "state_late"  # the state lags behind its stamps by more than answer_s (latest.py)
     NOT_FINITE = "output_not_finite"
     FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
     DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps
@@ -98,24 +98,24 @@ class Safety(NamedTuple):
 
     @property
     def answer_s(self) -> float:
-        """How long the newest state may be answered: 2 T, and a fifth of T as grace."""
+        """For how long the newest state may be answered: 2 T, and a fifth of T as grace."""
         return SILENCE_PERIODS * self.control_period_s
 
     @property
     def silence_s(self) -> float:
-        """How long silence is no fault. What drives has its last plan for `ride_s` more."""
+        """For how long silence is no fault: in a drive, the last plan adds `ride_s`."""
         return SILENCE_PERIODS * self.control_period_s + self.ride_s * (self.mode is Mode.DRIVE)
 
 
 def is_silent(safety: Safety, now_s: float) -> bool:
-    """Whether the newest state is older than silence_s (or there was none)."""
+    """Return whether the newest state is older than silence_s (or there was none)."""
     return safety.last_fresh_s is None or now_s - safety.last_fresh_s > safety.silence_s
 
 
 def classify_arrival(
     safety: Safety, session: str, arrived_s: float, needs_rearm: bool
 ) -> Optional[Event]:
-    """Which event the time before a state and its sender are; None where it follows in time."""
+    """Event implied by the gap before a new state and by its sender; None where it is in time."""
     if safety.last_fresh_s is None:
         return None
     if session != safety.session:
@@ -130,7 +130,7 @@ def classify_arrival(
 
 
 def classify_fresh(safety: Safety, final: bool, needs_rearm: bool) -> Event:
-    """Which event a fresh state with a finite answer in time is."""
+    """Event of a fresh state with a finite answer in time."""
     if final:
         return Event.FINAL
     enough = safety.fresh_in_a_row + 1 >= FRESH_STATES_TO_RECOVER
@@ -140,7 +140,7 @@ def classify_fresh(safety: Safety, final: bool, needs_rearm: bool) -> Event:
 
 
 def advance(safety: Safety, event: Event) -> Safety:
-    """The state after the event. Arrival times are noted by `note_arrival`."""
+    """Return the state after the event. Arrival times are noted by `note_arrival`."""
     mode = TRANSITIONS[safety.mode, event]
     stops, is_fault = mode is Mode.SAFE_STOP, event in FAULTS
     reason = event.value if is_fault else safety.reason
@@ -155,7 +155,7 @@ def advance(safety: Safety, event: Event) -> Safety:
 
 
 def note_arrival(safety: Safety, session: str, arrived_s: float) -> Safety:
-    """Remember whose newest state arrived when, before anyone knows what the policy makes of it.
+    """Note arrival and sender of the newest state, before its answer is known.
 
     Not called for a late state: the silence goes on.
     """

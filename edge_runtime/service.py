@@ -1,27 +1,44 @@
-"""The runtime as a service: what it tells systemd (sd_notify(3), Type=notify), its own health.
+"""The runtime as a service on a board: systemd, an installer's hold, sensors, priority and memory.
 
-The board's sensors are Linux's; elsewhere they are unknown.
+It speaks sd_notify(3), Type=notify. Sensors and priorities are Linux's.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
+import resource
 import socket
 import threading
 from pathlib import Path
-from typing import Collection, Dict, Mapping, NamedTuple, Optional
+from typing import (
+    Any,
+    BinaryIO,
+    Callable,
+    Collection,
+    Dict,
+    List,
+    Mapping,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+)
 
 import numpy as np
 
 from edge_runtime import log
+from edge_runtime.util import UserError, open_regular
 
 WINDOW = 1024
 _LOOK_PERIOD_S = 2.0
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 class Notifier:
-    """Says READY, WATCHDOG, STATUS and STOPPING to systemd; says nothing where it is not there.
+    """Sends READY, WATCHDOG, STATUS and STOPPING to systemd, where it runs under systemd.
 
     Never waits: a message for which systemd has no room is dropped.
     """
@@ -57,7 +74,7 @@ class Notifier:
 
 
 class Board(NamedTuple):
-    """One look. `temperature_c`: the hottest sensor in degrees Celsius, None without any."""
+    """The board now. `temperature_c`: its hottest sensor in degrees Celsius, None without any."""
 
     temperature_c: Optional[float] = None
     load_1min: float = 0.0
@@ -65,7 +82,7 @@ class Board(NamedTuple):
 
 
 def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -> Board:
-    """Read the sensors now. Some take milliseconds to answer: never in the control thread."""
+    """Read the sensors. Some take milliseconds to answer: never in the control thread."""
     temperatures_c, rss_mb = [], 0.0
     for sensor in Path(thermal).glob("thermal_zone*/temp"):
         # A sensor that is switched off answers with an error.
@@ -77,14 +94,14 @@ def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -
 
 
 def peak_memory_mb() -> Optional[float]:
-    """The most memory that this process has held so far; None where the system does not say."""
+    """Return the most memory that this process has held; None where the system does not say."""
     with contextlib.suppress(OSError, LookupError, ValueError):  # getrusage has its parent's, too
         return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) * 1024e-6
     return None
 
 
 class BoardWatch:
-    """Looks every 2 s in a thread of its own, and keeps the last look."""
+    """Reads the board every 2 s in a thread, and keeps the last reading."""
 
     def __init__(self) -> None:
         self.last = look()
@@ -101,6 +118,91 @@ class BoardWatch:
 
 
 def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
-    """p50, p99 and max in milliseconds; zeros where there is none."""
+    """p50, p99 and max in milliseconds; zeros where there are no durations."""
     p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}
+
+
+def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
+    """Apply the settings of priority, processors and memory (0, empty and False: no change).
+
+    Call it before a thread that drives is started: the threads of Zenoh, of the policy and of the
+    vehicle inherit from the main thread. Each refusal of the system is logged; returns their keys.
+    """
+    usable = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+    rows: Sequence[Tuple[str, Any, Callable[[Any], None], str]] = (
+        ("realtime_priority", priority, _set_priority,
+         "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"),
+        ("cpus", cpus, _set_cpus, f"this process may use {usable}"),
+        ("lock_memory", lock_memory, _lock_memory,
+         "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"),
+    )  # fmt: skip
+    refused = []
+    for key, value, apply, words in rows:
+        try:
+            if value:
+                apply(value)
+        except (OSError, ValueError, AttributeError) as error:
+            log.event("warning", "not_permitted", key=key, value=value, detail=error, help=words)
+            refused.append(key)
+    return refused
+
+
+def _set_priority(priority: int) -> None:
+    # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to all others.
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+def _set_cpus(cpus: Sequence[int]) -> None:
+    missing = set(cpus) - os.sched_getaffinity(0)
+    if missing:  # the kernel would silently take those that exist
+        raise ValueError(f"no processor {sorted(missing)} for this process")
+    os.sched_setaffinity(0, cpus)
+
+
+def _lock_memory(_: object) -> None:
+    """Keep every page that is ever touched; pages that nobody touches take no room."""
+    soft, _hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        # With a limit it would succeed now, and an allocation would fail in mid-drive.
+        raise PermissionError(f"at most {soft // 1024} KiB may be locked")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+class Hold:
+    """Keeps commands from wire and vehicle while an installer tries this release.
+
+    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
+    process, so an installer that dies silences no runtime. Once free, this process never asks
+    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._stream: Optional[BinaryIO] = None
+        try:
+            self._stream = open_regular(path)  # kept until it is free
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Return whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # No locks on this file system; if only for now, the next call asks.
+            return False
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Say why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

@@ -1,10 +1,10 @@
-"""What a party is called, and what it may say and hear: certificates, private keys, rights.
+"""Certificates, private keys, and what each party may say and hear.
 
-`ca.pem`, `cert.pem` and `key.pem` are read and held against one another before a session is opened,
-because Zenoh's own message for any fault in them is "Unable to connect". ROLES is the table of
-rights, by the common name of the certificate. Zenoh filters only in the process that holds the
-configuration. That is the simulator or router that listens, and each edge runtime for what comes to
-it. A refused message is dropped without a word to its sender.
+`ca.pem`, `cert.pem` and `key.pem` are checked before a session is opened, because Zenoh's own
+message for any fault in them is "Unable to connect". ROLES is the table of rights, by the common
+name of the certificate. Zenoh filters only in the process that holds the configuration: the
+simulator or router that listens, and each edge runtime for what comes to it. A refused message is
+dropped without a word to its sender.
 """
 
 from __future__ import annotations
@@ -51,16 +51,6 @@ class TlsFiles(NamedTuple):
         }
 
 
-def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
-    """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
-    from edge_runtime.transport import check_fits  # Here: `deploy certs` opens no session.
-
-    for endpoint in endpoints:
-        if endpoint is not None:
-            check_fits(endpoint, directory is not None)
-    return None if directory is None else load_tls(directory)
-
-
 def load_tls(directory: PathLike) -> TlsFiles:
     """Check the three files against one another and the clock.
 
@@ -76,7 +66,7 @@ def load_tls(directory: PathLike) -> TlsFiles:
         raise UserError(f"--tls {directory} is no directory; `python -m deploy certs` makes one")
     ca_path, path, key_path = (folder / name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE))
     certificates = {}
-    for each in (ca_path, path):
+    for each in (path, ca_path):
         data = read_bytes(each, "certificate")
         try:
             certificates[each] = x509.load_pem_x509_certificate(data)
@@ -93,16 +83,13 @@ def load_tls(directory: PathLike) -> TlsFiles:
     except (ValueError, TypeError, InvalidSignature):
         raise UserError(f"{path} was not issued by the authority in {CA_FILE} beside it") from None
     now = datetime.datetime.now(datetime.timezone.utc)
-    for each in (path, ca_path):
-        dated = certificates[each]
-        begins, ends = dated.not_valid_before_utc, dated.not_valid_after_utc
-        if now >= ends:
-            raise UserError(f"{each} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
-        if now < begins:
-            raise UserError(
-                f"{each} is valid from {begins:%Y-%m-%d %H:%M} UTC on, and the clock here says"
-                f" {now:%Y-%m-%d %H:%M} UTC; is the clock set?"
-            )
+    for each, dated in certificates.items():
+        if now >= dated.not_valid_after_utc:
+            ended = f"{dated.not_valid_after_utc:%Y-%m-%d %H:%M}"
+            raise UserError(f"{each} expired at {ended} UTC; make a new one")
+        if now < dated.not_valid_before_utc:
+            begins = f"{dated.not_valid_before_utc:%Y-%m-%d %H:%M}"
+            raise UserError(f"{each} is valid from {begins} UTC on; is the clock set?")
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
     paths = (str(ca_path), str(path), str(key_path))
@@ -110,7 +97,7 @@ def load_tls(directory: PathLike) -> TlsFiles:
 
 
 def read_private_key(path: PathLike) -> Any:
-    """A private key of any kind, without a password; UserError where the file holds none."""
+    """Read a private key of any kind, without a password; UserError where the file holds none."""
     from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
@@ -122,7 +109,7 @@ def read_private_key(path: PathLike) -> Any:
 
 
 def read_signing_key(path: PathLike) -> Ed25519PrivateKey:
-    """The Ed25519 key that signs policies and bundles. Raises UserError for anything else."""
+    """Read the Ed25519 key that signs policies and bundles; UserError for anything else."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     if not os.path.exists(path):
@@ -185,70 +172,69 @@ _MESSAGES: Dict[str, Tuple[List[str], List[str]]] = {
 
 
 def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
-    """The name in a certificate: `edge-hunter01`, or `viewer` for a role of all vehicles."""
+    """Name a certificate: `edge-hunter01`, or `viewer` for a role of all vehicles."""
     if ROLES[role].all_vehicles:
         return role
     return f"{role}-{check_vehicle_id(str(vehicle_id))}"
 
 
-def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
-    """Zenoh's `access_control` for a listener: the rights of every party of these vehicles.
-
-    All else is denied: other names, other keys, and `delete` for everybody.
-    """
-    parties: Dict[str, List[Dict[str, Any]]] = {}
-    for vehicle_id in (None, *dict.fromkeys(vehicle_ids)):
-        for role, rights in ROLES.items():
-            if rights.all_vehicles == (vehicle_id is None):
-                parties[common_name(role, vehicle_id)] = _rules(role, vehicle_id)
-    return _access_control(parties)
-
-
-def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
-    """Zenoh's `access_control` for an edge runtime: what its simulator or a router may hand it.
-
-    Without it, the simulator of another vehicle could pose as the one that this edge looks for:
-    its certificate is a server's, too, and of the same authority.
-    """
-    # The same rules as the edge itself applies them: what it may send leaves here.
-    turn = {"ingress": ["egress"], "egress": ["ingress"]}
-    rules = [{**rule, "flows": turn[rule["flows"][0]]} for rule in _rules(EDGE, vehicle_id)]
-    return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
-
-
 def check_name(name: str, *able: str) -> None:
-    """Raise UserError where a certificate's name is not one of those that are able to do this.
+    """Raise UserError where a certificate's name is not one of those that may do this.
 
     Zenoh would not say so: the messages would go nowhere.
     """
     if name not in able:
-        one_vehicles = any(each not in ROLES for each in able)
         raise UserError(
-            f"--tls names the certificate of {name}, and this takes that of {' or '.join(able)};"
-            f" choose another directory{', or another --vehicle-id' if one_vehicles else ''}"
+            f"--tls names the certificate of {name}; name the directory of {' or '.join(able)}"
         )
 
 
-def _rules(role: str, vehicle_id: Optional[str]) -> List[Dict[str, Any]]:
-    """The rows of one party, as its neighbour applies them."""
-    rights, rows = ROLES[role], []
+def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
+    """Make Zenoh's `access_control` for a listener: the rights of every party of these vehicles.
+
+    All else is denied: other names, other keys, and `delete` for everybody.
+    """
+    parties: Dict[str, List[Dict[str, Any]]] = {}
+    for role, rights in ROLES.items():
+        for vehicle_id in (None,) if rights.all_vehicles else vehicle_ids:
+            parties[common_name(role, vehicle_id)] = _rules(rights, vehicle_id)
+    return _access_control(parties)
+
+
+def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
+    """Make Zenoh's `access_control` for an edge runtime: what its listener may hand it.
+
+    Without it, the simulator of another vehicle could pose as the one that this edge looks for:
+    its certificate is a server's, too, and of the same authority.
+    """
+    # The edge's own rules, as it applies them itself: what it may send leaves here.
+    turned = {"ingress": "egress", "egress": "ingress"}
+    rules = [
+        {**rule, "flows": [turned[flow] for flow in rule["flows"]]}
+        for rule in _rules(ROLES[EDGE], vehicle_id)
+    ]
+    return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
+
+
+def _rules(rights: Rights, vehicle_id: Optional[str]) -> List[Dict[str, Any]]:
+    """Make the rules of one party, as its neighbour applies them."""
+    rules = []
     for right, (from_it, to_it) in _MESSAGES.items():
         keys = [f"phil/{vehicle_id or '*'}/{suffix}" for suffix in getattr(rights, right)]
         if keys:
-            rows.append({"messages": from_it, "flows": ["ingress"], "key_exprs": keys})
-            rows.append({"messages": to_it, "flows": ["egress"], "key_exprs": keys})
-    return rows
+            rules.append({"messages": from_it, "flows": ["ingress"], "key_exprs": keys})
+            rules.append({"messages": to_it, "flows": ["egress"], "key_exprs": keys})
+    return rules
 
 
 def _access_control(rules_by_name: Dict[str, List[Dict[str, Any]]]) -> Dict[str, Any]:
     rules, subjects, policies = [], [], []
-    for name, rows in rules_by_name.items():
-        if not rows:
-            continue
-        named = [{"id": f"{name}-{i}", "permission": "allow", **row} for i, row in enumerate(rows)]
-        rules += named
-        subjects.append({"id": name, "cert_common_names": [name]})
-        policies.append({"rules": [row["id"] for row in named], "subjects": [name]})
+    for name, own in rules_by_name.items():
+        if own:
+            ids = [f"{name}-{number}" for number in range(len(own))]
+            rules += [{"id": i, "permission": "allow", **rule} for i, rule in zip(ids, own)]
+            subjects.append({"id": name, "cert_common_names": [name]})
+            policies.append({"rules": ids, "subjects": [name]})
     return {
         "enabled": True,
         "default_permission": "deny",

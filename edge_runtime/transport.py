@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Sequence, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.util import UserError
-
-if TYPE_CHECKING:
-    from edge_runtime.tls import TlsFiles
+from edge_runtime.reach import check_port_is_free, look, why_not_connected
+from edge_runtime.tls import TlsFiles, load_tls
+from edge_runtime.util import PathLike, UserError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 TLS_PROTOCOLS = ("tls", "quic")
@@ -30,7 +29,7 @@ _ENDPOINT = re.compile(r"(tcp|udp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\
 
 
 def check_endpoint(endpoint: str) -> str:
-    """The endpoint itself; UserError if it is not PROTOCOL/HOST:PORT."""
+    """Return the endpoint; UserError if it is not PROTOCOL/HOST:PORT."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 1 <= int(match.group(3)) <= 65535:
         right = f"write it as {DEFAULT_ENDPOINT} (tcp or udp; tls or quic with --tls)"
@@ -39,7 +38,6 @@ def check_endpoint(endpoint: str) -> str:
 
 
 def is_tls(endpoint: str) -> bool:
-    """Whether the endpoint's protocol asks for certificates."""
     return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
 
 
@@ -53,6 +51,14 @@ def check_fits(endpoint: str, with_tls: bool) -> None:
         raise UserError(f"endpoint {endpoint} needs certificates: {where}")
 
 
+def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
+    """Load `--tls DIR`; None without it. UserError where an endpoint does not go with that."""
+    for endpoint in endpoints:
+        if endpoint is not None:
+            check_fits(endpoint, directory is not None)
+    return None if directory is None else load_tls(directory)
+
+
 def open_session(
     listen: Union[str, Sequence[str], None] = None,
     connect: Optional[str] = None,
@@ -62,21 +68,18 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `mode` is "router", "peer" or "client". `tls` is what `tls_for` gave. `access` is Zenoh's
-    `access_control`, of tls.py; a session that listens with TLS must have it.
-    Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
-    link that either end refuses, and, in client mode, nobody there.
+    `mode` is "router", "peer" or "client". `access` is Zenoh's `access_control`, of tls.py; a
+    session that listens with TLS must have it. Raises UserError for a malformed endpoint, one that
+    does not go with `tls`, a busy port, a link that either end refuses, and, in client mode,
+    nobody there.
     """
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
         raise ValueError("a TLS listener needs access control: any certificate could say all")
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
-    if listens:
-        from edge_runtime.reach import check_port_is_free  # Here: most sessions only connect.
-
-        for endpoint in listens:
-            check_port_is_free(endpoint)
+    for endpoint in listens:
+        check_port_is_free(endpoint)
     config = zenoh.Config()
     for name, value in session_rows(listens, connect, mode, tls, access).items():
         config.insert_json5(name, json.dumps(value))
@@ -85,13 +88,9 @@ def open_session(
     except zenoh.ZError as error:
         if connect is None or listens:
             raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
-        from edge_runtime.reach import why_not_connected  # Here: most find a link.
-
         raise UserError(why_not_connected(connect, tls)) from None
     if connect is not None and tls is not None and not session.info.routers_zid():
         # A peer goes on trying for ever, also where it will never be let in: say so now.
-        from edge_runtime.reach import look
-
         answers, why = look(connect, tls)
         if answers and why and not session.info.routers_zid():
             session.close()
@@ -106,7 +105,7 @@ def session_rows(
     tls: Optional[TlsFiles],
     access: Optional[Dict[str, Any]],
 ) -> Dict[str, Any]:
-    """Zenoh's settings of such a session, by their paths, as in `scouting/gossip/enabled`."""
+    """Return Zenoh's settings by their paths, as in `scouting/gossip/enabled`."""
     rows: Dict[str, Any] = {
         "mode": mode,
         # Explicitly none: a peer would otherwise listen on every interface.
@@ -122,7 +121,7 @@ def session_rows(
         "transport/shared_memory/enabled": False,
     }
     if mode == "router":
-        # Its most. At its 2 a recorder that gets no processor for a moment loses commands.
+        # Zenoh's most. At its 2 a recorder that gets no processor for a moment loses commands.
         rows["transport/link/tx/queue/size/real_time"] = 16
     if tls is not None:
         rows["transport/link/tls"] = tls.zenoh_rows()
@@ -134,9 +133,9 @@ def session_rows(
 
 
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
-    """A subscriber's callback that takes only what was put to this very key.
+    """Make a subscriber's callback that drops what was not put to this very key.
 
-    Zenoh gives it whatever intersects: a put to `phil/*/state` comes to every vehicle.
+    Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
     """
 
     def take(sample: zenoh.Sample) -> None:

@@ -1,8 +1,7 @@
 """The wire: its keys, and its messages as MessagePack maps that are validated on arrival.
 
-Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection that
-says why it never reaches the policy. What an observation and an action must be, the policy's
-manifest says (manifest.py). Contract, section 3.
+Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection. The
+policy's manifest says what an observation and an action must be (manifest.py). Contract, section 3.
 """
 
 from __future__ import annotations
@@ -11,14 +10,11 @@ import math
 import re
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, TypeVar, Union
+from typing import Any, Dict, List, NamedTuple, Optional, TypeVar, Union
 
 import msgspec
 
 from edge_runtime.util import UserError
-
-if TYPE_CHECKING:  # It needs the messages' limits, and says what an observation must be.
-    from edge_runtime.manifest import Layout
 
 SCHEMA = 2
 
@@ -34,7 +30,6 @@ MAX_PLAN, MAX_RIDE_S = 10, 1.0  # further actions of a command at most, and for 
 
 DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
-
 TOPICS = (
     "state",  # simulator to edge, once a control period
     "command",  # edge to simulator and vehicle, in answer to it
@@ -49,14 +44,14 @@ _VEHICLE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def check_vehicle_id(vehicle_id: str) -> str:
-    """The id itself; UserError if it could not be part of a key."""
+    """Return the id; UserError if it could not be part of a key."""
     if not _VEHICLE_ID.fullmatch(vehicle_id):
         raise UserError(f"vehicle id {vehicle_id!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ -")
     return vehicle_id
 
 
 def key(vehicle_id: str, topic: str) -> str:
-    """The Zenoh key of one of TOPICS, as in `phil/hunter01/state`."""
+    """Return the Zenoh key of one of TOPICS, as in `phil/hunter01/state`."""
     assert topic in TOPICS, topic
     return f"phil/{check_vehicle_id(vehicle_id)}/{topic}"
 
@@ -84,11 +79,11 @@ class Rejection(NamedTuple):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `observation`: each array's bytes, in C order.
+    """What the simulator sees at one step. `observation` holds each array's bytes, in C order.
 
-    `speed_mps` is None where the environment has none. `task` is what the environment is for, as
-    `manifest.Task.text` says it; left out where unknown. `heard` counts the commands that came, no
-    copies; the last is stamped `heard_sent_ns`, and came at `heard_ns` by the sender's clock.
+    `speed_mps` is None where the environment has none. `task` is `manifest.Task.text`, left out
+    where unknown. `heard` counts the commands that came, without copies; the last is stamped
+    `heard_sent_ns`, and came at `heard_ns` by the sender's clock.
     """
 
     session: str
@@ -130,10 +125,10 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
 class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     """What the vehicle does. `action` is what the actuators have reached, not what was asked.
 
-    `episode` and `step` are those of the last command taken (-1 before the first one).
-    `speed_mps` and `commanded_speed_mps` (what a vehicle that takes a speed is asked for now) are
-    the vehicle's own; `scenario_speed_mps` is the speed of the scenario's car by the similarity.
-    These two and `battery_v` are None where the driver does not know them.
+    `episode` and `step` are those of the last command taken (-1 before the first one). `speed_mps`
+    is the vehicle's own, and so is `commanded_speed_mps`, which a vehicle that takes a speed is
+    asked for now. `scenario_speed_mps` is that of the scenario's car by the similarity. What the
+    driver does not know is None.
     """
 
     vehicle: str
@@ -153,14 +148,14 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
-    """How the edge runtime is, twice a second.
+    """The state of the edge runtime, twice a second.
 
     `inference_ms` and `command_ms` (from a state's arrival to its command's sending) hold p50,
     p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
-    a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
-    this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
-    `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
-    a re-arm; empty if nothing. `link` is `LinkQuality.measured`.
+    a newer one replaced before the policy took them, `rivals` other runtimes with this vehicle id.
+    `temperature_c` is the board's hottest sensor, None where it has none. `vehicle_fault` says in
+    words what is wrong with the vehicle, or what has stopped it and waits for a re-arm. `link` is
+    `LinkQuality.measured`.
     """
 
     vehicle_id: str
@@ -191,46 +186,37 @@ Message = Union[State, Command, Feedback, Health]
 
 
 class Versioned(msgspec.Struct):
-    """What every version of a message has."""
+    """The field of every version of every message."""
 
     schema: int
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
-_VERSIONED = msgspec.msgpack.Decoder(Versioned)
 _DECODERS: Dict[Any, Any] = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
+    kind: msgspec.msgpack.Decoder(kind) for kind in (Versioned, State, Command, Feedback, Health)
 }
 _ENCODER = msgspec.msgpack.Encoder()
-# What a hostile payload makes msgspec raise: bad bytes, bad UTF-8, nesting, absurd lengths.
+# A hostile payload makes msgspec raise these: bad bytes, bad UTF-8, nesting, absurd lengths.
 _DECODE_ERRORS = (msgspec.MsgspecError, ValueError, RecursionError, MemoryError, OverflowError)
 
 
 def encode(message: Message) -> bytes:
-    """The MessagePack map of a message. Nothing is checked here: the receiver does that."""
+    """Encode a message as a MessagePack map. Nothing is checked here: the receiver does that."""
     return _ENCODER.encode(message)
 
 
-def decode_state(payload: bytes, layout: Optional[Layout] = None) -> Union[State, Rejection]:
-    """A State with finite numbers, whose observation fits the layout, or why not.
-
-    Without a layout any observation is taken. A state that names another task is handed on as it
-    is, so that its sender can be told; the policy must not see it.
-    """
-    limit = layout.max_payload_bytes if layout is not None else MAX_STATE_BYTES
-    state = _decode(payload, State, limit)
-    if layout is None or isinstance(state, Rejection) or is_foreign(state, layout.task_text):
-        return state
-    return layout.refusal(state.observation) or state
+def decode_state(payload: bytes, max_bytes: int = MAX_STATE_BYTES) -> Union[State, Rejection]:
+    """Decode a State with finite numbers and any observation (`Layout.decode` checks that)."""
+    return _decode(payload, State, max_bytes)
 
 
 def is_foreign(state: State, task: str) -> bool:
-    """Whether a state says that it is of another task than this; both as `manifest.Task.text`."""
+    """Return whether a state names another task than this; both as `manifest.Task.text`."""
     return state.task not in (msgspec.UNSET, task)
 
 
 def decode_command(payload: bytes) -> Union[Command, Rejection]:
-    """A Command of a known mode, finite, or why not.
+    """Decode a Command of a known mode with finite numbers.
 
     To drive takes at least one action, and a plan of as many. A stop needs none, and has no plan.
     """
@@ -257,7 +243,7 @@ def _decode(
         return Rejection(Reason.OVERSIZED, detail)
     try:
         # The schema first: another schema's fields need not fit, and that is no malformed message.
-        schema = _VERSIONED.decode(payload).schema
+        schema = _DECODERS[Versioned].decode(payload).schema
         if schema != SCHEMA:
             return Rejection(Reason.SCHEMA, f"schema {schema}, this side speaks {SCHEMA}")
         message: _M = _DECODERS[kind].decode(payload)
@@ -273,12 +259,12 @@ def _decode(
 
 decode_feedback = partial(_decode, kind=Feedback)
 decode_health = partial(_decode, kind=Health)
-"""A Feedback or a Health with finite numbers, or why not."""
+"""Decode a Feedback or a Health with finite numbers."""
 
 
 def _refusal(name: str, value: Any, least: int) -> Optional[Rejection]:
-    """None for finite floats, short texts and no counts below `least`, also in maps and lists."""
-    kind = type(value)  # much quicker than isinstance, and each state comes by here
+    """Refuse floats that are not finite, long texts and counts below `least`, also inside."""
+    kind = type(value)  # much quicker than isinstance, and every state passes here
     if kind is int and value < least:
         return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
     if kind is float and not math.isfinite(value):

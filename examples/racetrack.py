@@ -1,4 +1,4 @@
-"""A scripted human for highway-env's racetrack: keeps to the middle of a lane, and passes cars.
+"""A scripted human for highway-env's racetrack: it keeps to a lane's middle and passes cars.
 
 In a clone: ``python -m trainer train --scenario racetrack-v0 --human
 examples.racetrack:RacetrackExpert --out runs/race``
@@ -17,14 +17,14 @@ class RacetrackExpert:
 
     AHEAD_S, CENTRE_PER_S, HEADING_PER_S, TOWARDS = 0.2, 1.0, 3.0, 0.35
     OFFSET_M, HEADING_RAD, ROOM_M = 1.6, 0.5, 17.0
-    """Where a policy is stopped: off the middle, across the lane, behind a car that it can see
-    (18 m ahead, no further)."""
+    """The policy's limits: offset from the middle, angle to the lane, distance to a car ahead, of
+    which it sees 18 m."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
 
     def act(self) -> np.ndarray:
-        """The steering, in [-1, 1]."""
+        """Return the steering, in [-1, 1]."""
         car, lane = self.env.vehicle, self._lane()
         along_m, aside_m = lane.local_coordinates(car.position)
         speed_mps = max(car.speed, 1.0)
@@ -36,7 +36,7 @@ class RacetrackExpert:
         return np.clip([angle_rad / FULL_STEERING_RAD], -1.0, 1.0)
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Why it takes over; only from a policy that does something else."""
+        """Return why it takes over, or None where the policy steers as it would."""
         if abs(float(policy_action[0]) - float(self.act()[0])) < 0.2:
             return None
         car, lane = self.env.vehicle, self._lane()
@@ -48,7 +48,7 @@ class RacetrackExpert:
         return "offset" if abs(aside_m) > self.OFFSET_M else None
 
     def _lane(self) -> Any:
-        """The car's lane, or one beside it that is free where this one is not."""
+        """Return the car's lane, or a free lane beside it if the car's is not free."""
         car, network = self.env.vehicle, self.env.road.network
         lanes = [car.lane_index, *network.side_lanes(car.lane_index)]
         free = [index for index in lanes if self._is_free(network.get_lane(index))]

@@ -1,9 +1,9 @@
-"""A policy of Stable-Baselines3: trained, and exported as the ONNX that `deploy policy` takes.
+"""Train a policy of Stable-Baselines3 and export it as the ONNX that `deploy policy` takes.
 
     python examples/sb3_policy.py Pendulum-v1 --steps 6000 --out td3.onnx
 
-What such a file must hold stands in `Exported`: all that happens to an observation before the
-network, and the way from the network's -1 to 1 to the environment's own range.
+The exported graph (`Exported`) holds all preprocessing of an observation, and scales the network's
+-1 to 1 to the environment's own range.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import torch
 from stable_baselines3 import SAC, TD3, HerReplayBuffer
 from torch import Tensor
 
-OPSET = 17  # The oldest onnxruntime that a board may have reads it.
+OPSET = 17  # Readable by the oldest onnxruntime that a board may have
 
 
 class Exported(torch.nn.Module):
@@ -35,7 +35,7 @@ class Exported(torch.nn.Module):
         self.register_buffer("range", torch.tensor(done.high - done.low))
 
     def forward(self, *arrays: Tensor) -> Tensor:
-        """The action, float32 [batch, n]."""
+        """Return the action, float32 [batch, n]."""
         seen: Any = dict(zip(self.names, arrays, strict=True)) if self.names else arrays[0]
         if self.is_image:
             seen = seen.permute(0, 3, 1, 2)  # the library sees channels first
@@ -48,12 +48,12 @@ class Exported(torch.nn.Module):
 
 
 def is_image(space: gymnasium.Space[Any]) -> bool:
-    """Whether a space is of pictures, height first and colours last."""
+    """Return whether a space holds pictures, height first and colours last."""
     return space.dtype == "uint8" and len(space.shape or ()) == 3
 
 
 def train(name: str, algorithm: str, steps: int, seed: int) -> Any:
-    """A model trained for that many steps; with a goal in the observation, by hindsight."""
+    """Train a model; with hindsight if the observation holds a goal."""
     environment = gymnasium.make(name)
     options: dict[str, Any] = {"policy": "MlpPolicy", "learning_rate": 1e-3, "seed": seed}
     if isinstance(environment.observation_space, gymnasium.spaces.Dict):
@@ -66,7 +66,7 @@ def train(name: str, algorithm: str, steps: int, seed: int) -> Any:
 
 
 def export(model: Any, out: str) -> None:
-    """Write the actor; its inputs are named after the entries of a Dict."""
+    """Write the actor as ONNX, with inputs named after the entries of a Dict."""
     environment = model.get_env().envs[0].unwrapped
     network, seen = Exported(model.actor.eval(), environment), environment.observation_space
     boxes = [seen[name] for name in network.names] or [seen]

@@ -1,4 +1,4 @@
-"""Two tasks of others as the experiment on human guidance drives them: with an end and a goal.
+"""Two environments of other packages with an end and a goal, for the experiment on guidance.
 
 In a clone: ``python -m trainer train --scenario examples.tasks:examples/Hill-v0 --human
 examples.tasks:HillExpert --out runs/hill``
@@ -19,7 +19,7 @@ class Racetrack(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(gymnasium.make("racetrack-v0", **options))
 
     def step(self, action: Any) -> Any:
-        """One control period, with the word on success."""
+        """Drive for one control period and report success."""
         *seen, info = self.env.step(action)
         car: Any = self.env.unwrapped
         well = not car.vehicle.crashed and car.vehicle.on_road
@@ -36,7 +36,7 @@ class Hill(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(gymnasium.make("MountainCarContinuous-v0", **options))
 
     def step(self, action: Any) -> Any:
-        """One control period, with the word on success."""
+        """Drive for one control period and report success."""
         seen, reward, terminated, *rest, info = self.env.step(action)
         return seen, 0.1 * float(reward), terminated, *rest, {**info, "is_success": terminated}
 
@@ -54,11 +54,11 @@ class HillExpert:
         self.against = 0
 
     def act(self) -> np.ndarray:
-        """The push, in [-1, 1]."""
+        """Return the push, in [-1, 1]."""
         return np.array([1.0 if self.env.state[1] >= 0.0 else -1.0])
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Why it takes over."""
+        """Return why it takes over, or None."""
         wasted = float(policy_action[0]) * float(self.act()[0]) < 0.3
         self.against = self.against + 1 if wasted else 0
         return "wasted" if self.against > self.PATIENCE else None

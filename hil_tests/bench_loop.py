@@ -13,8 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -33,19 +32,15 @@ from edge_runtime.files import write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
-from hil_tests.processes import POLICY, PUBLIC_KEY, CommandTimeoutError, Process, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.testing.messages import make_state
 from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
-PICTURES = 64
-PERIOD_S = 0.004
-STARTS = 5
-IDLE_S = 10.0
-WARM_UP = 200
-MEMORY_SAMPLES = 10
-QUANTILES = (50, 90, 99)
-RESAMPLES, INTERVAL = 2000, (2.5, 97.5)
+PERIOD_S, WARM_UP, PICTURES = 0.004, 200, 64
+STARTS, IDLE_S, MEMORY_SAMPLES = 5, 10.0, 10
+ROUSE_EVERY_S, LAST_ANSWER_S = 0.02, 0.2
+QUANTILES, RESAMPLES, INTERVAL = (50, 90, 99), 2000, (2.5, 97.5)
 RATIO_BAR = 1.25  # At most as many times the floor
 BARS = (
     ("memory after the last step, MB", "memory_mb", 110.0),
@@ -54,20 +49,17 @@ BARS = (
     (f"process start to first command, s (median of {STARTS})", "first_command_s", 1.5),
 )
 """What is measured of the runtime's process, its name in the report, and its bar: below that."""
-_ROUSE_EVERY_S = 0.02
-_ANSWER_S, _LAST_ANSWER_S = 5.0, 0.2
 EXAMPLE = examples("python -m hil_tests bench --blocks 5 --out runs/loop.json")
 HEAD = ("", "ours", "floor", "ratio", "bar")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
     parser.add_argument("--policy", default=str(POLICY), help="policy file")
     parser.add_argument("--public-key", default=str(PUBLIC_KEY), help="of the policy's signature")
     for name, default, text in (
-        ("--blocks", 20, "of each contender"),
-        ("--states", 500, "in each block"),
-        ("--steps", 100_000, "of the memory's run"),
+        ("--blocks", 20, "blocks of each contender"),
+        ("--states", 500, "states in each block"),
+        ("--steps", 100_000, "steps of the memory's run"),
     ):
         parser.add_argument(name, type=positive, default=default, help=text)
     add_options(parser, "--out")
@@ -76,15 +68,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print the table, and write the JSON. Bars are shown, never enforced."""
     load_policy(arguments.policy, arguments.public_key)
-    machine: dict[str, Any] = {"processor": processor_model(), "cores": os.cpu_count()}
-    machine["load_before"] = os.getloadavg()[0]
-    report = {"machine": machine, "source_revision": source_revision(), **_measure(arguments)}
-    machine["load_after"] = os.getloadavg()[0]
+    machine = {"processor": processor_model(), "cores": os.cpu_count()}
+    load = {"load_before": os.getloadavg()[0]}
+    measured = _measure(arguments)
+    load["load_after"] = os.getloadavg()[0]
+    report = {"machine": {**machine, **load}, "source_revision": source_revision(), **measured}
     write_json_out(arguments.out, report)
-    print(
-        f"\n{machine['processor']}, {machine['cores']} cores, load {machine['load_before']:.1f} "
-        f"before and {machine['load_after']:.1f} after\n"
-    )
+    print(f"\n{', '.join(f'{name} {value}' for name, value in report['machine'].items())}\n")
     print("\n".join(markdown_table(HEAD, rows(report))))
     return 0
 
@@ -119,16 +109,15 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "memory_samples_mb": memory_mb, "memory_mb": memory_mb[-1],
         "grown_mb": memory_mb[-1] - memory_mb[1],
     }  # fmt: skip
-    return {"latency": latency, "process": process, "modes": dict(ours.modes)}
+    return {"latency": latency, "process": process}
 
 
 class Contender:
-    """Sends states to a process. A block of them is an episode."""
+    """Sends states to a process and notes when each was answered. A block is an episode."""
 
     def __init__(self, session: zenoh.Session, vehicle_id: str, stack: ExitStack) -> None:
         self.vehicle_id = vehicle_id
-        self.arrivals: dict[int, float] = {}  # when the answer to each step came
-        self.modes: Counter[str] = Counter()  # how many answers had each
+        self.arrivals: dict[int, float] = {}  # Step -> when its answer came (perf_counter, s)
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, 2, 45, 80)
         self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
@@ -136,61 +125,54 @@ class Contender:
         publisher = session.declare_publisher(
             wire.key(vehicle_id, "state"), congestion_control=zenoh.CongestionControl.DROP
         )
-        self.put: Callable[[bytes], None] = stack.enter_context(publisher).put
+        self._put = stack.enter_context(publisher).put
         commands = wire.key(vehicle_id, "command")
         stack.enter_context(session.declare_subscriber(commands, self._on_command))
 
-    def prepare(self, final: bool = False) -> tuple[int, bytes]:
-        """The next step and its state."""
+    def send(self, final: bool = False) -> tuple[int, float]:
+        """Send the next state; return its step and when it was sent (perf_counter, s)."""
         self._step += 1
-        frames = self._pictures[self._step % PICTURES]
         state = make_state(
-            self._step,
-            session="bench",
-            episode=self._episode,
-            observation={"frames": frames},
-            final=final,
-        )
-        return self._step, wire.encode(state)
+            self._step, session="bench", episode=self._episode, final=final,
+            observation={"frames": self._pictures[self._step % PICTURES]},
+        )  # fmt: skip
+        payload = wire.encode(state)
+        sent_s = time.perf_counter()
+        self._put(payload)
+        return self._step, sent_s
 
     def end_block(self) -> None:
-        """A final state: the edge runtime stands by while the other process works."""
-        self.put(self.prepare(final=True)[1])
+        """Send a final state: the edge runtime stands by while the other process works."""
+        self.send(final=True)
         self._episode += 1
 
     def rouse(self) -> float:
-        """Send states until the first answer comes; when that came (perf_counter, s)."""
+        """Send states until the first answer comes; return when it came (perf_counter, s)."""
         self.arrivals.clear()
 
         def is_answered() -> bool:
-            self.put(self.prepare()[1])
-            time.sleep(_ROUSE_EVERY_S)
+            self.send()
+            time.sleep(ROUSE_EVERY_S)
             return bool(self.arrivals)
 
         wait_until(is_answered, f"{self.vehicle_id} answers")
         return min(self.arrivals.values())
 
-    def ask(self) -> float:
-        """Send one state and wait for its answer: how long it took, s; TimeoutError."""
-        step, payload = self.prepare()
-        begun_s = time.perf_counter()
-        self.put(payload)
-        while step not in self.arrivals:
-            if time.perf_counter() > begun_s + _ANSWER_S:
-                raise CommandTimeoutError(f"{self.vehicle_id} does not answer step {step}")
-            time.sleep(0.0001)
-        return self.arrivals[step] - begun_s
+    def ask(self) -> None:
+        """Send a state and wait for its answer."""
+        step, _ = self.send()
+        what = f"the answer of {self.vehicle_id} to step {step}"
+        wait_until(lambda: step in self.arrivals, what, poll_s=0.0001)
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         arrived_s = time.perf_counter()
         command = wire.decode_command(bytes(sample.payload))
         assert isinstance(command, wire.Command), command
-        self.modes[command.mode] += 1
         self.arrivals.setdefault(command.step, arrived_s)
 
 
 def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
-    """Blocks alternate, and so does who begins a pair; the first pair is a warm-up."""
+    """Ask both in blocks by turns; who begins a pair changes, and the first pair is a warm-up."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
     with ProgressBar("pairs of blocks", blocks + 1) as bar:
         for number in range(blocks + 1):
@@ -209,27 +191,25 @@ def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dic
 
 
 def block_ms(contender: Contender, count: int) -> np.ndarray:
-    """The latencies of a block's answers, ms; states without an answer are missing."""
+    """Return the latencies of a block's answers, ms; states without an answer are missing."""
     contender.arrivals.clear()
     sent: dict[int, float] = {}
     next_s = time.perf_counter()
     for _ in range(count):
-        step, payload = contender.prepare()
         next_s = max(next_s + PERIOD_S, time.perf_counter())
         time.sleep(max(0.0, next_s - time.perf_counter()))
-        sent[step] = time.perf_counter()
-        contender.put(payload)
-    time.sleep(_LAST_ANSWER_S)
+        step, sent[step] = contender.send()
+    time.sleep(LAST_ANSWER_S)
     arrivals = dict(contender.arrivals)
     contender.end_block()
     return np.array([(arrivals[s] - at_s) * 1e3 for s, at_s in sent.items() if s in arrivals])
 
 
 def compare(ours: Sequence[np.ndarray], floor: Sequence[np.ndarray]) -> dict[str, Any]:
-    """For each quantile: ours, the floor's, their ratio over all blocks, and its 95 % interval.
+    """For each quantile return ours, the floor's, their ratio over all blocks, its 95 % interval.
 
-    Both are the latencies of each block, in any unit, block by block side by side: blocks are
-    resampled in pairs (bootstrap), for neighbours in time share the machine's noise.
+    Both are the latencies of each block, block by block side by side: blocks are resampled in pairs
+    (bootstrap), for neighbours in time share the machine's noise.
     """
 
     def quantiles(draw: Sequence[int] | np.ndarray) -> np.ndarray:  # [ours and floor, quantiles]
@@ -247,7 +227,7 @@ def compare(ours: Sequence[np.ndarray], floor: Sequence[np.ndarray]) -> dict[str
 
 
 def memory(process: Process, contender: Contender, steps: int) -> list[float]:
-    """Resident memory, MB, at the start and after each tenth of ``steps`` answers, one by one."""
+    """Return the resident memory, MB, at the start and after each tenth of ``steps`` answers."""
     samples = [process.resident_mb()]
     for tenth in range(MEMORY_SAMPLES):
         contender.arrivals.clear()
@@ -258,7 +238,7 @@ def memory(process: Process, contender: Contender, steps: int) -> list[float]:
 
 
 def idle_load(pid: int) -> float:
-    """The part of a core that the process uses while nobody sends anything."""
+    """Return the part of a core that the process uses while nobody sends anything."""
     begin, begun_s = _cpu_s(pid), time.perf_counter()
     time.sleep(IDLE_S)
     return (_cpu_s(pid) - begin) / (time.perf_counter() - begun_s)
@@ -270,16 +250,13 @@ def _cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str, str]]:
-    """The rows of what was measured, with their bars."""
+def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of what was measured, with their bars."""
     for name, row in report["latency"]["latency_ms"].items():
         low, high = row["interval"]
-        ratio, bar = row["ratio"], f"≤ {RATIO_BAR:g} times"
-        yield (
-            f"state sent to command received, {name}, ms", f"{row['ours']:.3f}",
-            f"{row['floor']:.3f}", f"{ratio:.2f} [{low:.2f}, {high:.2f}]",
-            _bar(bar, ratio <= RATIO_BAR),
-        )  # fmt: skip
+        ratio, bar = row["ratio"], _bar(f"≤ {RATIO_BAR:g} times", row["ratio"] <= RATIO_BAR)
+        both = f"{row['ours']:.3f}", f"{row['floor']:.3f}", f"{ratio:.2f} [{low:.2f}, {high:.2f}]"
+        yield f"state sent to command received, {name}, ms", *both, bar
     for what, name, most in BARS:
         value = report["process"][name]
         yield what, f"{value:.3g}", "", "", _bar(f"< {most:g}", value < most)
@@ -290,9 +267,9 @@ def _bar(bar: str, met: bool) -> str:
 
 
 def answer(policy: str, connect: str) -> None:
-    """The floor: answer states until SIGTERM by a Zenoh callback, onnxruntime and a put.
+    """Be the floor: answer states until SIGTERM by a Zenoh callback, onnxruntime and a put.
 
-    No validation, no watchdog, no limits: what the edge runtime costs is measured against this.
+    No validation, no watchdog, no limits: the edge runtime's cost is measured against this.
     """
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())

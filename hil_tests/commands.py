@@ -1,14 +1,11 @@
-"""Those commands of ``python -m hil_tests`` whose work loads torch: their options, and its place.
-
-That takes seconds; ``--help`` need not wait for it.
-"""
+"""Options of the commands whose work loads torch: --help need not wait for it."""
 
 import argparse
 
-from bridge.environments import CONDITIONS, NOMINAL
+from bridge.environments import NOMINAL
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
-from trainer.environments import CONDITIONS as TEST_CONDITIONS
+from trainer.environments import CONDITIONS
 from trainer.options import add_scenario
 
 
@@ -18,27 +15,22 @@ from trainer.options import add_scenario
     "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
 )
 def campaign(parser: argparse.ArgumentParser) -> None:
-    out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
-    parser.add_argument("--out", required=True, metavar="R.json", help=out)
-    default = "policy file (default: results/policies/SCENARIO.onnx)"
-    parser.add_argument("--policy", metavar="P.onnx", help=default)
+    add = parser.add_argument
+    out = "report as JSON; R.md and a picture go beside it"
+    add("--out", required=True, metavar="R.json", help=out)
+    add("--policy", metavar="P.onnx", help="policy file (default: results/policies/SCENARIO.onnx)")
     add_public_key(parser)
     add_scenario(parser)
-    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    for name, kind, value, text in (
-        ("--runs", cli.whole_number(2), 100, "episodes of each row, the same seeds"),
-        ("--seed", cli.not_negative, 0, "of the first episode"),
-        ("--target", cli.share, 0.98, "success that is asked for"),
-    ):
-        parser.add_argument(name, type=kind, default=value, help=text)
-    only = "one part (default: both)"
-    parser.add_argument("--only", choices=("latency", "faults"), help=only)
-    jobs = "drives or faults side by side; 0: one a core"
-    parser.add_argument("--jobs", type=cli.not_negative, default=0, help=jobs)
-    rows = "only these latency axes and faults, by name or pattern (delay, hunter_*); a wrong one "
-    rows += "lists them"
-    parser.add_argument("--rows", metavar="NAME,...", help=rows)
-    parser.add_argument("--tries", type=cli.positive, default=10, help="of each fault")
+    add("--condition", choices=CONDITIONS, default=NOMINAL, help="condition of the scene")
+    add("--runs", type=cli.whole_number(2), default=100, help="episodes on each network")
+    add("--seed", type=cli.not_negative, default=0, help="seed of the first episode")
+    add("--target", type=cli.share, default=0.98, help="share of successes that is asked for")
+    add("--only", choices=("latency", "faults"), help="run one part (default: both)")
+    jobs = "drives or faults at the same time; 0: one a core"
+    add("--jobs", type=cli.not_negative, default=0, help=jobs)
+    rows = "run only these networks and faults, by name or pattern (delay, hunter_*); an unknown"
+    add("--rows", metavar="NAME,...", help=f"{rows} name lists all")
+    add("--tries", type=cli.positive, default=10, help="tries of each fault")
 
 
 @command(
@@ -49,16 +41,15 @@ def campaign(parser: argparse.ArgumentParser) -> None:
 def envelope(parser: argparse.ArgumentParser) -> None:
     inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
     add, count = parser.add_argument, cli.not_negative
-    add("--out", required=True, metavar="F.json", type="path", help="what is found")
-    add("--policy", metavar="P.onnx", help="(default: results/policies/ENV.onnx)")
+    add("--out", required=True, metavar="F.json", type="path", help="the envelope, as JSON")
+    add("--policy", metavar="P.onnx", help="policy file (default: results/policies/ENV.onnx)")
     add_public_key(parser)
     add("--env", help="scenario, gymnasium id or module:id (default: the file's, else left_turn)")
-    add("--condition", choices=TEST_CONDITIONS, default="nominal", help="of the scene")
-    add("--promise", type=inner, default=0.95, help="share of successes")
-    add("--confidence", type=inner, default=0.95, help="of each axis's limit")
-    add("--seed", type=count, default=0, help="of the first drive")
+    add("--condition", choices=CONDITIONS, default=NOMINAL, help="condition of the scene")
+    add("--promise", type=inner, default=0.95, help="share of successes to be kept")
+    add("--confidence", type=inner, default=0.95, help="confidence of each axis's limit")
+    add("--seed", type=count, default=0, help="seed of the first drive")
     add("--jobs", type=count, default=0, help="processes that drive; 0: one a core")
-    confirms = "drive just inside and outside of this file's edges, with fresh seeds; scene and "
-    confirms += "promise are the file's"
-    add("--confirm", metavar="F.json", type="path", help=confirms)
-    add("--runs", type=cli.positive, default=500, help="drives that confirm a network")
+    confirms = "drive both sides of each edge in this file with fresh seeds; scene and promise are"
+    add("--confirm", metavar="F.json", type="path", help=f"{confirms} the file's")
+    add("--runs", type=cli.positive, default=500, help="drives to confirm a network")

@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from edge_runtime import log
@@ -29,7 +31,9 @@ MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
 HANG_S = 10.0  # A call that takes so long does not come back
-LOOKS_EVERY_S = 0.2
+CAR = Car(
+    throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.5, wheelbase_m=5.0
+)
 EXAMPLE = examples(
     "python -m hil_tests conformance --vehicle mock",
     "python -m hil_tests conformance --vehicle my_vehicle:Rover --config edge.toml",
@@ -37,7 +41,6 @@ EXAMPLE = examples(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     add("--vehicle", metavar="NAME|MODULE:CLASS", help="the driver (default: that of --config)")
     add("--config", metavar="FILE.toml", help="its settings, as for `edge_runtime run`")
@@ -47,58 +50,48 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a table of all rules; 0 where the driver keeps them, 1 where it breaks one."""
+    """Print a line for each rule; return 0 where the driver keeps all, 1 where it breaks one."""
     flags = {"policy": "any", "vehicle": arguments.vehicle}
     config = load_config(arguments.config, flags, opens_link=False)
     if config.vehicle == NONE:
         raise UserError("no vehicle to try: name it with --vehicle")
     log.configure("error")
-    actions = [Action(name=name, low=-1.0, high=1.0) for name in ("pedal", "steering")]
-    car = Car(
-        throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.5, wheelbase_m=5.0
-    )
     manifest = Manifest(
-        task="conformance", observation={"frames": Entry(dtype="uint8", shape=[1])}, car=car,
-        action=actions, control_period_s=arguments.period_s, algorithm="", training={}, created="",
+        task="conformance", observation={"frames": Entry(dtype="uint8", shape=[1])}, car=CAR,
+        action=[Action(name=name, low=-1.0, high=1.0) for name in ("pedal", "steering")],
+        control_period_s=arguments.period_s, algorithm="", training={}, created="",
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
     bench = Bench(vehicle, arguments.period_s)
-    judge = threading.Thread(target=_judge, args=(bench,), daemon=True)
-    judge.start()
     try:
-        while judge.is_alive() and bench.calls_for_s <= HANG_S:
-            judge.join(LOOKS_EVERY_S)
-        if judge.is_alive():
-            bench.is_over = True
-            bench.say(f"{bench.called}() has not come back after {HANG_S:g} s")
+        verdicts = judge(bench)
     finally:
-        bench.is_over = True  # After ^C nothing may be asked of it once it is closed.
-        judge.join(CALL_S if bench.calls_for_s > HANG_S else HANG_S)
         with contextlib.suppress(Exception):  # The last rule closes it, where it came so far.
-            if not judge.is_alive():
-                bench.vehicle.close()
+            bench.call("close")
         log.close()
-    kept, untried = bench.verdicts.count(""), len(RULES) - len(bench.verdicts)
+    kept, untried = sum(verdicts), len(RULES) - len(verdicts)
     rest = f", {untried} not tried" if untried else ""
-    print(f"{bench.vehicle.name}: {kept} rules kept, {len(bench.verdicts) - kept} broken{rest}")
+    print(f"{vehicle.name}: {kept} rules kept, {len(verdicts) - kept} broken{rest}")
     return 0 if kept == len(RULES) else BROKEN
 
 
-def _judge(bench: Bench) -> None:
-    """Say what is wrong by each rule, in their order."""
-    for is_kept in RULES.values():
+def judge(bench: Bench) -> list[bool]:
+    """Try the rules in their order until a call hangs; return of each whether it is kept."""
+    verdicts: list[bool] = []
+    for rule, is_kept in RULES.items():
         try:
-            words = "" if is_kept(bench) else _in_words(bench.last)
+            wrong = "" if is_kept(bench) else _in_words(bench.last)
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
-            words = f"{type(error).__name__}: {error}"
-        if bench.is_over:
-            return
-        bench.say(words)
+            wrong = str(error) if bench.hangs else f"{type(error).__name__}: {error}"
+        print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
+        verdicts.append(not wrong)
+        if bench.hangs:
+            break
+    return verdicts
 
 
 def _in_words(report: VehicleReport | None) -> str:
-    """The last report, for a person."""
     if report is None:
         return "it has not reported yet"
     values = {**report.action, "speed_mps": report.speed_mps}
@@ -108,43 +101,50 @@ def _in_words(report: VehicleReport | None) -> str:
 
 
 class Bench:
-    """A driver, whose calls are timed and whose reports are looked at."""
+    """Calls a driver from one thread, as the runtime does, times the calls and keeps its reports.
+
+    A call that takes HANG_S is a TimeoutError, and so is every call after it.
+    """
 
     def __init__(self, vehicle: Vehicle, period_s: float) -> None:
         self.vehicle, self.period_s, self.pause_s = vehicle, period_s, min(period_s / 4, 0.02)
         vehicle.control_period_s = period_s
         self.go = {name: limit.high for name, limit in vehicle.limits.items()}
-        self.longest_s, self.well_formed = 0.0, True
+        self.longest_s, self.well_formed, self.hangs = 0.0, True, False
         self.last: VehicleReport | None = None
-        self.called, self._called_s = "", math.inf  # The call under way, and since when
-        self.verdicts: list[str] = []  # What is wrong by each rule that was tried; empty: nothing
-        self.is_over = False
-
-    def say(self, words: str) -> None:
-        """Note and print what is wrong by the next rule; empty: nothing."""
-        rule = list(RULES)[len(self.verdicts)]
-        self.verdicts.append(words)
-        print(f"broken  {rule}: {printable(words)}" if words else f"kept    {rule}", flush=True)
-
-    @property
-    def calls_for_s(self) -> float:
-        """How long the call under way has taken; -inf where there is none."""
-        return time.monotonic() - self._called_s
+        self._asked: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
+        threading.Thread(target=self._work, daemon=True).start()
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
-        """Call the driver as the runtime does: with the time, and with a command's speed."""
-        if self.is_over:
-            raise InterruptedError
-        self.called, self._called_s = name, time.monotonic()
-        more = {"command": (self._called_s, None), "close": ()}.get(name, (self._called_s,))
+        """Call the driver with the time, and with a command's speed."""
+        if self.hangs:
+            raise TimeoutError
+        now_s = time.monotonic()
+        more = {"command": (now_s, None), "close": ()}.get(name, (now_s,))
+        self._asked.put(partial(getattr(self.vehicle, name), *arguments, *more, **options))
         try:
-            return getattr(self.vehicle, name)(*arguments, *more, **options)
-        finally:
-            self.longest_s = max(self.longest_s, self.calls_for_s)
-            self._called_s = math.inf
+            answer, error = self._answers.get(timeout=HANG_S)
+        except queue.Empty:
+            self.hangs = True
+            raise TimeoutError(f"{name}() has not come back after {HANG_S:g} s") from None
+        if error is not None:
+            raise error
+        return answer
+
+    def _work(self) -> None:
+        while True:
+            do, answer, failure = self._asked.get(), None, None
+            begun_s = time.monotonic()
+            try:
+                answer = do()
+            except BaseException as error:
+                failure = error
+            self.longest_s = max(self.longest_s, time.monotonic() - begun_s)
+            self._answers.put((answer, failure))
 
     def report(self, after_s: float = 0.0) -> VehicleReport:
-        """What it says of itself, after a time in which it is asked for nothing else."""
+        """Return its report, after a time in which it is asked for nothing else."""
         end_s = time.monotonic() + after_s
         while time.monotonic() < end_s:
             self.call("feedback")
@@ -156,7 +156,7 @@ class Bench:
         return report
 
     def until(self, moves: bool, limit_s: float | None = None, commands: bool = False) -> bool:
-        """Whether it comes to move, or to stand; meanwhile it is told to go each T, or nothing."""
+        """Return whether it comes to move, or to stand; ``commands``: told to go each T."""
         end_s = time.monotonic() + (PATIENCE_S if limit_s is None else limit_s)
         next_s = -math.inf
         while True:
@@ -172,19 +172,19 @@ class Bench:
             time.sleep(self.pause_s)
 
     def goes(self, enables: bool = False, limit_s: float | None = None) -> bool:
-        """Whether commands move it, after `enable` from a stand."""
+        """Return whether commands move it; ``enables``: after `enable` from a stand."""
         if enables:
             self.call("enable")
             self.until(moves=False)
         return self.until(moves=True, limit_s=limit_s, commands=True)
 
     def after(self, periods: float) -> VehicleReport:
-        """Its report so many T after a last command."""
+        """Return its report so many T after a last command."""
         self.call("command", self.go)
         return self.report(periods * self.period_s)
 
     def brakes(self) -> bool:
-        """Whether it gets slower within 2 T of a stop, and then stands."""
+        """Return whether it gets slower within 2 T of a stop, and then stands."""
         self.call("brake")
         # Commands still come: without them it would brake by itself.
         if self.until(moves=False, limit_s=2 * self.period_s + LATE_S, commands=True):
@@ -193,7 +193,7 @@ class Bench:
         return after_mps < before_mps and self.until(moves=False)
 
     def refuses(self, *actions: dict[str, float]) -> bool:
-        """Whether each of these is a ValueError."""
+        """Return whether each of these is a ValueError."""
         for action in actions:
             with contextlib.suppress(ValueError):
                 self.call("command", action)
@@ -201,7 +201,7 @@ class Bench:
         return True
 
     def stays_within(self) -> bool:
-        """Whether its actuators stay within the limits, when far more is asked."""
+        """Return whether its actuators stay within the limits, when far more is asked."""
         for _ in range(10):
             self.call("command", {name: 10.0 * value for name, value in self.go.items()})
             action = self.report(self.period_s / 2).action
@@ -211,7 +211,7 @@ class Bench:
         return True
 
     def closes(self) -> bool:
-        """Whether it may be closed twice, and nothing moves it then."""
+        """Return whether it may be closed twice, and nothing moves it then."""
         self.call("brake", latch=False)
         self.until(moves=False)
         self.call("close")

@@ -1,24 +1,19 @@
-"""``python -m hil_tests doctor``: what this machine can and cannot do, and how to get the rest.
+"""``python -m hil_tests doctor``: try what this machine can do, and say how to get the rest.
 
-Each probe does the thing instead of looking for it; CHECKS, at the end, says what each is for. It
-runs in a fresh clone, before anything is installed, so only the standard library is
-imported up here; heavy libraries are tried in a process of their own.
+It runs in a fresh clone, so only the standard library is imported up here; Python 3.8 must read it.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -27,62 +22,22 @@ from typing import NamedTuple
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.util import UserError
 
-BASICS = "basics"
-INSTALL = "make install"
+BASICS, INSTALL = "basics", "make install"
 NOT_READY = 1  # Exit status where a basic is missing
-TIMEOUT_S = 60.0  # For a program that a probe starts
 ROOT = Path(__file__).parents[1]
-LOCK = ROOT / "requirements" / "workstation.txt"
 OLDEST = (3, 11)
-DISK_GB = 2
-"""A training run with its checkpoint takes some 0.5 GB, recordings and pictures come on top."""
-MEMORY_GB = 2  # A full replay buffer and torch take 1.2 GB.
-ARRIVAL_S = 5.0
-_KERNEL = """
-import os, sys, torch
-from trainer.learner.kernel import load
-if load() is None:  # it has said why
-    sys.exit("turned off by PHIL_KERNEL=0" if os.environ.get("PHIL_KERNEL") == "0" else 1)
-print("the learner's kernel is built and loaded")
-"""
-_GPU = """
-import sys, torch
-if not torch.cuda.is_available():
-    sys.exit(f"torch {torch.__version__} sees no CUDA device")
-print(torch.cuda.get_device_name(0))
-"""
+DISK_GB, MEMORY_GB = 2, 2  # A run with its checkpoint takes 0.5 GB; torch and a full replay 1.2 GB
+ARRIVAL_S, SCRIPT_S = 5.0, 60.0
+KERNEL = "from trainer.learner.kernel import load; assert load(), 'it cannot be built or is off'"
+GPU = "import torch; assert torch.cuda.is_available(), f'torch {torch.__version__} sees none'"
+DISPLAY = "from bridge.rerun import has_display; assert has_display(), 'DISPLAY is not set'"
+SSH_KEYGEN = "import shutil; assert shutil.which('ssh-keygen'), 'it is not on PATH'"
+PRIORITY = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
 EXAMPLE = examples("python -m hil_tests doctor --only basics vehicle")
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    groups = f"of {', '.join(GROUPS)} (default: all)"
-    parser.add_argument("--only", metavar="GROUP", nargs="+", default=GROUPS, help=groups)
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Make the checks and print them; 0 where the basics work. UserError for an unknown group."""
-    for group in arguments.only:
-        if group not in GROUPS:
-            raise UserError(f"no group {group!r}: choose from {', '.join(GROUPS)}")
-    found: list[Finding] = []
-    for check in CHECKS:
-        if check.group not in arguments.only:
-            continue
-        if not found or check.group != found[-1].check.group:
-            print(f"\n{check.group}")
-        found.append(examine(check))
-        print(lines(found[-1]), flush=True)
-    print(f"\n{summary(found)}")
-    return NOT_READY if lacking(found, BASICS) else 0
-
-
-class Check(NamedTuple):
-    """One thing that a machine may have.
-
-    ``probe`` does it, and says in a few words what it found; any exception says that it is missing.
-    ``without`` says what fails or is worse where it is missing; ``remedy``, how to get it.
-    """
+class Ability(NamedTuple):
+    """What a machine may be able to do. ``probe`` does it and returns a few words, or raises."""
 
     group: str
     name: str
@@ -91,52 +46,27 @@ class Check(NamedTuple):
     remedy: str
 
 
-class Finding(NamedTuple):
-    """A check that was made: whether it is there, what was found, and how to get it."""
-
-    check: Check
-    ok: bool
-    detail: str
-    remedy: str
+def add_arguments(parser: ArgumentParser) -> None:
+    groups = f"groups of checks: {', '.join(GROUPS)} (default: all)"
+    parser.add_argument("--only", metavar="GROUP", nargs="+", choices=GROUPS, help=groups)
 
 
-def examine(check: Check) -> Finding:
-    """Make a check; whatever goes wrong in it is its finding."""
-    ok, remedy = False, check.remedy
-    try:
-        ok, detail = True, check.probe()
-    except ModuleNotFoundError as error:  # the thing itself was not tried
-        detail, remedy = f"Python finds no module {error.name}", INSTALL
-    except UserError as error:
-        detail = str(error)
-    # A broken library may raise anything at all, and the checks after it are still wanted.
-    except Exception as error:
-        detail = f"{type(error).__name__}: {error}"
-    return Finding(check, ok, " ".join(detail.split()), remedy)
-
-
-def lines(finding: Finding) -> str:
-    """A line where it is there; what it is for and how to get it where it is not."""
-    said = f"{finding.check.name}: {finding.detail}"
-    if finding.ok:
-        return f"  ok       {said}"
-    needs = (f"without it: {finding.check.without}", f"get it: {finding.remedy}")
-    return ("\n" + 11 * " ").join((f"  missing  {said}", *needs))
-
-
-def lacking(found: list[Finding], group: str | None = None) -> list[str]:
-    """The names of what is missing, of all groups or one."""
-    return [one.check.name for one in found if not one.ok and group in (None, one.check.group)]
-
-
-def summary(found: list[Finding]) -> str:
-    """The last line."""
-    if basic := lacking(found, BASICS):
-        return f"The basics do not work here: {', '.join(basic)}."
-    basics = "The basics work. " if any(one.check.group == BASICS for one in found) else ""
-    if not (names := lacking(found)):
-        return f"{basics}Nothing is missing."
-    return f"{basics}Missing{' besides' if basics else ''}: {', '.join(names)}."
+def run(arguments: argparse.Namespace) -> int:
+    """Try every ability and print a line for each; return 0 where the basics work."""
+    missing = []
+    for ability in ABILITIES:
+        if arguments.only and ability.group not in arguments.only:
+            continue
+        try:
+            print(f"  ok       {ability.name}: {ability.probe()}", flush=True)
+        except Exception as error:  # A broken library may raise anything.
+            missing.append(ability)
+            unknown = isinstance(error, ModuleNotFoundError)
+            said = " ".join(str(error).split()) or type(error).__name__
+            print(f"  missing  {ability.name}: {said}\n           without it: {ability.without}")
+            print(f"           get it: {INSTALL if unknown else ability.remedy}", flush=True)
+    print(f"\nmissing: {', '.join(ability.name for ability in missing) or 'nothing'}")
+    return NOT_READY if any(ability.group == BASICS for ability in missing) else 0
 
 
 def _python() -> str:
@@ -146,40 +76,30 @@ def _python() -> str:
 
 
 def _packages() -> str:
-    import tomllib  # An older Python has none, and is to say so in the check before.
+    import tomllib  # An older Python has none.
+
+    def version_of(name: str) -> str:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            return metadata.version(name).split("+")[0]  # torch says +cpu behind its version.
+        return ""
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]]
-    if absent := [name for name in wanted if _installed(name) is None]:
+    absent = [name for name in wanted if not version_of(name)]
+    if absent:
         raise UserError(f"not installed: {', '.join(absent)}")
-    return f"all {len(wanted)} that pyproject.toml asks for"
-
-
-def _versions() -> str:
-    locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
-    found = {name: version for name in locked if (version := _installed(name)) is not None}
-    # torch says +cpu or +cu130 behind its version.
-    other = {n: version for n, version in found.items() if version.split("+")[0] != locked[n]}
-    if other:
-        each = (f"{name} {version} (locked: {locked[name]})" for name, version in other.items())
-        raise UserError(f"other versions: {', '.join(each)}")
-    return f"{len(found)} packages as in {LOCK.name}"
-
-
-def _installed(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
+    lines = (ROOT / "requirements" / "workstation.txt").read_text().splitlines()
+    locked = dict(line.split("==") for line in lines if "==" in line)
+    other = [name for name, version in locked.items() if version_of(name) not in ("", version)]
+    return f"{', '.join(other)} not as locked: results may differ" if other else "as locked"
 
 
 def _loopback() -> str:
     from edge_runtime.reach import free_endpoint
     from edge_runtime.transport import open_session
 
-    came = threading.Event()
-    endpoint = free_endpoint()
-    with contextlib.ExitStack() as stack:  # Python 3.8 must read this, to be told so.
+    came, endpoint = threading.Event(), free_endpoint()
+    with contextlib.ExitStack() as stack:
         router = stack.enter_context(open_session(listen=endpoint, mode="router"))
         client = stack.enter_context(open_session(connect=endpoint, mode="client"))
         stack.enter_context(router.declare_subscriber("phil/doctor", lambda _: came.set()))
@@ -189,37 +109,13 @@ def _loopback() -> str:
     return f"a message went over {endpoint}"
 
 
-def _window() -> str:
-    from bridge.rerun import has_display
-
-    if not has_display():
-        raise UserError("neither DISPLAY nor WAYLAND_DISPLAY is set")
-    return "there is a display"
-
-
-def _ssh_keygen() -> str:
-    found = shutil.which("ssh-keygen")
-    if found is None:
-        raise UserError("not found")
-    return found
-
-
-def _disk() -> str:
-    with tempfile.NamedTemporaryFile(dir=Path.cwd(), prefix=".doctor-") as file:
-        file.write(b"doctor")
-    return _enough(shutil.disk_usage(Path.cwd()).free, DISK_GB, f"free in {Path.cwd()}")
-
-
-def _memory() -> str:
-    rows = Path("/proc/meminfo").read_text().splitlines()
-    available = next(int(row.split()[1]) * 1024 for row in rows if "MemAvailable" in row)
-    return _enough(available, MEMORY_GB, f"available, {os.cpu_count()} cores")
-
-
-def _enough(size: int, wanted_gb: int, what: str) -> str:
-    said = f"{size / 1e9:.1f} GB {what}"
-    if size < wanted_gb * 10**9:
-        raise UserError(f"{said}; {wanted_gb} are wanted")
+def _room() -> str:
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    memory = next(int(line.split()[1]) * 1024 for line in lines if "MemAvailable" in line)
+    disk = shutil.disk_usage(Path.cwd()).free
+    said = f"{memory / 1e9:.1f} GB of memory, {disk / 1e9:.1f} GB of disk"
+    if memory < MEMORY_GB * 10**9 or disk < DISK_GB * 10**9:
+        raise UserError(f"{said}; {MEMORY_GB} and {DISK_GB} GB are wanted")
     return said
 
 
@@ -232,62 +128,41 @@ def _can_over_udp() -> str:
     name = parse_bus(free_bus())
     with open_bus(name) as sender, open_bus(name) as receiver:
         sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
-        heard = receiver.recv(ARRIVAL_S)
-    if heard is None or bytes(heard.data) != b"doctor":
-        raise UserError("a frame did not arrive on loopback")
+        if receiver.recv(ARRIVAL_S) is None:
+            raise UserError("a frame did not arrive on loopback")
     return "a frame went through UDP multicast on loopback"
 
 
-def _realtime_priority() -> str:
-    # The thread keeps the priority to itself, and ends with it.
-    with ThreadPoolExecutor(1) as thread:
-        thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
-    return "SCHED_FIFO was given to a thread"
-
-
-def python_says(script: str) -> str:
-    """The first line of a script in its own process; ModuleNotFoundError, UserError if it fails."""
+def python_does(script: str) -> str:
+    """Run a script that loads heavy libraries in a process of its own."""
     command = [sys.executable, "-c", script]
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise UserError(str(error)) from None
-    if done.returncode != 0:
-        said = (done.stderr or done.stdout).strip() or f"exit status {done.returncode}"
-        if (last := said.splitlines()[-1]).startswith("ModuleNotFoundError"):
-            raise ModuleNotFoundError(name=last.split("'")[1])
-        raise UserError(last)
-    return done.stdout.partition("\n")[0]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SCRIPT_S, cwd=ROOT)
+    if done.returncode:
+        kind, _, said = (done.stderr.strip().splitlines() or [""])[-1].partition(": ")
+        raise (ModuleNotFoundError if kind == "ModuleNotFoundError" else UserError)(said or kind)
+    return "works"
 
 
-CHECKS = (
-    Check(BASICS, "Python", _python, "nothing runs", "Python 3.11 or newer; make PYTHON=..."),
-    Check(BASICS, "packages", _packages, "nothing runs", INSTALL),
-    Check(BASICS, "loopback", _loopback, "no drive over Zenoh, no `make demo`, no `make test`",
-          "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall"),
-    Check(BASICS, "disk", _disk, "no training, no recordings (--out)",
-          "free some space, or work in another directory"),
-    Check(BASICS, "memory", _memory, "no training", "end other programs"),
-    Check("training", "locked versions", _versions,
-          "results differ from results/ in the last bits", INSTALL),
-    Check("training", "C++ kernel", partial(python_says, _KERNEL),
-          "`trainer train` takes several times as long",
-          "a C++ compiler: apt install g++"),
-    Check("training", "GPU", partial(python_says, _GPU),
-          "no `--device cuda`",
-          "an NVIDIA GPU with its driver, and torch with CUDA"),
-    Check("person", "window", _window,
-          "no cockpit that opens by itself, no rerun window (--spawn)",
-          "a desktop session; without one: open the printed address, and --serve or --save"),
-    Check("vehicle", "ssh-keygen", _ssh_keygen, "no bundle for a board, no `make test`",
-          "apt install openssh-client"),
-    Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
-          "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
-    Check("vehicle", "real-time priority", _realtime_priority,
-          "a busy machine may make the edge runtime's commands late",
-          "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)"),
+ABILITIES = (
+    Ability(BASICS, "Python", _python, "nothing runs", "Python 3.11 or newer; make PYTHON=..."),
+    Ability(BASICS, "packages", _packages, "nothing runs", INSTALL),
+    Ability(BASICS, "loopback", _loopback, "no drive over Zenoh, no `make demo`, no `make test`",
+            "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall"),
+    Ability(BASICS, "room", _room, "no training, no recordings",
+            "end other programs, free some disk, or work in another directory"),
+    Ability("training", "C++ kernel", partial(python_does, KERNEL),
+            "`trainer train` takes several times as long", "a C++ compiler: apt install g++"),
+    Ability("training", "GPU", partial(python_does, GPU), "no `--device cuda`",
+            "an NVIDIA GPU with its driver, and torch with CUDA"),
+    Ability("person", "display", partial(python_does, DISPLAY),
+            "no cockpit that opens by itself, no rerun window (--spawn)",
+            "a desktop session; without one: open the printed address, and --serve or --save"),
+    Ability("vehicle", "ssh-keygen", partial(python_does, SSH_KEYGEN),
+            "no bundle for a board, no `make test`", "apt install openssh-client"),
+    Ability("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
+            "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
+    Ability("vehicle", "real-time priority", partial(python_does, PRIORITY),
+            "a busy machine may make the edge runtime's commands late",
+            "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)"),
 )  # fmt: skip
-"""In the order of the output. Nothing much works without the basics."""
-GROUPS = tuple(dict.fromkeys(check.group for check in CHECKS))
+GROUPS = tuple(dict.fromkeys(ability.group for ability in ABILITIES))

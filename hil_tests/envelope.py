@@ -24,32 +24,25 @@ from __future__ import annotations
 
 import argparse
 import math
-import resource
 import shlex
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
-from multiprocessing import get_context
 from typing import Annotated, Any
 
 import msgspec
 
 from bridge.network import DirectionSpec, LatencySpec, Outage, parse_spec
-from bridge.report import GOAL, TRUNCATED, UNKNOWN
-from edge_runtime import cli
+from bridge.outcomes import GOAL
+from bridge.statistics import success_estimate
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, name_in_file, read_json
-from trainer.drivers import load_driver, located
-from trainer.environments import CONDITIONS, make_environment
-from trainer.evaluation import drive_episodes, trained_in
-from trainer.experiments.data import success_estimate
-from trainer.options import set_threads
-from trainer.util import cores, die_with_parent, kept
+from hil_tests.drivers import Drivers
+from trainer.environments import CONDITIONS
+from trainer.util import kept
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
 ZONE = 0.7
@@ -57,7 +50,7 @@ ZONE = 0.7
 98.5 % and from 91.5 %."""
 TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
 MOST_FAILURES = 50  # At the promise: a point is left undecided after the drives that have so many
-CHUNK = 8  # Drives of one task of a process
+AT_ONCE = 16  # Drives between two looks at whether a point is decided
 FRESH = 1_000_000  # So far from the seeds of the search are those that confirm it
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
 BURST_PERCENT = 5.0  # Share of the messages in bad stretches
@@ -81,7 +74,7 @@ Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
 
 
 def network(at: Point) -> LatencySpec:
-    """The network of a point, the same each way."""
+    """Return the network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
     outage_s = min(outage_s, OUTAGE_EVERY_S - AXES["outage_s"][1])  # One must end.
     spread_ms, has_bursts, loss = jitter_ms or tail_ms, burst >= 1.0, min(loss, MOST_LOSS_PERCENT)
@@ -102,7 +95,7 @@ def network(at: Point) -> LatencySpec:
 
 
 class SequentialTest:
-    """Whether the share of successes is above or below a promise, by as few drives as decide it.
+    """Decides by few drives whether the share of successes is above or below a promise.
 
     Two of Wald's sequential probability ratio tests (1945, Sequential tests of statistical
     hypotheses, Annals of Mathematical Statistics 16(2)) on the same drives, as Sobel and Wald
@@ -123,7 +116,7 @@ class SequentialTest:
         self.drives = self.successes = 0
 
     def add(self, success: bool) -> str | None:
-        """Count a drive; the verdict, None while there is none."""
+        """Count a drive; return the verdict, None while there is none."""
         self.drives += 1
         self.successes += success
         for which, verdict in enumerate((HOLDS, BREAKS)):
@@ -136,21 +129,21 @@ class SequentialTest:
 
 
 class Search:
-    """Looks for edges, and keeps what was found at every point that was tried.
+    """Looks for edges, and keeps the verdict of every point that was tried.
 
     ``drive`` is called with the next seeds, from ``seed`` on and ``at_once`` at a time, until a
     point is decided. ``confidence`` is that of a statement about an axis.
     """
 
     def __init__(
-        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = CHUNK
+        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = AT_ONCE
     ) -> None:
         self._drive, self._seed, self._at_once = drive, seed, at_once
         self._new_test = partial(SequentialTest, promise, confidence)
         self.tried: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
-        """HOLDS, BREAKS or BETWEEN."""
+        """Drive a point until it is decided; return HOLDS, BREAKS or BETWEEN."""
         spec = network(at)
         if str(spec) not in self.tried:
             test, verdict = self._new_test(), None
@@ -164,9 +157,9 @@ class Search:
         return str(self.tried[str(spec)]["verdict"])
 
     def holds_up_to(self, ray: Ray, most: int) -> int:
-        """The largest step up to which every tried one holds, by bisection; 0 is not tried.
+        """Return the largest step up to which every tried one holds, by bisection from 0.
 
-        That less is no worse is not taken for granted: half of it is tried, too.
+        Less may be worse: half of it is tried, too.
         """
         edge = self._bisect(ray, 0, most, (HOLDS,))[0]
         if edge > 1 and self.verdict(ray(edge // 2)) != HOLDS:
@@ -174,9 +167,9 @@ class Search:
         return edge
 
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
-        """The largest step that holds, the smallest beyond it that breaks, and both networks.
+        """Return the largest step that holds, the smallest beyond it that breaks, both networks.
 
-        None where none breaks. It lies below the least step known to break.
+        None where none breaks. The edge lies below the least step known to break.
         """
         inside = self.holds_up_to(ray, most)
         names = {k: str(network(ray(k))) for k in range(inside + 1, most + 1)}
@@ -187,7 +180,7 @@ class Search:
         return {**found, "outside": None if outside is None else str(network(ray(outside)))}
 
     def _bisect(self, ray: Ray, low: int, most: int, is_low: tuple[str, ...]) -> tuple[int, int]:
-        """Neighbours of which the lower is low; the most is tried first, ``low`` is not tried."""
+        """Return neighbours of which the lower is low; the most is tried first, ``low`` never."""
         middle, high = most, most + 1
         while high - low > 1:
             low, high = (middle, high) if self.verdict(ray(middle)) in is_low else (low, middle)
@@ -196,7 +189,10 @@ class Search:
 
 
 def find_region(search: Search) -> dict[str, Any]:
-    """The limits, ``joint`` and ``box`` (module docstring), and the edges; UserError: none."""
+    """Return limits, ``joint`` and ``box`` (module docstring), and the edges.
+
+    Raises UserError where the promise is not kept without a network.
+    """
     if search.verdict({}) != HOLDS:
         raise UserError("the promise is not kept even on a perfect network: lower --promise")
 
@@ -206,87 +202,32 @@ def find_region(search: Search) -> dict[str, Any]:
         limit, breaks_at = (k and round(k * step, 6) for k in found.pop("steps"))
         return {"limit": limit, "breaks_at": breaks_at, **found}
 
-    edges = dict(zip(AXES, _side_by_side([partial(of_axis, name) for name in AXES]), strict=True))
+    edges = {name: of_axis(name) for name in AXES}
     limits = {name: edge["limit"] for name, edge in edges.items()}
     limits["burst_messages"] *= limits["burst_messages"] >= 1.0
     worse, other = sorted(("jitter_ms", "tail_jitter_ms"), key=limits.__getitem__)
     corner = {name: limit for name, limit in limits.items() if limit and name != other}
 
-    def mixture(names: Sequence[str], k: int) -> Point:
-        return {name: corner[name] * k / SCALE for name in names}
+    def mixture(names: Sequence[str]) -> Ray:
+        return lambda k: {name: corner[name] * k / SCALE for name in names}
 
-    pairs = [partial(mixture, names) for names in combinations(corner, 2)]
-    edges["together"], *held = _side_by_side(
-        [
-            partial(search.edge, partial(mixture, list(corner)), 2 * SCALE),
-            *(partial(search.holds_up_to, pair, SCALE // 2) for pair in pairs),
-        ]
-    )
+    edges["together"] = search.edge(mixture(list(corner)), 2 * SCALE)
+    held = [search.holds_up_to(mixture(pair), SCALE // 2) for pair in combinations(corner, 2)]
     box = min(1.0, edges["together"].pop("steps")[0] / SCALE)
     joint = min(1.0, len(corner) * box, *(2 * k / SCALE for k in held))
     tail_ms, limits["jitter_ms"] = limits.pop("tail_jitter_ms"), limits[worse]
     return {"limits": limits, "joint": joint, "box": box, "tail_jitter_ms": tail_ms, "edges": edges}
 
 
-def _side_by_side(work: Sequence[Callable[[], Any]]) -> list[Any]:
-    """Do all in threads, which wait for drives. After ^C none is waited for: drives end first."""
-    threads = ThreadPoolExecutor(len(work))
-    try:
-        return [future.result() for future in [threads.submit(one) for one in work]]
-    finally:
-        threads.shutdown(wait=False, cancel_futures=True)
-
-
-class Drivers(ProcessPoolExecutor):
-    """Processes that drive, each with an environment and the policy."""
-
-    def __init__(self, jobs: int, *task: str | None) -> None:
-        begin: Any = _begin
-        super().__init__(jobs, get_context("spawn"), begin, task)
-        self.driven: list[int] = []  # How many drives each `drive` was
-        self._ended = {TRUNCATED}  # How any drive has ended
-
-    def __exit__(self, *_: object) -> None:
-        self.shutdown(cancel_futures=True)
-
-    def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
-        """Drive each seed behind a network; whether it succeeded."""
-        self.driven.append(len(seeds))
-        outcomes = list(self.map(partial(_outcome, spec), seeds, chunksize=CHUNK))
-        self._ended.update(outcomes)
-        # A limit of steps alone is a timeout as soon as any other drive's end was told.
-        if UNKNOWN in outcomes or len(self._ended) == 1:
-            raise UserError("the environment does not say of each drive whether it succeeded")
-        return [outcome == GOAL for outcome in outcomes]
-
-
-_mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
-
-
-def _begin(policy: str, env: str, condition: str, public_key: str | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
-    threading.Thread(target=die_with_parent, daemon=True).start()
-    set_threads(1)
-    period_s = trained_in(policy, public_key)[1]
-    environment = make_environment(env, condition, period_s=period_s)
-    _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
-
-
-def _outcome(spec: LatencySpec, seed: int) -> str:
-    env, driver, condition = _mine
-    (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
-    return result.outcome
-
-
-class Edge(msgspec.Struct):
-    """The networks on both sides of an edge; no network is outside where none breaks the policy."""
+class EdgeNetworks(msgspec.Struct):
+    """The networks on both sides of an edge; None outside where no network breaks the policy."""
 
     inside: str
     outside: str | None
 
 
 class Known(msgspec.Struct):
-    """What an envelope's file needs, so that it can be confirmed."""
+    """What a file of an envelope holds of what is needed to confirm it."""
 
     policy_id: str
     policy: str
@@ -294,80 +235,79 @@ class Known(msgspec.Struct):
     condition: str
     promised_success: float
     confidence: float
-    edges: Annotated[dict[str, Edge], msgspec.Meta(min_length=1)]
+    edges: Annotated[dict[str, EdgeNetworks], msgspec.Meta(min_length=1)]
 
 
 def read_known(path: str) -> Known:
-    """The envelope in a file; UserError where there is none, or nothing to confirm."""
+    """Read an envelope's file; UserError where it holds none, or nothing to confirm."""
     value = read_json(path, "envelope")
     try:
         known = msgspec.convert(value, Known)
-        if known.condition not in CONDITIONS:
-            raise UserError(f"there is no condition {known.condition!r}")
         for edge in known.edges.values():
             for spec in (edge.inside, edge.outside or "none"):
                 parse_spec(spec)
     except (msgspec.ValidationError, UserError) as error:
         what = "no envelope of hil_tests envelope, with edges to confirm"
         raise UserError(f"{path} is {what}: {error}") from None
+    if known.condition not in CONDITIONS:
+        raise UserError(f"{path}: there is no condition {known.condition!r}")
     return known
 
 
-def confirm(drivers: Drivers, known: Known, seeds: range) -> dict[str, Any]:
-    """Drive every edge's two networks; whether inside kept the promise, and outside did not."""
+def confirm(drive: Drive, known: Known, seeds: range) -> dict[str, Any]:
+    """Drive every edge's two networks; report whether inside kept the promise, outside not."""
     rows = []
     for name, edge in known.edges.items():
         for side, spec in (("inside", edge.inside), ("outside", edge.outside)):
             if spec is None:
                 continue
-            successes = sum(drivers.drive(parse_spec(spec), seeds))
+            successes = sum(drive(parse_spec(spec), seeds))
             found = success_estimate(successes, len(seeds))
             as_told = (found.value >= known.promised_success) == (side == "inside")
-            what = {"edge": name, "side": side, "network": spec, "successes": successes}
-            share = {"share": found.value, "low": found.low, "high": found.high}
-            rows.append({**what, **share, "as_told": as_told})
+            rows.append({
+                "edge": name, "side": side, "network": spec, "successes": successes,
+                "share": found.value, "low": found.low, "high": found.high, "as_told": as_told,
+            })  # fmt: skip
             print(f"{name} {side}: {found.value:.1%} {spec}", file=sys.stderr)
     return {"runs": len(seeds), "rows": rows, "confirmed": all(row["as_told"] for row in rows)}
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find an envelope, or confirm one: 0, or 1 where an edge is not confirmed."""
+    """Find an envelope, or confirm one; return 0, or 1 where an edge is not confirmed."""
     check_writable(arguments.out)
-    began_s, jobs = time.monotonic(), arguments.jobs or cores()
-    known = read_known(arguments.confirm) if arguments.confirm else None
-    told = known or arguments  # A file tells what was driven.
-    env, name, condition = arguments.env, arguments.policy, told.condition
-    if known:
+    began_s = time.monotonic()
+    env, name, known = arguments.env or "left_turn", arguments.policy, None
+    told: Any = arguments
+    if arguments.confirm:
+        told = known = read_known(arguments.confirm)
         said = f"{arguments.confirm} is of"
-        env = env or name_in_file(known.env, said, "--env")
+        env = arguments.env or name_in_file(known.env, said, "--env")
         name = name or name_in_file(known.policy, said, "--policy")
-    env = env or "left_turn"
-    policy = located(name or kept(f"results/policies/{env}.onnx"))
-    period_s = trained_in(policy, arguments.public_key)[1]
-    environment = make_environment(env, condition, period_s=period_s)
-    policy_id = load_driver(policy, environment, arguments.public_key)[1]
-    if known and known.policy_id != policy_id:
-        raise UserError(f"{arguments.confirm} is of another policy than {policy}")
-    found: dict[str, Any] = {
-        "schema": 1, "policy_id": policy_id, "policy": name, "env": env, "condition": condition,
-        "promised_success": known.promised_success if known else arguments.promise,
-        "confidence": told.confidence, "seed": arguments.seed,
-        "control_period_s": environment.control_period_s,
-    }  # fmt: skip
-    task = (jobs, policy, env, condition, arguments.public_key)
-    with cli.sigterm_as_interrupt(), Drivers(*task) as drivers:
+    name = name or kept(f"results/policies/{env}.onnx")
+    promise = known.promised_success if known else arguments.promise
+    task = (name, env, told.condition, arguments.public_key, arguments.jobs)
+    with sigterm_as_interrupt(), Drivers(*task) as drivers:
+        if known and known.policy_id != drivers.policy_id:
+            raise UserError(f"{arguments.confirm} is of another policy than {name}")
+
+        def drive(spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
+            return [result.outcome == GOAL for result in drivers.drive(spec, seeds)]
+
         if known:
             first = arguments.seed + FRESH
-            found |= confirm(drivers, known, range(first, first + arguments.runs))
+            found = confirm(drive, known, range(first, first + arguments.runs))
         else:
-            rule = found["promised_success"], found["confidence"]
-            search = Search(drivers.drive, *rule, arguments.seed, jobs * CHUNK)
-            found |= {**find_region(search), "tried": search.tried}
-    spent = resource.getrusage(resource.RUSAGE_CHILDREN)  # All of them have ended.
-    found |= {"drives": sum(drivers.driven), "seconds": round(time.monotonic() - began_s, 1)}
-    found["cpu_s"] = spent.ru_utime + spent.ru_stime
-    found["command"] = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
-    write_json_out(arguments.out, found)
+            at_once = max(drivers.jobs, AT_ONCE)
+            search = Search(drive, promise, told.confidence, arguments.seed, at_once)
+            found = {**find_region(search), "tried": search.tried}
+    report = {
+        "schema": 1, "policy_id": drivers.policy_id, "policy": name, "env": env,
+        "condition": told.condition, "promised_success": promise, "confidence": told.confidence,
+        "seed": arguments.seed, "control_period_s": drivers.control_period_s, **found,
+        "drives": drivers.driven, "seconds": round(time.monotonic() - began_s, 1),
+        "command": f"python -m hil_tests {shlex.join(sys.argv[1:])}",
+    }  # fmt: skip
+    write_json_out(arguments.out, report)
     shown = ("limits", "joint", "box", "confirmed", "drives", "seconds")
-    print(", ".join(f"{name} {found[name]}" for name in shown if name in found))
-    return 0 if found.get("confirmed", True) else 1
+    print(", ".join(f"{key} {report[key]}" for key in shown if key in report))
+    return 0 if report.get("confirmed", True) else 1

@@ -17,7 +17,6 @@ FOLDERS = {
 
 
 def main() -> None:
-    """The entry point."""
     sys.exit(run_cli(_run))
 
 

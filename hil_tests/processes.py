@@ -37,7 +37,7 @@ _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Pytho
 
 
 class CommandTimeoutError(UserError, TimeoutError):
-    """A command had not ended when its time was over."""
+    """A command or an event did not come in time."""
 
 
 class Process:
@@ -100,21 +100,18 @@ class Process:
 
     @property
     def output(self) -> str:
-        """Its standard output so far."""
         return "".join(self._output)
 
     @property
     def errors(self) -> str:
-        """Its standard error so far."""
         return "".join(self._errors)
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is gone, for whatever reason."""
         return self._process.poll() is not None
 
     def wait_for_line(self, text: str, timeout_s: float = PATIENCE_S) -> float:
-        """When the first line with ``text`` came, monotonic s."""
+        """Wait for the first line with ``text``; return when it came, monotonic s."""
         what = f"{text!r} from pid {self.pid}"
         return float(wait_until(lambda: self._when(text), what, timeout_s))
 
@@ -125,7 +122,6 @@ class Process:
         self._process.stdin.flush()
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal."""
         self._process.send_signal(number)
 
     def kill(self) -> None:
@@ -134,7 +130,7 @@ class Process:
         self._gone(None)
 
     def end(self, timeout_s: float = STOP_TIMEOUT_S) -> int:
-        """SIGTERM (or nothing, where it ended itself), then its exit status."""
+        """Send SIGTERM where it still runs; return its exit status."""
         if not self.has_ended:
             self._process.send_signal(signal.SIGCONT)
             self._process.terminate()
@@ -145,7 +141,7 @@ class Process:
             return -signal.SIGKILL
 
     def wait(self, timeout_s: float = 2 * PATIENCE_S) -> int:
-        """The exit status, once it has ended by itself; CommandTimeoutError."""
+        """Wait until it ends by itself; return its exit status. CommandTimeoutError."""
         try:
             return self._gone(timeout_s)
         except subprocess.TimeoutExpired:
@@ -158,12 +154,12 @@ class Process:
             raise self._failure()
 
     def crashed(self) -> bool:
-        """Whether it ended on its own, or said what a crash says."""
+        """Return whether it ended on its own, or printed what a crash prints."""
         gone = self.has_ended and not self._ended_by_us
         return gone or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
 
     def resident_mb(self) -> float:
-        """Its resident memory now, MB (10^6 bytes), by the kernel's own count."""
+        """Return its resident memory, MB (10^6 bytes), by the kernel's own count."""
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
         kib = [int(line.split()[1]) for line in lines if line.startswith("VmRSS:")]
         if not kib:
@@ -295,17 +291,19 @@ def in_parallel(
             raise
 
 
-def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+def wait_until(
+    condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S, poll_s: float = POLL_S
+) -> Any:
     """Poll until the condition is true and return its value; CommandTimeoutError otherwise."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
         if value := condition():
             return value
-        time.sleep(POLL_S)
+        time.sleep(poll_s)
     raise CommandTimeoutError(f"not within {timeout_s:g} s: {what}")
 
 
 def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:
-    """Options of an edge runtime where the loop is measured, whoever made the policy."""
+    """Return an edge runtime's options for a policy that may be unsigned."""
     named = () if public_key is None else ("--public-key", public_key)
     return ("--policy", str(policy), "--allow-unsigned", *named)

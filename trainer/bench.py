@@ -1,6 +1,6 @@
-"""Measure learner, environments and training, the learner beside Stable-Baselines3's.
+"""Measure learner, environments and training; the learner beside Stable-Baselines3's.
 
-Contenders take turns within one run, so that the machine's noise hits all of them alike.
+Contenders take turns within one run, so that the machine's noise hits all alike.
 """
 
 import argparse
@@ -38,28 +38,28 @@ from trainer.util import processor_model, source_revision
 
 OURS, FLOAT32, SB3 = "ours", "ours_float32", "stable_baselines3"
 PEERS = {FLOAT32: "the same in float32", SB3: "Stable-Baselines3 TD3"}
-BAR = 5.0  # Ours is to be at least so many times as fast as Stable-Baselines3's
+BAR = 5.0  # Our learner shall be at least so many times as fast as Stable-Baselines3's
 TRANSITIONS = 1000
-"""In each learner's buffer, not the paper's 100,000: drawing from a full one costs no more."""
+"""In each learner's buffer, instead of the paper's 100,000: drawing costs the same."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
-Work = Callable[[], object]  # a contender's piece of work: an update, or a step
-Times = dict[str, list[float]]  # contender -> seconds of a piece of its work, round by round
-Tick = Callable[[str], None]  # told what was done, once a round
+Work = Callable[[], object]  # A contender's piece of work: an update, or a step
+Times = dict[str, list[float]]  # Contender -> seconds for a piece of work, round by round
+Tick = Callable[[str], None]  # Called once a round with what was done
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Counts. More of them give the same figures with less noise."""
+    """Counts; higher ones give the same figures with less noise."""
 
-    batch_size: int = LearnerConfig.batch_size  # in a minibatch of every learner (table A5)
-    rounds: int = 20  # of the learners, and of each scenario
+    batch_size: int = LearnerConfig.batch_size  # Of every learner (table A5)
+    rounds: int = 20  # Of the learners, and of each scenario
     updates_per_round: int = 5
-    steps_per_round: int = 200  # about three episodes
-    training_episodes: int = 10  # counted ones; those before the first update come on top
+    steps_per_round: int = 200  # About three episodes
+    training_episodes: int = 10  # Besides those before the first update
 
     @property
     def ticks(self) -> int:
-        """What the progress bar counts to."""
+        """Rounds and episodes in all, for the progress bar."""
         return self.rounds * (1 + len(SCENARIOS)) + self.training_episodes
 
 
@@ -67,7 +67,7 @@ FULL, QUICK = Effort(), Effort(rounds=4, updates_per_round=3, training_episodes=
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print; returns the exit status."""
+    """Measure and print; return the exit status."""
     check_writable(arguments.out)
     set_threads(arguments.threads)
     effort = QUICK if arguments.quick else FULL
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
-    """The report: machine and versions, the contract's three figures, and each part in full."""
+    """Make the report: machine and versions, the contract's three figures, and each part."""
     learner = measure_learner(effort, tick)
     environment = {name: measure_environment(name, effort, tick) for name in SCENARIOS}
     training = measure_training(effort, tick)
@@ -98,9 +98,9 @@ def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
 
 
 def take_turns(contenders: Mapping[str, Work], rounds: int, pieces: int, tick: Tick) -> Times:
-    """So many pieces of each contender's work a round, after one round that is not counted.
+    """Time ``pieces`` of each contender's work a round, after one round that is not counted.
 
-    The one that begins a round ends the next: none is always measured first.
+    Whoever begins a round ends the next: nobody is always measured first.
     """
     names = list(contenders)
     times: Times = {name: [] for name in names}
@@ -117,7 +117,7 @@ def take_turns(contenders: Mapping[str, Work], rounds: int, pieces: int, tick: T
 
 
 def whole_update(learner: TD3Learner, replay: ReplayBuffer, batch_size: int) -> Work:
-    """An update of a learner of ours: drawing, learning, new priorities."""
+    """Return an update of our learner: drawing, learning, new priorities."""
     random = np.random.default_rng(0)
 
     def update() -> None:
@@ -129,9 +129,9 @@ def whole_update(learner: TD3Learner, replay: ReplayBuffer, batch_size: int) -> 
 
 
 def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
-    """Milliseconds of a PHIL-TD3 update and of Stable-Baselines3's, where that is installed.
+    """Measure a PHIL-TD3 update and, where it is installed, Stable-Baselines3's, in ms.
 
-    Ours in float32 is beside them where bfloat16 is faster; elsewhere ours is just that.
+    Where bfloat16 is faster, ours is measured in float32, too.
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
     precisions = {OURS: "float32"}
@@ -151,7 +151,7 @@ def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
 
 
 def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, Any]:
-    """A figure ``of`` the median times, and how many times as long as ours each peer takes."""
+    """Return the figure ``of`` our median time, and each peer's with its ratio to our time."""
     medians = {each: float(np.median(times[each])) for each in times}
     ours = medians.pop(OURS)
     peers = {peer: {name: of(its), "ratio": its / ours} for peer, its in medians.items()}
@@ -159,7 +159,7 @@ def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, 
 
 
 def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, Any]:
-    """The scenario's steps a second, with observation: random actions, episode after episode."""
+    """Measure a scenario's steps a second, with observation, under random actions."""
     env, random, seeds = make_environment(scenario), np.random.default_rng(0), count()
     env.reset(seed=next(seeds))
 
@@ -173,7 +173,7 @@ def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, 
 
 
 def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
-    """PHIL-TD3 in the left turn with an update in every step; no validation, no checkpoint."""
+    """Train PHIL-TD3 in the left turn with an update a step, without validation or checkpoint."""
     learner = LearnerConfig(batch_size=effort.batch_size, warmup_steps=effort.batch_size)
     config = RunConfig(evaluate_every_steps=0, learner=learner)
     episodes: list[EpisodeMetrics] = []
@@ -191,7 +191,7 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
 
 
 def training_figures(episodes: Sequence[EpisodeMetrics], whole_s: float) -> dict[str, Any]:
-    """Seconds for 10,000 steps, scaled up: the whole by the clock on the wall, and its parts."""
+    """Return seconds for 10,000 steps, scaled up: the wall-clock total, and its parts."""
     steps = sum(episode.steps for episode in episodes)
     parts_s = {name: sum(getattr(each, f"{name}_s") for each in episodes) for name in PARTS}
     scaled = {name: 1e4 / steps * value for name, value in {"total": whole_s, **parts_s}.items()}
@@ -199,14 +199,13 @@ def training_figures(episodes: Sequence[EpisodeMetrics], whole_s: float) -> dict
 
 
 def show(report: dict[str, Any]) -> None:
-    """Print the table to stdout."""
     machine = report["machine"]
     print(f"{machine['processor']}, {machine['cores']} cores, threads: {report['threads']}\n")
     print("\n".join(markdown_table(("what", "ours", "peer", "ratio", "bar"), rows(report))))
 
 
 def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    """The lines of what was measured: ours beside each peer's, and whether the bar is met."""
+    """Yield the table's rows: ours beside each peer's, and whether the bar is met."""
     learner, seconds = report["learner"], report["training"]["s_per_10k_steps"]
     what, ours = f"PHIL-TD3 update, batch {learner['batch_size']}, ms", learner["ms_per_update"]
     for peer, its in learner["peers"].items():
@@ -223,14 +222,12 @@ def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 Experience = list[tuple[Any, ...]]
-"""Transitions of one long drive: frames [2, 45, 80], action [1], reward, the frames that it led to,
-and whether the human acted. The observations are real, the rewards invented."""
+"""Transitions of one long drive: frames [2, 45, 80], action [1], reward, next frames, and whether
+the human acted. The observations are real, the rewards invented."""
 
 
 def gather(size: int, seed: int = 0) -> Experience:
-    """Drive the left turn at random for so many steps; the human acts in a fifth, about as often
-    as in a guided run.
-    """
+    """Drive the left turn at random; the human acts in a fifth, about as in a guided run."""
     random, frames = np.random.default_rng(seed), real_observations("left_turn", size + 1, seed)
     actions = random.uniform(-1, 1, (size, 1)).astype(np.float32)
     rewards = random.normal(size=size).astype(np.float32)
@@ -239,7 +236,7 @@ def gather(size: int, seed: int = 0) -> Experience:
 
 
 def filled(experience: Experience) -> ReplayBuffer:
-    """A buffer of ours that holds all of it."""
+    """Fill a replay buffer of ours."""
     replay = ReplayBuffer(len(experience))
     for before, action, reward, after, human in experience:
         replay.add(Transition(before, action, float(reward), after, False, human=bool(human)))
@@ -247,10 +244,10 @@ def filled(experience: Experience) -> ReplayBuffer:
 
 
 def make_sb3_model(experience: Experience) -> Any:
-    """Stable-Baselines3's TD3 with the networks of tables A2 and A3, its replay filled.
+    """Make Stable-Baselines3's TD3 with the networks of tables A2 and A3, and fill its replay.
 
     It does less than the paper asks for: both critics share one features extractor, the replay is
-    uniform, and there is no Q advantage and no behaviour cloning. ImportError: it isn't installed.
+    uniform, and there is no Q advantage and no behaviour cloning. ImportError: not installed.
     """
     from stable_baselines3 import TD3
     from stable_baselines3.common.logger import Logger

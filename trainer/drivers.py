@@ -1,7 +1,5 @@
-"""What can drive, by its name.
-
-A name is the word expert, ``module:Class`` of one, ``constant:ACTION``, an exported policy, a
-training run or a human model.
+"""Drivers by name: the word expert, ``module:Class`` of an expert, ``constant:ACTION``, an exported
+policy, a training run or a human model.
 """
 
 import os
@@ -29,15 +27,14 @@ from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
 from trainer.util import fitting, load_torch
 
-CONSTANT = "constant:"
-"""Before an action that is kept throughout: what any policy should be better than."""
+CONSTANT = "constant:"  # Before an action that is kept throughout: a floor for any policy
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
 ActTogether = Callable[[Observation], Action]  # Many actions for many observations
 
 
 class TogetherDriver(Driver):
-    """Drives without a memory, one picture at a time or many at once.
+    """Drives without a memory, one observation at a time or many at once.
 
     ``act_together`` gives actions float32 [n, action size] for observations [n, ...].
     """
@@ -46,19 +43,18 @@ class TogetherDriver(Driver):
         self.act_together = act_together
 
     def act(self, observation: Observation) -> Action:
-        """The action, float32 [action size]."""
         return self.act_together(observation[None])[0]
 
 
 def constant_driver(action: float, size: int = 1) -> TogetherDriver:
-    """One action throughout, whatever is seen; ValueError unless it is from -1 to 1."""
+    """Return a driver with one action throughout; ValueError unless it is from -1 to 1."""
     if not -1.0 <= action <= 1.0:
         raise ValueError(action)
     return TogetherDriver(lambda seen: np.full((len(seen), size), action, np.float32))
 
 
 class OnnxDriver(Driver):
-    """An exported policy file that drives, run by the edge runtime's own loader."""
+    """Drives with an exported policy file, in the edge runtime's own loader."""
 
     def __init__(self, path: Path, public_key: str | None = None) -> None:
         from edge_runtime.policy import load_policy
@@ -71,15 +67,14 @@ class OnnxDriver(Driver):
         self.reset()
 
     def reset(self) -> None:
-        """Begin where the edge's limits begin."""
         self._last = neutral_action(self._limits)
 
     def act(self, observation: Observation) -> Action:
-        """The policy's action, float32 [action size], from its own range brought to [-1, 1].
+        """Return the policy's action, float32 [action size], scaled to [-1, 1].
 
-        Within the manifest's range and rate of change, as the edge sends it: onnxruntime's tanh
-        exceeds 1 by a last bit now and then. Each answer counts as a control period after the one
-        before; the edge measures the time, so behind jitter it may allow less.
+        It keeps to the manifest's range and rate of change, as the edge does: onnxruntime's tanh
+        exceeds 1 by a last bit now and then. Answers count as a control period apart; the edge
+        measures the time, so behind jitter it may allow less.
         """
         wanted = self.policy.act(entries_of(observation, self._plain)).tolist()
         self._last = limit_action(wanted, self._last, self._limits, self._period_s)
@@ -87,22 +82,21 @@ class OnnxDriver(Driver):
 
 
 def is_expert(word: str) -> bool:
-    """Whether this is the word expert, or ``module:Class`` of one."""
+    """Return whether this is the word expert, or ``module:Class`` of an expert."""
     a_class = re.fullmatch(r"[\w.]+:\w+", word) and not word.startswith(CONSTANT)
     return word == "expert" or bool(a_class)
 
 
 def located(driver: str) -> str:
-    """What drives, by its name; a path is absolute: a simulator may change the directory."""
+    """Return a driver's name with any path absolute: a simulator may change the directory."""
     return driver if is_expert(driver) or not Path(driver).exists() else os.path.abspath(driver)
 
 
 def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[Driver, str]:
-    """The driver that the word or path ``policy`` names, and its policy id.
+    """Return the driver that the word or path ``policy`` names, and its policy id.
 
-    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
-
-    Raises UserError: nothing there that drives.
+    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`. Raises
+    UserError where nothing drives.
     """
     if is_expert(policy):
         return expert_of(env, policy), policy
@@ -116,32 +110,28 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     path = Path(policy)
     if path.suffix == ".onnx":
         driver, wanted = OnnxDriver(path, public_key), task_of(env).text
-        if driver.policy.manifest.text != wanted:
-            found = driver.policy.manifest.text
+        if (found := driver.policy.manifest.text) != wanted:
             raise UserError(f"{policy} is for {found}, and {env.scenario} asks for {wanted}")
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
-        actor, about = load_human_model(path, env)
-        policy_id = f"human:{path.name}"
-    elif path.is_dir():
+        return TogetherDriver(load_human_model(path, env)[0].eval().act), f"human:{path.name}"
+    if path.is_dir():
         actor, about = load_actor(path, env)
-        policy_id = f"run:{path.name}:{about['episode']}"
-    else:
-        raise UserError(
-            f"{policy} is no policy: expected an .onnx file, a training run, "
-            "a human model's directory, the word expert, module:Class of one, or constant:ACTION"
-        )
-    return TogetherDriver(actor.eval().act), policy_id
+        return TogetherDriver(actor.eval().act), f"run:{path.name}:{about['episode']}"
+    raise UserError(
+        f"{policy} is no policy: expected an .onnx file, a training run, "
+        "a human model's directory, the word expert, module:Class of one, or constant:ACTION"
+    )
 
 
 def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
-    """A run's actor: the best on the validation seeds, or the last one where none was validated.
+    """Return a run's best actor on the validation seeds, or the last where none was validated.
 
-    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``. ``env`` is
-    by default the one that it names.
+    The dict beside the network has ``scenario``, ``algorithm``, ``seed``, ``episode``. Without
+    ``env`` the environment is made by the name in the file.
 
-    Raises UserError: no run there, or one in another environment than ``env``; without ``env``, in
-    one of a module.
+    Raises UserError for no run, a run in another environment than ``env``, or, without ``env``, in
+    an environment of a module.
     """
     there = [run_dir / name for name in (BEST_FILE, CHECKPOINT_FILE)]
     path = next((path for path in there if path.is_file()), None)

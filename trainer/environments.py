@@ -1,9 +1,9 @@
-"""What is driven, by its name: the two scenarios, and any other environment made to look like them.
+"""Environments by name: the two scenarios, and any other environment adapted to look like them.
 
-Everything in the trainer sees an environment in one form: an observation is one array (of several
-entries a structured one), an action is float32 [n] in [-1, 1], and the info of a step says where
-the car is, how fast it is and, at the end, how that came. `Adapted` makes that form of any
-environment; its ``outer`` and ``inner`` are the one place where actions are scaled.
+The trainer sees every environment in one form: an observation is one array (a structured one for
+several entries), an action is float32 [n] in [-1, 1], and a step's ``info`` holds position, speed
+and, in the last step, the outcome. `Adapted` brings any environment into that form; `outer` and
+`inner` are the only places where actions are scaled.
 """
 
 import copy
@@ -18,23 +18,22 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
-from bridge.episode import array_of, finite
-from bridge.report import outcome_of
+from bridge.outcomes import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
 from trainer.human.guide import Action, Expert, Reason
-from trainer.learner.replay import Layout
+from trainer.learner.replay import ReplayLayout
 from trainer.scenarios import SCENARIOS, Scene
 from trainer.util import PERIOD_S
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
-MOST_STEPS = 1000  # Of an episode whose environment has no end of its own
-BEARABLE = 1e4  # Of an observation's numbers; the layers of a network take some units
+MOST_STEPS = 1000  # Of an episode whose environment has no limit of its own
+BEARABLE = 1e4  # Largest number in an observation; the layers of a network take some units
 
 
 class Condition(NamedTuple):
-    """How test episodes are driven."""
+    """The scene and the command noise of test episodes."""
 
     scene: Scene
     noise_std: float  # Standard deviation of the Gaussian noise on the command
@@ -42,14 +41,14 @@ class Condition(NamedTuple):
 
 
 CONDITIONS = {
-    "nominal": Condition("nominal", 0.0, "the scene that is trained in"),
+    "nominal": Condition("nominal", 0.0, bridge.CONDITIONS["nominal"]),
     "noise": Condition(
         "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
     ),
-    "variant": Condition("variant", 0.0, "more vehicles, and other types of them"),
-    "dense": Condition("dense", 0.0, "closer and less even traffic"),
+    "variant": Condition("variant", 0.0, bridge.CONDITIONS["variant"]),
+    "dense": Condition("dense", 0.0, bridge.CONDITIONS["dense"]),
 }
-"""Only the first is trained and validated in."""
+"""Training and validation use only the first."""
 
 
 def make_environment(
@@ -58,14 +57,14 @@ def make_environment(
     printed_reward: bool = False,
     period_s: float | None = None,
 ) -> Any:
-    """The environment of a scenario's word, a gymnasium id or ``module:id``.
+    """Make the environment of a scenario's word, a gymnasium id or ``module:id``.
 
-    The two scenarios come as they are, in the scene of a test condition; any other is `Adapted`.
-    With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own weight. A step
-    counts as ``period_s`` where that is given, else as what the environment says, else as 0.1 s,
-    and a line says so.
+    The two scenarios come as they are, in the scene of a test condition; any other environment is
+    `Adapted`. With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own
+    weight. A step lasts ``period_s`` where given, else what the environment says, else 0.1 s, which
+    a line says.
 
-    Raises UserError: no such environment, or one that nothing here could drive.
+    Raises UserError for no such environment, or one that cannot be driven here.
     """
     name, scene = scenario_of(name), CONDITIONS[condition].scene
     if name not in SCENARIOS:
@@ -80,30 +79,30 @@ def make_environment(
 
 
 def scenario_of(name: str) -> str:
-    """The word of a scenario of ours that is named by its id; any other name as it is."""
+    """Return the word of a scenario that is named by its id; any other name unchanged."""
     words = {environment_id: word for word, environment_id in SCENARIOS.items()}
     return words.get(name.rpartition(":")[2], name)
 
 
 def check_trained_in(env: Any, policy: Path, scenario: str) -> None:
-    """Raise UserError where a policy is of another environment; no file decides what is made."""
+    """Raise UserError if a policy is of another environment; no file decides what is made."""
     if scenario != env.scenario:
         raise UserError(f"{policy} was trained in {scenario}, not in {env.scenario}")
 
 
 def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]]:
-    """Observations as the entries that a policy file names; a single one is ``plain``."""
+    """Return observations as the entries that a policy file names; a single one is ``plain``."""
     names = observations.dtype.names
     return {name: observations[name] for name in names} if names else {plain: observations}
 
 
 def task_of(env: Any) -> Task:
-    """What the environment asks of a policy file."""
+    """Return what the environment asks of a policy file."""
     return bridge.describe(env if env.scenario in SCENARIOS else env.env, env.control_period_s)
 
 
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:
-    """The observation, and those that the action held for so many steps would lead to.
+    """Return the observation and those of ``steps`` steps with the action held.
 
     A copy of the environment takes the steps; fewer where the episode ends.
     """
@@ -117,7 +116,7 @@ def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]
 
 
 def check_foresight(env: Any) -> None:
-    """Raise UserError unless a copy of the environment does as it does, and leaves it alone."""
+    """Raise UserError unless the environment can be deep-copied for look-ahead."""
     action = np.full(env.action_space.shape, 0.5, np.float32)
     try:
         trial = copy.deepcopy(env)
@@ -125,48 +124,49 @@ def check_foresight(env: Any) -> None:
         foreseen, again = (foresee(trial, observation, action, 1)[1] for _ in range(2))
         same = foreseen.tobytes() == again.tobytes() == trial.step(action)[0].tobytes()
         why = "" if same else ": it does not do what the environment does"
-    except Exception as error:  # Of any class of an environment.
+    except Exception as error:  # Of any class of an environment
         why = f": {type(error).__name__}: {error}"
     if why:
         raise UserError(f"nothing can be foreseen in {env.scenario} by a copy of it{why}")
 
 
 def expert_of(env: Any, human: str = "expert") -> Expert:
-    """The environment's scripted expert, with a memory of its own.
+    """Return the environment's scripted expert, with a memory of its own.
 
-    ``human`` may be ``module:Class`` of another one, which is made from the environment.
+    ``human`` may be ``module:Class`` of another expert, which is made from the environment.
 
-    Raises UserError: there is none.
+    Raises UserError where there is none.
     """
-    if ":" not in human and env.expert is None:
-        raise UserError(f"{env.scenario} offers no expert(); module:Class may name another one")
     if ":" not in human:
+        if env.expert is None:
+            hint = "module:Class may name another one"
+            raise UserError(f"{env.scenario} offers no expert(); {hint}")
         return env.expert()
     try:
         own = EntryPoint(human, human, "").load()(env.unwrapped)
-    except Exception as error:  # A module may raise anything when it is imported.
+    except Exception as error:  # A module may raise anything when it is imported
         raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
     return _ScaledExpert(env, own)
 
 
 def outer(action_range: tuple[Any, Any], action: Any) -> NDArray[np.float32]:
-    """An action in [-1, 1], float32 [n], in a range (low, high); so it is in a policy file."""
+    """Scale an action from [-1, 1], float32 [n], to a range (low, high), as in a policy file."""
     low, high = action_range
     return np.asarray(low + 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * (high - low), np.float32)
 
 
 def inner(action_range: tuple[Any, Any], action: Any) -> Action:
-    """The action of a range, of any shape, in [-1, 1], float32 [n]."""
+    """Scale an action of a range, of any shape, to [-1, 1], float32 [n]."""
     low, high = action_range
     share = (np.asarray(action, np.float64).reshape(-1) - low) / np.maximum(high - low, 1e-12)
     return np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
 
 
-class Adapted:
+class Adapted(bridge.Adapter):
     """Any environment in the form of the two scenarios.
 
-    It has Box or flat Dict observations, and a Box of actions with finite bounds; ``name`` is what
-    it was asked for by. Raises UserError: what `bridge.environments.describe` refuses.
+    It has Box or flat Dict observations, and a Box of actions with finite bounds. ``name`` is the
+    name by which it was made. Raises UserError for what `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")
@@ -175,68 +175,64 @@ class Adapted:
     def __init__(
         self, env: gymnasium.Env[Any, Any], name: str, period_s: float | None = None
     ) -> None:
-        self.env, self.scenario = env, name
-        self.unwrapped: Any = env.unwrapped
+        super().__init__(env, bridge.describe(env, period_s, PERIOD_S))
+        self.scenario, self.unwrapped = name, env.unwrapped
         self.observation_space = env.observation_space
-        task = bridge.describe(env, period_s, PERIOD_S)
-        self.layout = _layout(task, isinstance(env.observation_space, Dict))
-        self.control_period_s = task.control_period_s
-        self.action_names = tuple(row.name for row in task.action)
-        own = self._own_space = env.action_space
-        assert isinstance(own, Box)  # described
-        self.action_range = own.low.reshape(-1), own.high.reshape(-1)
-        self.action_space = Box(-1.0, 1.0, (len(task.action),), np.float32)
+        self.control_period_s = self.task.control_period_s
+        self.action_names = tuple(row.name for row in self.task.action)
+        entries = [(n, np.dtype(e.dtype), tuple(e.shape)) for n, e in self.task.observation.items()]
+        several = isinstance(env.observation_space, Dict)
+        (_, dtype, shape), *_ = entries
+        self.layout = ReplayLayout((), np.dtype(entries)) if several else ReplayLayout(shape, dtype)
+        self.action_range = self._space.low.reshape(-1), self._space.high.reshape(-1)
+        self.action_space = Box(-1.0, 1.0, (len(self.task.action),), np.float32)
+        self.rest_action: Action = inner(self.action_range, self.hands_off)
         self.key_rate_per_s = float(bridge.offered(env, "key_rate_per_s", 5.0))
         self.expert = self._expert if bridge.offered(env, "expert") else None
         if env.spec is None or env.spec.max_episode_steps is None:
             most = f"an episode ends after {MOST_STEPS} steps at the latest"
             bridge.say_once(f"{name} has no limit of its own: {most}")
             self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)
-        self._last = self.rest_action
+        self._last_action = self.rest_action
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Begin an episode."""
-        self._last = self.rest_action
+        self._last_action = self.rest_action
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._seen(observation), _said(info)
+        return self._seen(observation), _known(info)
 
     def step(self, action: Action) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
-        """One control period."""
-        self._last = np.asarray(action, np.float32)
-        observation, reward, terminated, truncated, info = self.env.step(self._own(action))
-        info = _said(info)
+        """Drive for one control period."""
+        self._last_action = np.asarray(action, np.float32)
+        own = outer(self.action_range, action).reshape(self._space.shape)
+        observation, reward, terminated, truncated, info = self.env.step(
+            own.astype(self._space.dtype)
+        )
+        info = _known(info)
         if terminated or truncated:
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
-        reward = finite("reward", reward)
+        reward = bridge.finite("reward", reward)
         return self._seen(observation), reward, bool(terminated), bool(truncated), info
+
+    def close(self) -> None:
+        """Close the environment: of some simulators only one may live in a process."""
+        self.env.close()
 
     @property
     def brake_action(self) -> Action:
         """The environment's own stop, or the last action where it has none."""
         own = bridge.offered(self.env, "brake_action")
-        return self._last if own is None else inner(self.action_range, own)
-
-    def press_brake(self, pressed: bool) -> None:
-        """Press or release the brake, where it has one."""
-        bridge.offered(self.env, "press_brake", lambda pressed: None)(pressed)
-
-    def scene(self) -> dict[str, Any] | None:
-        """The scene from above in metres; None where it has none."""
-        return bridge.scene_of(self.env)
+        return self._last_action if own is None else inner(self.action_range, own)
 
     @property
     def can_be_seen(self) -> bool:
         """Whether there is something to show a person."""
         return callable(bridge.offered(self.env, "scene")) or self._draws
 
-    def close(self) -> None:
-        """Close it: of some simulators only one may live in a process."""
-        self.env.close()
-
     def render(self) -> NDArray[np.uint8]:
-        """The environment's own picture, uint8 [height, width, 3]; UserError without one."""
+        """Return the environment's picture, uint8 [height, width, 3]; UserError without one."""
         picture: Any = self.env.render() if self._draws else None
         if not isinstance(picture, np.ndarray):
             raise UserError(f"{self.scenario} draws no picture (render_mode rgb_array)")
@@ -248,32 +244,22 @@ class Adapted:
 
     @property
     def keys(self) -> dict[str, Action]:
-        """Key -> the action while it is held, in [-1, 1]; of a single action the arrows."""
+        """Key -> the action while it is held, in [-1, 1]; the arrows for a single action."""
         own: Mapping[str, Any] = bridge.offered(self.env, "keys", {})
         if not own and len(self.action_names) == 1:
-            one = np.ones(1, np.float32)
-            return {"up": one, "right": one, "down": -one, "left": -one}
+            full = np.ones(1, np.float32)
+            return {"up": full, "right": full, "down": -full, "left": -full}
         return {name: inner(self.action_range, action) for name, action in own.items()}
-
-    @property
-    def rest_action(self) -> Action:
-        """Hands off: zeros of the environment's own."""
-        return inner(self.action_range, np.clip(0.0, *self.action_range))
-
-    def _own(self, action: Action) -> NDArray[Any]:
-        space = self._own_space
-        return outer(self.action_range, action).reshape(space.shape).astype(space.dtype)
 
     def _expert(self) -> Expert:
         return _ScaledExpert(self, self.env.get_wrapper_attr("expert")())
 
     def _seen(self, observation: Any) -> NDArray[Any]:
-        """As one array; UserError for one that no network could learn from."""
+        """Return one array; UserError for numbers that no network could learn from."""
         seen = np.zeros(self.layout.shape, self.layout.dtype)
-        given = observation if seen.dtype.names else {bridge.PLAIN: observation}
-        for name, entry in entries_of(seen, bridge.PLAIN).items():
-            entry[...] = array_of(given, name, entry.dtype, entry.shape)
-            largest = np.abs(entry).max() if entry.dtype.kind in "fi" else 0.0
+        for name, array in self.arrays(observation).items():
+            (seen[name] if seen.dtype.names else seen)[...] = array
+            largest = np.abs(array).max() if array.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
                 what = "holds a number that is not finite"
                 raise UserError(f"an observation of {self.scenario} {what}")
@@ -284,7 +270,7 @@ class Adapted:
 
 
 class _ScaledExpert(Expert):
-    """An expert whose actions are the environment's own."""
+    """An expert whose actions are in the environment's own range."""
 
     def __init__(self, env: Any, own: Any) -> None:
         self._env, self._own = env, own
@@ -294,25 +280,19 @@ class _ScaledExpert(Expert):
         getattr(self._own, "reset", lambda: None)()
 
     def act(self, observation: Any = None) -> Action:
-        """The expert's action, from the true state."""
+        """Return the expert's action, from the true state."""
         return inner(self._env.action_range, self._own.act())
 
     def wants_control(self, action: Action) -> Reason | None:
-        """Why it would take over from ``action``, or None."""
+        """Return why it would take over from ``action``, or None."""
         return self._own.wants_control(outer(self._env.action_range, action))
 
     def may_return(self) -> bool:
-        """Whether it would give control back here."""
+        """Return whether it would give control back here."""
         return bool(getattr(self._own, "may_return", lambda: True)())
 
 
-def _said(info: Mapping[str, Any]) -> dict[str, Any]:
-    """The info with all that the trainer looks at; what is not known is nan, or no distance."""
+def _known(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the info with distance and speed, which are 0 and NaN where they are unknown."""
     unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
     return unknown | {key: value for key, value in info.items() if value is not None}
-
-
-def _layout(task: Task, several: bool) -> Layout:
-    entries = [(name, np.dtype(e.dtype), tuple(e.shape)) for name, e in task.observation.items()]
-    (_, dtype, shape), *_ = entries
-    return Layout((), np.dtype(entries)) if several else Layout(shape, dtype)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bridge.report import GOAL
+from bridge.outcomes import GOAL
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
 from trainer.training.config import CURVE_FILE
@@ -26,7 +26,6 @@ Values = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw it; returns the exit status."""
     if arguments.out is None and len(arguments.run_dirs) > 1:
         raise UserError("several runs go into one picture: --out F.png")
     print(write_learning_curve(*map(Path, arguments.run_dirs), out=arguments.out))
@@ -36,10 +35,10 @@ def run(arguments: argparse.Namespace) -> int:
 def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
     """Draw return, surviving distance, success and human share over the episodes as a PNG.
 
-    Several runs are a thin line each, and their mean up to the end of the shortest. ``out``: the
-    file; by default in the first run's directory.
+    Each of several runs is a thin line; the thick one is their mean, up to the end of the shortest.
+    ``out`` is by default in the first run's directory.
 
-    Raises UserError: one of the runs has no metrics yet, or the file cannot be written.
+    Raises UserError: a run has no metrics yet, or the file cannot be written.
     """
     path = run_dirs[0] / CURVE_FILE if out is None else Path(out)
     check_writable(path)
@@ -61,7 +60,7 @@ def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
         panel.plot(episodes, mean, color="C0", label=label)
         panel.set_title(PANELS[name])
         panel.grid(alpha=0.3)
-    # Success of the policy alone where all runs were validated, and its mean.
+    # Mean success of the policy alone, where all runs were validated.
     validated = np.array([run["validation"][:shortest] for run in runs])
     tested = ~np.isnan(validated).any(axis=0)
     means = validated[:, tested].mean(axis=0)
@@ -82,7 +81,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def moving_average(values: Values, window: int) -> Values:
-    """The mean of the last ``window`` values (fewer at the start), same length."""
+    """Return the means of the last ``window`` values (fewer at the start), same length."""
     sums = np.convolve(values, np.ones(window))[: len(values)]
     return sums / np.minimum(np.arange(1, len(values) + 1), window)
 
@@ -93,7 +92,7 @@ def _columns(run_dir: Path) -> dict[str, Values]:
         raise UserError(f"{run_dir} holds no metrics to draw")
 
     def column(name: str) -> Values:
-        # Kept results have nothing where there was no number.
+        # Kept results have an empty field where there was no number.
         return np.array([row.get(name) or "nan" for row in rows], dtype=float)
 
     return {

@@ -1,4 +1,4 @@
-"""Write a trained actor as the policy file that may drive (contract section 4)."""
+"""Write a trained actor as a policy file (contract section 4)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PARITY_TOLERANCE = 1e-5
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export, check, sign; returns the exit status."""
+    """Export, check and sign; return the exit status."""
     names = ("out", "scenario", "key")
     made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
     signed = "signed" if arguments.key else "not signed"
@@ -51,10 +51,10 @@ def export(
 ) -> Export:
     """Write a run's actor as a policy file, as ``python -m trainer export`` does.
 
-    ``run`` is what ``train`` gave, or its directory; ``scenario`` what it was trained in, to be
-    named where that is of a module; ``key`` the private key (PEM) that signs.
+    ``run`` is the result of ``train``, or its directory; ``scenario`` what it was trained in, to be
+    named where that is ``module:ID``; ``key`` the private key (PEM) that signs.
 
-    Raises UserError: no run there, a wrong name or key, or a file that would do something else.
+    Raises UserError: no run there, a wrong name or key, or a file that differs from the actor.
     """
     scenario = scenario or getattr(run, "scenario", None)
     # Absolute: a simulator may change the working directory.
@@ -77,7 +77,7 @@ def export(
 
 @dataclass(frozen=True)
 class Export:
-    """A policy file's bytes and how far onnxruntime is from torch on real observations."""
+    """A policy file's bytes, and the largest difference of onnxruntime from torch."""
 
     model: bytes
     policy_id: str
@@ -87,12 +87,12 @@ class Export:
 def export_policy(
     actor: Actor, label: dict[str, Any], training: dict[str, Any], env: Any = None
 ) -> Export:
-    """Convert, describe, check and compare.
+    """Convert an actor, describe it in a manifest, and compare torch with onnxruntime.
 
     ``label`` has ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run; the manifest
-    gets its whole config (``training``). ``env`` is that scenario, by default a new one.
+    holds its whole config (``training``). ``env`` is that scenario, by default a new one.
 
-    Raises UserError: the file would not do what the network does.
+    Raises UserError: the two differ.
     """
     env = env or make_environment(label["scenario"], period_s=period_of(training))
     network = _InOwnUnits(actor, env.action_range).eval()
@@ -118,7 +118,7 @@ def export_policy(
 
 
 class _InOwnUnits(torch.nn.Module):
-    """The actor with its actions in the environment's range, as ``environments.outer`` has it."""
+    """The actor with its actions in the environment's range, as ``environments.outer`` scales."""
 
     reach: torch.Tensor
 
@@ -135,7 +135,7 @@ class _InOwnUnits(torch.nn.Module):
 
 
 def real_observations(driven: Any, count: int, seed: int = 0) -> NDArray[Any]:
-    """Observations [count, ...] from driving an environment, or a scenario, at random."""
+    """Collect observations [count, ...] by driving an environment, or a scenario, at random."""
     env = make_environment(driven) if isinstance(driven, str) else driven
     random = np.random.default_rng(seed)
     size = env.action_space.shape
@@ -153,7 +153,7 @@ def real_observations(driven: Any, count: int, seed: int = 0) -> NDArray[Any]:
 
 
 def parity(network: torch.nn.Module, model: bytes, entries: Mapping[str, NDArray[Any]]) -> float:
-    """Largest absolute difference between torch and onnxruntime over observations, by entry."""
+    """Return the largest absolute difference between torch and onnxruntime on observations."""
     session = open_network(model)
     entries = {name: np.ascontiguousarray(values) for name, values in entries.items()}
     with torch.no_grad():

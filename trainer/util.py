@@ -1,8 +1,7 @@
-"""Small things that several parts of the trainer need.
+"""Helpers of the trainer: seeds, ranges of settings, torch files, locked directories, processes.
 
-In this order: seeds, ranges of settings, torch files, one process in a directory, processes and
-their end, and what made a result. torch takes two seconds to load, so it is imported only where a
-function needs it: ``--help`` and the configs need none of it.
+torch takes two seconds to load and is imported only in the functions that need it: ``--help`` and
+the configs do not.
 """
 
 import io
@@ -31,18 +30,18 @@ from edge_runtime.util import UserError, open_regular
 PERIOD_S = 0.1  # Of an environment that does not say how long a step is
 CPU_INFO = Path("/proc/cpuinfo")
 WRITTEN = ("results/paper", "results/guidance")
-"""What the experiments write themselves. Human models, which decide trainings, count as source."""
+"""The experiments' own output. Human models, which decide trainings, count as source."""
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
 FROM_ZERO: Range = (0, math.inf)
 ABOVE_ZERO: Range = (2.0**-126, math.inf)
-"""From float32's smallest normal number on: what is less may become zero on its way."""
+"""From float32's smallest normal number on: smaller numbers may become zero."""
 SHARE: Range = (0, 1)
 
 
 class Purpose(IntEnum):
-    """What is drawn at random in a run: each purpose has a stream of its own."""
+    """A use of random numbers in a run; each has a stream of its own."""
 
     TRAINING = 0
     VALIDATION = 1
@@ -55,20 +54,19 @@ class Purpose(IntEnum):
 
 
 def episode_seed(run_seed: int, purpose: Purpose, episode: int) -> int:
-    """The environment's seed for an episode: above 2**31, so that tests may use small numbers."""
+    """Return the environment's seed for an episode, above 2**31: tests use small numbers."""
     (word,) = np.random.SeedSequence([run_seed, purpose, episode]).generate_state(1)
     return (1 << 31) + int(word) // 2
 
 
 def random_stream(run_seed: int, purpose: Purpose) -> np.random.Generator:
-    """A random stream for one purpose."""
     return np.random.default_rng([run_seed, purpose])
 
 
 def check_ranges(config: Any, ranges: Mapping[Range, Sequence[str]]) -> None:
     """Raise UserError unless every number of a dataclass is finite and within its range.
 
-    That is at least 0, but for the fields that ``ranges`` names. A default may be outside.
+    Fields that ``ranges`` does not name are at least 0. A default may be outside its range.
     """
     named = {name: limits for limits, names in ranges.items() for name in names}
     for field in fields(config):
@@ -89,7 +87,7 @@ def _text(low: float, high: float) -> str:
 
 
 def save_torch(path: Path, state: Any) -> None:
-    """Write a state whole or not at all."""
+    """Write a state, whole or not at all."""
     import torch
 
     buffer = io.BytesIO()
@@ -106,7 +104,7 @@ def load_torch(path: Path) -> dict[str, Any]:
 
     try:
         with open_regular(path) as stream:
-            # torch writes a checksum of each part, and looks at none.
+            # torch writes a checksum of each part, and checks none.
             if damaged := zipfile.ZipFile(stream).testzip():
                 raise ValueError(f"{damaged} is damaged")
             stream.seek(0)
@@ -117,13 +115,13 @@ def load_torch(path: Path) -> dict[str, Any]:
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
     except Exception as error:
-        # torch raises its own unpickling errors for foreign files; ours hold a table of names.
+        # torch raises unpickling errors of its own for foreign files.
         raise UserError(f"{path} is not a checkpoint of this project") from error
 
 
 @contextmanager
 def fitting(words: str) -> Iterator[None]:
-    """Make a UserError of these words of whatever a crafted or foreign file leads to."""
+    """Turn any error that a crafted or foreign file causes into a UserError of these words."""
     try:
         yield
     except UserError:
@@ -136,7 +134,7 @@ def fitting(words: str) -> Iterator[None]:
 def claimed(directory: Path) -> Iterator[None]:
     """Be the only process of this machine that trains in a directory.
 
-    It is made if it is missing, and removed again if it stays empty.
+    A missing directory is made, and removed again if it stays empty.
 
     Raises UserError: another process trains there, or the directory cannot be made or written.
     """
@@ -154,10 +152,10 @@ def claimed(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
-    """Hold a directory against other processes of this machine; gives whether it could in so long.
+    """Lock a directory against other processes; yield whether that succeeded in ``patience_s``.
 
-    It is made if it is missing. The lock is the kernel's: when a process dies, however it dies, its
-    lock is gone with it.
+    A missing directory is made. The kernel keeps the lock: it ends with the process that holds it,
+    however that dies.
 
     Raises UserError: the directory cannot be made or written.
     """
@@ -173,7 +171,7 @@ def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
 
 
 def cores() -> int:
-    """Processor cores that this process may use, where the system tells; else all."""
+    """Return the number of cores that this process may use, where the system tells; else all."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -181,7 +179,7 @@ def cores() -> int:
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Processes started here never see ^C, which a terminal sends to all: their parent ends them.
+    """Keep ^C, which a terminal sends to all, from processes started here: the parent ends them.
 
     Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
     """
@@ -193,7 +191,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def die_with_parent() -> None:
-    """End this process when its parent has ended; to be run in a thread."""
+    """End this process when its parent has ended; run it in a thread."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -201,17 +199,17 @@ def die_with_parent() -> None:
 
 
 def kept(path: str) -> str:
-    """The path of what the repository keeps, from whatever folder; in its root as it is."""
+    """Return the path of a file of the repository, from any folder; unchanged in its root."""
     root = Path(__file__).parents[1]
     return path if Path.cwd() == root else str(root / path)
 
 
 @cache
 def source_revision(directory: Path = Path(__file__).parent) -> str:
-    """A repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
+    """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
 
-    As it was when first asked for: what is committed later is not what this process runs. Results
-    that a run has just written make no other source.
+    As of the first call: this process does not run what is committed later. The experiments' own
+    output does not count.
     """
     commit = _git(directory, "rev-parse", "HEAD")
     if commit is None:
@@ -222,7 +220,7 @@ def source_revision(directory: Path = Path(__file__).parent) -> str:
 
 
 def _git(directory: Path, *arguments: str) -> str | None:
-    """What git says; None where it fails."""
+    """Return git's output; None where it fails."""
     try:
         done = subprocess.run(
             ["git", *arguments], cwd=directory, capture_output=True, text=True, check=True
@@ -233,7 +231,7 @@ def _git(directory: Path, *arguments: str) -> str | None:
 
 
 def cpu_info() -> list[str]:
-    """The lines that Linux has about each core; none elsewhere."""
+    """Return Linux' lines about each core; none elsewhere."""
     try:
         return CPU_INFO.read_text(errors="replace").splitlines()
     except OSError:
@@ -241,7 +239,7 @@ def cpu_info() -> list[str]:
 
 
 def processor_model() -> str:
-    """The processor's name; on Linux ``platform`` knows no more than its instruction set."""
+    """Return the processor's name; on Linux ``platform`` only knows its instruction set."""
     for line in cpu_info():
         if line.startswith("model name") and (name := line.partition(":")[2].strip()):
             return name

@@ -1,4 +1,4 @@
-"""What all rerun views share: their colours, and where a view goes.
+"""What all rerun views share: their colours, ``bridge view``'s options, and where a view goes.
 
 It goes to a window, a local web page, or a file. Window and page are rerun's viewer as a process of
 its own, on loopback: by itself it would bind all interfaces.
@@ -16,17 +16,17 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from edge_runtime.cli import sigterm_as_interrupt, whole_number
+from edge_runtime.cli import command, sigterm_as_interrupt, whole_number
 from edge_runtime.files import behind_link, check_writable, make_directory
 from edge_runtime.reach import check_port_is_free, free_endpoint
 from edge_runtime.util import UserError
+from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
 if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without it
     import rerun as rr
@@ -45,34 +45,30 @@ APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 )
-
+GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
+PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
+"""Of the road from above, as people see it; the other cars have APPLIED's colour."""
 SPREAD = 150 / 360
 """Of the hue: what is asked and what is reached stay apart, however many actions there are."""
 
 
 def shades(colour: Colour, count: int) -> list[Colour]:
-    """Colours for so many actions, in hues that go on from ``colour``, which is the first."""
+    """Return ``count`` colours whose hues go on from ``colour``, the first of them."""
     hue, light, saturation = colorsys.rgb_to_hls(*(part / 255 for part in colour))
     hues = (hue + SPREAD * number / count for number in range(count))
     turned = [colorsys.hls_to_rgb(each % 1.0, light, saturation) for each in hues]
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in turned]
 
 
-GROUND, ROAD, MARKING = (222, 229, 216), (92, 97, 105), (235, 235, 235)
-PATH, GOAL, GLASS = (120, 190, 255), (84, 200, 120), (30, 34, 40)
-"""Of the road from above, as people see it; the other cars have APPLIED's colour."""
-
 LOOPBACK = "127.0.0.1"
-START_S = 30.0  # How long it may take until it listens
+START_S = 30.0  # Until a viewer listens, at most
 LOOK_S = 0.05
 LEAST_FREE_BYTES = 1 << 20
-WRITE_S = 60.0  # How long a disk may take for what was drawn
-FLUSH_S = 5.0  # How long it may take to receive what was drawn
-END_S = 1.0  # How long a viewer that takes no more may take to end
-GRPC_PORT = 9876
-WEB_PORT = 9090
-SPAWN, SERVE = "spawn", "serve"
-SUFFIX = ".rrd"
+WRITE_S = 60.0  # Until a disk has taken what was drawn, at most
+FLUSH_S = 5.0  # Until a viewer has taken what was drawn, at most
+END_S = 1.0  # Until a viewer that takes no more has ended, at most
+GRPC_PORT, WEB_PORT, FOXGLOVE_PORT = 9876, 9090, 8765  # Foxglove looks at its port first
+SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
 
 class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
@@ -83,16 +79,28 @@ class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
         self.why = why
 
 
-def flush(recording: rr.RecordingStream) -> None:
-    """Wait until all that was drawn has arrived; ViewerGone where it does not."""
-    try:
-        recording.flush(timeout_sec=FLUSH_S)
-    except RuntimeError as error:
-        raise ViewerGone(str(error)) from None
+@command(
+    "bridge.rerun.wire_view:run",
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view drive.mcap --save drive.rrd",
+    "python -m bridge view --foxglove",
+)
+def view(parser: argparse.ArgumentParser) -> None:
+    from bridge.ports import add_options  # It loads zenoh, which the trainer goes without.
+
+    text = "show this recording of bridge record, instead of listening"
+    parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
+    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
+    port: dict[str, Any] = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
+    add_sink(parser).add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **port)
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def add_sink(parser: argparse.ArgumentParser) -> Any:
-    """The group of ``--spawn``, ``--serve``, ``--save F.rrd``: kept as ``sink``, None without.
+    """Add ``--spawn``, ``--serve`` and ``--save F.rrd``, kept as ``sink``; return their group.
 
     ``--port`` of the page stands beside it.
     """
@@ -101,17 +109,11 @@ def add_sink(parser: argparse.ArgumentParser) -> Any:
     for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
         where.add_argument(f"--{kind}", dest="sink", action="store_const", const=kind, help=text)
     text = "write a recording instead of showing it"
-    where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
+    where.add_argument("--save", dest="sink", metavar=f"F{SUFFIX}", help=text)
     text = "of --serve: the page's port, and N + 1 for its data"
     text += f" (default: {WEB_PORT} and {GRPC_PORT}, or two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
     return where
-
-
-def _file(path: str) -> str:
-    if not path.endswith(SUFFIX):
-        raise UserError(f"{path}: rerun opens only what is called F{SUFFIX}")
-    return os.path.abspath(path)
 
 
 def has_display() -> bool:
@@ -121,22 +123,21 @@ def has_display() -> bool:
 
 
 def check_sink(sink: str | None, port: int | None = None) -> str:
-    """The sink: spawn (None is that, too), serve, or a path that ends in .rrd.
+    """Return the sink: spawn (also for None), serve, or an absolute path that ends in .rrd.
 
-    UserError for any other, and at once where nothing could be shown there. ``port``: of the page.
+    Raise UserError for any other, and where nothing can be shown there. ``port``: of the page.
     """
     sink = SPAWN if sink is None else sink
     if port is not None and sink != SERVE:
         raise UserError(f"--port is that of a page: --{SERVE}")
     if sink.endswith(SUFFIX):
-        sink = os.path.abspath(sink)
-        check_writable(sink)
-    elif sink == SERVE:
-        _page_ports(port)
-    elif sink != SPAWN:
+        return str(check_writable(sink))
+    if sink not in (SPAWN, SERVE):
         raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    elif not has_display():
+    if sink == SPAWN and not has_display():
         raise UserError("no display for a window here: serve a page, or save a file")
+    if sink == SERVE:
+        _page_ports(port)
     return sink
 
 
@@ -144,12 +145,12 @@ def check_sink(sink: str | None, port: int | None = None) -> str:
 def open_sink(
     sink: str, application: str, blueprint: rrb.Blueprint, port: int | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording that goes to ``spawn`` (a window), ``serve`` (a page on loopback) or a file.
+    """Open a recording that goes to a window (``spawn``), a page (``serve``) or a file.
 
     ``application`` keeps layouts of different kinds apart. A window stays open afterwards; a page
-    is served until then. SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another
-    use for it: a file is to be finished, and a server not to be left behind. ``port``: of the page,
-    as in ``check_sink``. ViewerGone: there is no viewer any more, or none has come.
+    is served until then, at ``port`` if it is given. SIGTERM raises KeyboardInterrupt meanwhile,
+    unless the command has another use for it: the file is to be finished, the server to be ended.
+    Raise ViewerGone where the viewer ends, hangs, or never comes.
     """
     import rerun as rr
 
@@ -157,6 +158,14 @@ def open_sink(
     opened = _saved(recording, sink, blueprint) if sink.endswith(SUFFIX) else None
     with sigterm_as_interrupt(), opened or _shown(recording, sink, blueprint, port):
         yield recording
+
+
+def flush(recording: rr.RecordingStream) -> None:
+    """Wait until all that was drawn has arrived; ViewerGone where it does not."""
+    try:
+        recording.flush(timeout_sec=FLUSH_S)
+    except RuntimeError as error:
+        raise ViewerGone(str(error)) from None
 
 
 @contextlib.contextmanager
@@ -189,34 +198,28 @@ def _shown(
     recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint, page_port: int | None
 ) -> Iterator[None]:
     """Draw for a window or a page; ViewerGone where it does not last."""
-    if kind == SERVE:
-        page_port, port = _page_ports(page_port)
-        page = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page_port)]
-        viewer = Viewer(page, [port, page_port])
-    else:
-        port = free_port()
-        viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
+    ports = _page_ports(page_port) if kind == SERVE else (free_port(),)
+    data = str(ports[-1])
+    page = ["--serve-web", "--web-viewer-port", str(ports[0])]
+    options = page if kind == SERVE else ["--expect-data-soon"]
+    viewer = Viewer([*options, "--port", data], ports)
     try:
-        url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        url = f"rerun+http://{LOOPBACK}:{data}/proxy"
         recording.connect_grpc(url, default_blueprint=blueprint)
         if kind == SERVE:
-            print(f"open http://{LOOPBACK}:{page_port}/?url={quote(url, safe='')}", flush=True)
+            print(f"open http://{LOOPBACK}:{ports[0]}/?url={quote(url, safe='')}", flush=True)
         try:
             yield
         finally:
             flush(recording)
     except ViewerGone as gone:
         why = viewer.last_words(END_S) or gone.why
-        viewer.end()
-        with contextlib.suppress(ViewerGone):  # Here, so that what is told below is the cause.
-            viewer.leave(recording)
+        viewer.end()  # Where it hangs, rerun would wait for it for ever.
         raise ViewerGone(why) from None
     finally:
-        try:
-            viewer.leave(recording)
-        finally:
-            if kind == SERVE:
-                viewer.end()
+        recording.disconnect()
+        if kind == SERVE:
+            viewer.end()
 
 
 class Viewer:
@@ -250,17 +253,8 @@ class Viewer:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
-    def leave(self, recording: rr.RecordingStream) -> None:
-        """Disconnect from it; ViewerGone where it hangs, which rerun would wait for, for ever."""
-        patience = threading.Timer(FLUSH_S, self.end)
-        patience.start()
-        recording.disconnect()
-        if not patience.is_alive():
-            raise ViewerGone("it hangs")
-        patience.cancel()
-
     def last_words(self, wait_s: float = 0.0) -> str:
-        """Why it has ended; empty where it runs on for so long."""
+        """Return why it has ended; an empty text if it is still running after ``wait_s``."""
         try:
             self._process.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -280,15 +274,12 @@ def _page_ports(port: int | None) -> tuple[int, int]:
         except UserError:
             if port is not None:
                 raise UserError(f"port {each} is in use; name another --port") from None
-            first = second = free_port()  # Another view has the usual ones.
-            while second == first:
-                second = free_port()
-            return first, second
+            return free_port(), free_port()  # Another view has the usual ones.
     return ports
 
 
 def free_port() -> int:
-    """A port that is not in use."""
+    """A port that is not in use, and not returned to this process again soon."""
     return int(free_endpoint().rpartition(":")[2])
 
 

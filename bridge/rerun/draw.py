@@ -1,7 +1,7 @@
-"""What both views draw: the road from above, plots, and their places in a layout.
+"""What the views of a drive (``wire_view``) and of a training (``trainer.view``) share.
 
-Metres; y grows downwards, as in the scene. Cars are lines, because rerun's flat boxes cannot be
-turned.
+A `Canvas` draws lines, states, pictures and the road from above; the functions after it lay views
+out. Metres; y grows downwards, as in the scene. Cars are lines: rerun cannot turn its flat boxes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import SeenCar, SeenScene
+from bridge.messages import Point, SeenCar, SeenScene
 from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colour, shades
 
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
@@ -21,66 +21,117 @@ PURPLE, GREY = (150, 80, 200), (120, 124, 130)
 MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
 CAMERA = "camera"  # From here the road is seen
 NEAR_M = 20.0  # Cars farther from the path than this do not widen the view
-Bounds = tuple[tuple[float, float], tuple[float, float]]  # Ranges of x and y, m
-ALL_OF_IT = rrb.TimeRange(
-    start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
-)
-"""The whole time axis; otherwise rerun scrolls it with the cursor."""
 PICTURE_INTERVAL_S = 0.1
-"""Ten a second are as many as a control period makes, and plenty for an eye."""
+"""Ten pictures a second, as many as a control period of ours makes, are plenty for an eye."""
+Bounds = tuple[tuple[float, float], tuple[float, float]]  # Ranges of x and y, m
+WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+"""The whole time axis; without it rerun scrolls the axis with the cursor."""
 
 
-def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
-    """Draw what stays for an episode: roads, path and goal."""
-    _lines(recording, "road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
-    _lines(recording, "road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
-    _lines(recording, "road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
-    if scene.goal is not None:
-        recording.log(
-            "road/goal",
-            rr.Points2D([scene.goal], colors=[GOAL], radii=[0.9], labels=["goal"], draw_order=2.0),
-        )
+class Canvas:
+    """Draws on a recording at the time that ``stand_at`` has set; used by one thread.
+
+    ``lines``: path of each line that is there from the start -> its colour.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
+        self.recording, self.log = recording, recording.log
+        self._colours, self._names = lines, {path: [_name(path)] for path in lines}
+        self._ground: object = None
+        for path, colour in lines.items():
+            self.style(path, [colour], self._names[path])
+
+    def stand_at(self, steps: Mapping[str, int], seconds: Mapping[str, float] = {}) -> None:
+        """Set the time, by timeline, of all that is drawn next."""
+        self.recording.reset_time()
+        for timeline, step in steps.items():
+            self.recording.set_time(timeline, sequence=step)
+        for timeline, time_s in seconds.items():
+            self.recording.set_time(timeline, duration=time_s)
+
+    def scalar(self, path: str, *values: float) -> None:
+        """Draw the newest value of a line, or of each of several lines at one path."""
+        self.log(path, rr.Scalars(values))
+
+    def style(self, path: str, colours: Sequence[Colour], names: Sequence[str]) -> None:
+        """Give the lines at a path their colours and names."""
+        style = rr.SeriesLines(colors=colours, names=names, widths=[2.0] * len(names))
+        self.log(path, style, static=True)
+
+    def name_actions(self, path: str, names: Sequence[str]) -> None:
+        """Tell several actions at one path apart by their names and by shades of its colour."""
+        shown = [f"{_name(path)} {name}" for name in names] if len(names) > 1 else [_name(path)]
+        if self._names[path] != shown:
+            self._names[path] = shown
+            self.style(path, shades(self._colours[path], len(names)), shown)
+
+    def lanes(self, path: str, colours: Mapping[str, Colour]) -> None:
+        """Declare the states that may be logged at a path, and their colours."""
+        names = list(colours)
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=list(colours.values()))
+        self.log(path, lanes, static=True)
+
+    def status(self, lines: Sequence[str]) -> None:
+        """Replace the text that says how things stand; empty lines are left out."""
+        text = "\n\n".join(filter(None, lines))
+        self.log("status", rr.TextDocument(text, media_type="text/markdown"))
+
+    def is_new_ground(self, ground: object) -> bool:
+        """Whether another ground is to be shown than the one of the last call."""
+        before, self._ground = self._ground, ground
+        return before != ground
+
+    def draw_ground(self, scene: SeenScene) -> None:
+        """Draw what does not move: roads, path and goal."""
+        self._strips("road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
+        self._strips("road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
+        self._strips("road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
+        if scene.goal is not None:
+            look: Any = {"colors": [GOAL], "radii": [0.9], "labels": ["goal"], "draw_order": 2.0}
+            self.log("road/goal", rr.Points2D([scene.goal], **look))
+
+    def draw_cars(self, scene: SeenScene, bounds: Bounds, ego_colour: Colour) -> None:
+        """Draw the cars; the view moves to above the ego car where that has left the bounds."""
+        self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene, bounds), 0.0]))
+        for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
+            cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
+            shapes = [shapes_of(car) for car in cars]
+            half_m = [car.width_m / 2 for car in cars]
+            for part, shade, radius_m, order in (
+                ("body", colour, half_m, 3.0),
+                ("outline", GLASS, 0.1, 4.0),
+                ("glass", GLASS, 0.3, 5.0),
+            ):
+                path, strips = f"road/{name}/{part}", [shape[part] for shape in shapes]
+                self._strips(path, strips, shade, radius_m, order)
+
+    def _strips(self, path: str, strips: Any, colour: Colour, radii_m: Any, order: float) -> None:
+        drawn = rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order)
+        self.log(path, drawn)
 
 
-def draw_cars(recording: rr.RecordingStream, scene: SeenScene, ego_colour: Colour) -> None:
-    """Draw the cars; the ego car's colour may say what it does, or who decides."""
-    for name, ego in (("traffic", False), ("ego", True)):
-        path, colour = f"road/{name}", ego_colour if ego else APPLIED
-        cars = [car for car in scene.vehicles if car.ego == ego]
-        half_m = [car.width_m / 2 for car in cars]
-        _lines(recording, f"{path}/body", [body(car) for car in cars], colour, half_m, order=3.0)
-        _lines(recording, f"{path}/outline", [outline(car) for car in cars], GLASS, 0.1, order=4.0)
-        _lines(recording, f"{path}/glass", [windscreen(car) for car in cars], GLASS, 0.3, order=5.0)
+def _name(path: str) -> str:
+    return path.rpartition("/")[2].replace("_", " ")
 
 
-def _lines(
-    recording: rr.RecordingStream,
-    path: str,
-    strips: Sequence[Sequence[Sequence[float]]],
-    colour: Colour,
-    radii_m: float | list[float],
-    order: float,
-) -> None:
-    recording.log(path, rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order))
+def shapes_of(car: SeenCar) -> dict[str, list[Point]]:
+    """A car's lines: its outline, the windscreen, which tells front from back, and the body.
 
+    The body is an axis that fills the outline when it is drawn as wide as the car (round ends).
+    """
+    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
 
-def outline(car: SeenCar) -> list[tuple[float, float]]:
-    """Return the closed outline of the oriented box (five points)."""
+    def placed(*points: Point) -> list[Point]:
+        return [(car.x + a * cos - b * sin, car.y + a * sin + b * cos) for a, b in points]
+
     ahead, aside = car.length_m / 2, car.width_m / 2
-    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
-    return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
-
-
-def body(car: SeenCar) -> list[tuple[float, float]]:
-    """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
-    reach = max(0.0, (car.length_m - car.width_m) / 2)
-    return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
-
-
-def windscreen(car: SeenCar) -> list[tuple[float, float]]:
-    """Return a bar across the car, before its middle, that tells front from back."""
-    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
-    return [_place(car, ahead, -aside), _place(car, ahead, aside)]
+    reach = max(0.0, ahead - aside)
+    box = [(ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside), (ahead, aside)]
+    return {
+        "body": placed((-reach, 0.0), (reach, 0.0)),
+        "outline": placed(*box),
+        "glass": placed((0.4 * ahead, -0.7 * aside), (0.4 * ahead, 0.7 * aside)),
+    }
 
 
 def view_bounds(scene: SeenScene) -> Bounds:
@@ -96,20 +147,40 @@ def view_bounds(scene: SeenScene) -> Bounds:
     return ranges[0], ranges[1]
 
 
-def follow(recording: rr.RecordingStream, scene: SeenScene, bounds: Bounds) -> None:
-    """Hold the view above the ego car where that has left the ground shown (``view_bounds``)."""
+def away_m(scene: SeenScene, bounds: Bounds) -> list[float]:
+    """Return how far (x, y) the ego car is from the bounds' middle; [0, 0] where it is inside."""
     ego = next((car for car in scene.vehicles if car.ego), None)
-    away_m = [0.0, 0.0]
-    if ego is not None:
-        place = list(zip((ego.x, ego.y), bounds, strict=True))
-        if any(not low <= at <= high for at, (low, high) in place):
-            away_m = [at - (low + high) / 2 for at, (low, high) in place]
-    recording.log(CAMERA, rr.Transform3D(translation=[*away_m, 0.0]))
+    if ego is None:
+        return [0.0, 0.0]
+    place = list(zip((ego.x, ego.y), bounds, strict=True))
+    if all(low <= at <= high for at, (low, high) in place):
+        return [0.0, 0.0]
+    return [at - (low + high) / 2 for at, (low, high) in place]
 
 
-def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
-    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
-    return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
+class Plot(NamedTuple):
+    """One plot of a layout."""
+
+    origin: str
+    title: str
+    limits: tuple[float, float] | None = None  # Of the y axis; None: as the values need
+
+
+def plot_view(plot: Plot, shown: rrb.TimeRange = WHOLE) -> rrb.TimeSeriesView:
+    """The view of a plot; ``shown`` is the part of the time axis."""
+    return rrb.TimeSeriesView(
+        origin=plot.origin,
+        name=plot.title,
+        axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
+        axis_x=rrb.TimeAxis(view_range=shown),
+        plot_legend=rrb.Corner2D.LeftTop,
+    )
+
+
+def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
+    """The view of states over time."""
+    axis = rrb.TimeAxis(view_range=WHOLE)
+    return rrb.StateTimelineView(origin=origin, name=title, time_view=axis)
 
 
 def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
@@ -122,26 +193,21 @@ def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=CAMERA, contents="/road/**", visual_bounds=bounds, **look)
 
 
-def frames_view() -> rrb.Horizontal:
-    """What the policy sees, and what is to be said of it now."""
-    return rrb.Horizontal(
-        rrb.Spatial2DView(origin="frames/before", name="Policy sees t-1"),
-        rrb.Spatial2DView(origin="frames/now", name="Policy sees t"),
-        rrb.TextDocumentView(origin="status", name="Now"),
-        column_shares=[1, 1, 1],
-    )
-
-
-def numbers_view(array: str) -> rrb.Horizontal:
-    """The same for a policy that sees no picture: lines, or the ``array`` of many numbers."""
-    seen: Any = plot_view(Plot("observation", "Policy sees"))
-    if array:
-        seen = rrb.TensorView(origin=f"observation/{array}", name=f"Policy sees: {array}")
+def sees_view(frames: bool = True, array: str = "") -> rrb.Horizontal:
+    """What the policy sees (two frames, else a large ``array``, else lines), and the status."""
+    seen: list[Any] = [plot_view(Plot("observation", "Policy sees"))]
+    if frames:
+        times = {"before": "t-1", "now": "t"}.items()
+        seen = [
+            rrb.Spatial2DView(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times
+        ]
+    elif array:
+        seen = [rrb.TensorView(origin=f"observation/{array}", name=f"Policy sees: {array}")]
     now = rrb.TextDocumentView(origin="status", name="Now")
-    return rrb.Horizontal(seen, now, column_shares=[2, 1])
+    return rrb.Horizontal(*seen, now, column_shares=[1, 1, 1] if frames else [2, 1])
 
 
-def full_blueprint(
+def two_columns(
     left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
 ) -> rrb.Blueprint:
     """Two columns and nothing else open, along ``timeline``."""
@@ -151,41 +217,3 @@ def full_blueprint(
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=timeline),
     )
-
-
-class Plot(NamedTuple):
-    """One plot of a layout."""
-
-    origin: str
-    title: str
-    limits: tuple[float, float] | None = None  # Of the y axis; None: as the values need
-
-
-def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesView:
-    """The view of a plot; ``shown`` is the part of the time axis."""
-    return rrb.TimeSeriesView(
-        origin=plot.origin,
-        name=plot.title,
-        axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
-        axis_x=rrb.TimeAxis(view_range=shown),
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
-
-
-def style_actions(
-    recording: rr.RecordingStream, path: str, colour: Colour, names: Sequence[str]
-) -> None:
-    """Give each of several actions at one path its name and its colour."""
-    what = path.rpartition("/")[2]
-    shown = [f"{what} {name}" for name in names] if len(names) > 1 else [what]
-    colours, widths = shades(colour, len(names)), [2.0] * len(names)
-    style = rr.SeriesLines(colors=colours, names=shown, widths=widths)
-    recording.log(path, style, static=True)
-
-
-def style_lines(recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
-    """Name and colour lines by their entities; the name is the path's last part."""
-    for path, colour in lines.items():
-        name = path.rpartition("/")[2].replace("_", " ")
-        style = rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
-        recording.log(path, style, static=True)

@@ -31,13 +31,13 @@ from bridge.rerun import (
     flush,
     open_sink,
 )
-from bridge.rerun.draw import Plot
+from bridge.rerun.draw import Canvas, Plot
 from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link_quality import link_words
 from edge_runtime.manifest import Layout, Task
-from edge_runtime.tls import tls_for
+from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
@@ -136,7 +136,6 @@ def _watch(
     return 0
 
 
-# From top to bottom.
 PLOTS = (
     Plot("action", "Command: asked and achieved"),
     Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
@@ -144,7 +143,8 @@ PLOTS = (
     Plot("link", "Link each way: mean delay and jitter, ms; loss, %"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )
-SERIES = {
+"""From top to bottom."""
+LINES = {
     "action/asked": POLICY,
     "action/achieved": APPLIED,
     "speed/simulated": draw.BLUE,
@@ -161,25 +161,22 @@ SERIES = {
     "link/down_lost_percent": draw.RED,
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
+MOST_LINES = 16  # Numbers of an observation that a plot can show
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
-    """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    """Lay out the views; the first scene fixes the ground shown (None: as rerun sees fit)."""
     shown = None if scene is None or scene.picture else scene  # A picture has its own bounds.
     seen = {} if scene is None or scene.task is None else scene.task.observation
     many = [name for name, entry in seen.items() if math.prod(entry.shape) > MOST_LINES]
     pictures = not seen or any(map(is_picture, seen.values()))
     left = rrb.Vertical(
         draw.road_view(shown, "Road from above" if shown or not seen else "From above"),
-        draw.frames_view() if pictures else draw.numbers_view(many[0] if many else ""),
+        draw.sees_view(pictures, many[0] if many else ""),
         row_shares=[3, 1.4],
     )
     right = rrb.Vertical(
-        rrb.StateTimelineView(
-            origin="mode",
-            name="Mode, and why it does not drive",
-            time_view=rrb.TimeAxis(view_range=draw.ALL_OF_IT),
-        ),
+        draw.lanes_view("mode", "Mode, and why it does not drive"),
         *map(draw.plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
@@ -188,18 +185,18 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
         ),
         row_shares=[2.2, 2, 2, 2, 1.6, 1.6, 1.8],
     )
-    return draw.full_blueprint(left, right, [3, 2], "sim_time")
+    return draw.two_columns(left, right, [3, 2], "sim_time")
 
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
-SILENT = "no command"
-NOTHING_WRONG = "-"
-MOST_LINES = 16  # Numbers of an observation that a plot can show
+NO_COMMAND = "no command"
+NO_REASON = "-"
 REMEMBERED_STATES = 64  # States whose sending time is kept, for the latency of their commands
-EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
+EGO = {"drive": POLICY, "safe_stop": draw.RED, NO_COMMAND: (160, 30, 120)}
 ALL = "all"  # The sum over the reasons, which has a line from the start
 SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
 """The side that rejects, and the colour of all that it has rejected."""
+INFO, WARN, ERROR = rr.TextLogLevel.INFO, rr.TextLogLevel.WARN, rr.TextLogLevel.ERROR
 
 
 class WireLog:
@@ -210,32 +207,30 @@ class WireLog:
     """
 
     def __init__(self, recording: rr.RecordingStream, picture_interval_s: float = 0.0) -> None:
-        self._recording = recording
+        self.left_out = 0  # Messages that could not be drawn
+        self._canvas = Canvas(recording, LINES)
         self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
-        self._timeline = Timeline()
+        self._time = DriveTime()
         self._task: Task | None = None
         self._layout: Layout | None = None
+        self._bounds: draw.Bounds | None = None
         self._session = ""  # Of the newest state
-        self._told, self._reason = "", ""
+        self._mode = self._reason = ""
         self._episode: tuple[str, int] | None = None  # The newest one seen
-        self._heard_command_ns = 0
-        self._plan_periods = 0
+        self._heard_command_ns = self._plan_periods = 0
         self._sent_ns: dict[Place, int] = {}
         self._answered_ns: dict[Place, int] = {}
-        """From the sending of a state to that of its command, by the stamps of both."""
+        """From the sending of a state to that of its first command, by the stamps of both."""
         self._split: Place | None = None
         """The state whose round trip was drawn in its parts last."""
-        self._reasons: set[tuple[str, str]] = set()
-        self._drawn_episode: tuple[str, int] | None = None
         self._health: Health | None = None
-        self.left_out = 0  # Messages that could not be drawn
-        draw.style_lines(recording, SERIES)
+        self._rejecting: set[str] = set()
+        """The lines of rejections that are there."""
         for side, colour in SIDES.items():
-            self._style_rejections(side, ALL, colour)
-        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
-        recording.log("mode/mode", lanes, static=True)
-        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[draw.GREY])
-        recording.log("mode/reason", quiet, static=True)
+            self._canvas.style(f"rejected/{side}/{ALL}", [colour], [f"{side}: {ALL}"])
+        self._canvas.lanes("mode/mode", EGO)
+        quiet = rr.StateConfiguration(values=[NO_REASON], labels=[" "], colors=[draw.GREY])
+        self._canvas.log("mode/reason", quiet, static=True)
 
     def write(self, heard: Heard) -> None:
         """Draw one message as it came; a token shows as silence."""
@@ -244,7 +239,7 @@ class WireLog:
         message = decode(heard)
         if isinstance(message, wire.Rejection):
             self.left_out += 1
-            self._event(f"unreadable {heard.topic}: {message.detail}", rr.TextLogLevel.ERROR)
+            self._event(f"unreadable {heard.topic}: {message.detail}", ERROR)
         else:
             getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
 
@@ -256,14 +251,14 @@ class WireLog:
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
-        self._timeline.period_s = period_of(state) or self._timeline.period_s
+        self._time.period_s = period_of(state) or self._time.period_s
         self._session = state.session
         self._stand_at(place := (state.session, state.episode, state.step))
         _keep(self._sent_ns, place, state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
             self._draw_observation(state)
         if state.speed_mps is not None:
-            self._scalar("speed/simulated", state.speed_mps)
+            self._canvas.scalar("speed/simulated", state.speed_mps)
         if state.step == 0:
             self._event(f"episode {state.episode} begins")
         if state.final:
@@ -272,45 +267,43 @@ class WireLog:
             # For a viewer that comes late, or in a new episode, no command was due before.
             self._episode, self._heard_command_ns = place[:2], arrived_ns
         periods = BRAKE_PERIODS + self._plan_periods
-        silent = arrived_ns - self._heard_command_ns > periods * self._timeline.period_s * 1e9
+        silent = arrived_ns - self._heard_command_ns > periods * self._time.period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
-            nothing = [math.nan] * (len(self._task.action) if self._task else 1)
-            self._recording.log("action/asked", rr.Scalars(nothing))  # A gap in each line
-            self._tell(SILENT, "the simulator brakes by itself", rr.TextLogLevel.WARN)
+            gap = [math.nan] * (len(self._task.action) if self._task else 1)
+            self._canvas.scalar("action/asked", *gap)
+            self._tell(NO_COMMAND, "the simulator brakes by itself", WARN)
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
         """Draw what is asked, the mode, and where the time went."""
         self._stand_at(state := (command.session, command.episode, command.step))
         self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
-        self._recording.log("action/asked", rr.Scalars(list(command.action)))
+        self._canvas.scalar("action/asked", *command.action)
         if (sent_ns := self._sent_ns.get(state)) is not None:
-            self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
+            self._canvas.scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
             # A safe stop is repeated for as long as it lasts: only the first is the answer.
             if state not in self._answered_ns:
                 _keep(self._answered_ns, state, command.sent_ns - sent_ns)
-        self._scalar("latency/inference", command.inference_ns * 1e-6)
-        level = rr.TextLogLevel.INFO if command.mode == "drive" else rr.TextLogLevel.WARN
-        self._tell(command.mode, command.reason, level)
+        self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
+        self._tell(command.mode, command.reason, INFO if command.mode == DRIVE else WARN)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         """Draw what the vehicle has reached."""
-        self._recording.log("action/achieved", rr.Scalars(list(feedback.action)))
-        self._scalar("speed/vehicle", feedback.speed_mps)
+        self._canvas.scalar("action/achieved", *feedback.action)
+        self._canvas.scalar("speed/vehicle", feedback.speed_mps)
 
     def write_health(self, health: Health, _arrived_ns: int) -> None:
         """Refresh the status text, and note what the edge runtime has newly rejected."""
         before = self._health.rejected if self._health else {}
         for reason, count in health.rejected.items():
-            new = count - before.get(reason, 0)
-            if new > 0:
-                self._event(f"edge rejected {new} states: {reason}", rr.TextLogLevel.WARN)
-        self._rejections("edge", health.rejected)
+            if (new := count - before.get(reason, 0)) > 0:
+                self._event(f"edge rejected {new} states: {reason}", WARN)
+        self._draw_rejections("edge", health.rejected)
         for name, value in health.link.items():
-            if (path := f"link/{name}") in SERIES:
-                self._scalar(path, value)
+            if (path := f"link/{name}") in LINES:
+                self._canvas.scalar(path, value)
         self._health = health
-        self._write_status()
+        self._draw_status()
 
     def write_scene(self, scene: Scene, arrived_ns: int) -> None:
         """Draw the road from above, or the picture that is in its place.
@@ -321,121 +314,103 @@ class WireLog:
             self._take_task(scene.task)
         session = scene.origin.session if scene.origin else self._session
         self._stand_at((session, scene.episode, scene.step))
-        if self._drawn_episode is None:
+        if self._bounds is None:
             self._bounds = draw.view_bounds(scene)
-            self._recording.send_blueprint(make_blueprint(scene))
-        if self._drawn_episode != (session, scene.episode):
-            self._drawn_episode = session, scene.episode
-            draw.draw_ground(self._recording, scene)
-        self._round_trip(session, scene)
-        self._rejections("simulator", scene.rejected)
-        if scene.ridden and self._told == DRIVE:
-            self._tell(DRIVE, "rides on the plan", rr.TextLogLevel.WARN)
+            self._canvas.recording.send_blueprint(make_blueprint(scene))
+        if self._canvas.is_new_ground((session, scene.episode)):
+            self._canvas.draw_ground(scene)
+        self._draw_round_trip(session, scene)
+        self._draw_rejections("simulator", scene.rejected)
+        if scene.ridden and self._mode == DRIVE:
+            self._tell(DRIVE, "rides on the plan", WARN)
         if not self._cars_pace.due(arrived_ns * 1e-9):
             return
         if scene.picture:
-            self._recording.log(
-                "road/picture", rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
-            )
+            picture = rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
+            self._canvas.log("road/picture", picture)
         else:
-            draw.follow(self._recording, scene, self._bounds)
-            draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
+            self._canvas.draw_cars(scene, self._bounds, EGO[self._mode or NO_COMMAND])
 
     def _take_task(self, task: Task) -> None:
-        self._timeline.period_s = task.control_period_s
+        self._time.period_s = task.control_period_s
         if self._task != task:
             self._task, self._layout = task, Layout(task)
             for path in ("action/asked", "action/achieved"):
-                names = [action.name for action in task.action]
-                draw.style_actions(self._recording, path, SERIES[path], names)
+                self._canvas.name_actions(path, [action.name for action in task.action])
 
     def _draw_observation(self, state: State) -> None:
-        """Its images, the newest last, and few numbers as lines."""
+        """Draw its images, the newest last, and few numbers as lines."""
         if self._layout is None or self._layout.refusal(state.observation) is not None:
             return
-        has_camera = False
+        # The layout has views for the first camera; a person may add those of others.
+        root = "frames"
         for name, array in self._layout.arrays(state.observation).items():
-            images = images_of(array)
-            if images is not None:
-                # The layout has views for the first camera; a person may add those of others.
-                root = f"frames/{name}" if has_camera else "frames"
-                has_camera = True
+            if (images := images_of(array)) is not None:
                 for place, image in zip(("now", "before"), images[::-1], strict=False):
                     model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
-                    self._recording.log(f"{root}/{place}", rr.Image(image, color_model=model))
-            else:
-                few = array.size <= MOST_LINES
-                # As numbers: rerun has no tensor of truth values.
-                numbers = rr.Scalars(array.ravel()) if few else rr.Tensor(array * 1)
-                self._recording.log(f"observation/{name}", numbers)
+                    path = f"{root}/{place}" if root == "frames" else f"frames/{name}/{place}"
+                    self._canvas.log(path, rr.Image(image, color_model=model))
+                root = ""
+            elif array.size <= MOST_LINES:
+                self._canvas.scalar(f"observation/{name}", *array.ravel())
+            else:  # As numbers: rerun has no tensor of truth values.
+                self._canvas.log(f"observation/{name}", rr.Tensor(array * 1))
 
     def _stand_at(self, place: Place) -> None:
-        recording, (name, total_step) = self._recording, self._timeline.place(*place)
-        period_s = self._timeline.period_s
-        recording.reset_time()
-        recording.set_time("sim_time", duration=total_step * period_s)
-        recording.set_time("step", sequence=total_step)
-        recording.set_time(name, duration=place[2] * period_s)
+        name, total_step = self._time.place(*place)
+        period_s = self._time.period_s
+        seconds = {"sim_time": total_step * period_s, name: place[2] * period_s}
+        self._canvas.stand_at({"step": total_step}, seconds)
 
-    def _round_trip(self, session: str, scene: Scene) -> None:
-        """The newest round trip, and what is left of it for the way down."""
+    def _draw_round_trip(self, session: str, scene: Scene) -> None:
+        """Draw the newest round trip, and what is left of it for the way down."""
         if scene.round_trip_ms is None or scene.answered_step is None:
             return
-        self._scalar("latency/round_trip", scene.round_trip_ms)
+        self._canvas.scalar("latency/round_trip", scene.round_trip_ms)
         state = (session, scene.episode, scene.answered_step)
-        # It is told with every scene until the next one is known.
+        # Every scene tells it until the next one is known.
         if state in self._answered_ns and state != self._split:
             self._split, answered_ms = state, self._answered_ns[state] * 1e-6
-            self._scalar("latency/downlink", scene.round_trip_ms - answered_ms)
+            self._canvas.scalar("latency/downlink", scene.round_trip_ms - answered_ms)
 
-    def _rejections(self, side: str, counts: Mapping[str, int]) -> None:
-        self._scalar(f"rejected/{side}/{ALL}", sum(counts.values()))
+    def _draw_rejections(self, side: str, counts: Mapping[str, int]) -> None:
+        self._canvas.scalar(f"rejected/{side}/{ALL}", sum(counts.values()))
         for reason, count in counts.items():
-            if not count:
-                continue
-            if (side, reason) not in self._reasons:
-                self._reasons.add((side, reason))
-                self._style_rejections(side, reason, draw.GREY)
-                self._scalar(f"rejected/{side}/{reason}", 0)
-            self._scalar(f"rejected/{side}/{reason}", count)
+            path = f"rejected/{side}/{reason}"
+            if count and path not in self._rejecting:
+                self._rejecting.add(path)
+                self._canvas.style(path, [draw.GREY], [f"{side}: {reason}"])
+                self._canvas.scalar(path, 0)  # So that the line shows the step.
+            if count:
+                self._canvas.scalar(path, count)
 
-    def _style_rejections(self, side: str, reason: str, colour: tuple[int, int, int]) -> None:
-        style = rr.SeriesLines(colors=[colour], names=[f"{side}: {reason}"], widths=[2.0])
-        self._recording.log(f"rejected/{side}/{reason}", style, static=True)
-
-    def _tell(self, mode: str, reason: str, level: rr.TextLogLevel) -> None:
+    def _tell(self, mode: str, reason: str, level: Any) -> None:
         """Draw the mode where it changes."""
-        if (mode, reason) == (self._told, self._reason):
+        if (mode, reason) == (self._mode, self._reason):
             return
-        self._told, self._reason = mode, reason
-        self._recording.log("mode/mode", rr.StateChange(state=mode))
-        self._recording.log("mode/reason", rr.StateChange(state=reason or NOTHING_WRONG))
+        self._mode, self._reason = mode, reason
+        self._canvas.log("mode/mode", rr.StateChange(state=mode))
+        self._canvas.log("mode/reason", rr.StateChange(state=reason or NO_REASON))
         self._event(f"{mode}: {reason}" if reason else mode, level)
-        self._write_status()
+        self._draw_status()
 
-    def _scalar(self, path: str, value: float) -> None:
-        self._recording.log(path, rr.Scalars(value))
+    def _event(self, text: str, level: Any = INFO) -> None:
+        self._canvas.log("events", rr.TextLog(text, level=level))
 
-    def _event(self, text: str, level: rr.TextLogLevel = rr.TextLogLevel.INFO) -> None:
-        self._recording.log("events", rr.TextLog(text, level=level))
-
-    def _write_status(self) -> None:
-        lines = [f"# {self._told or 'waiting'}", self._reason]
+    def _draw_status(self) -> None:
+        lines = [f"# {self._mode or 'waiting'}", self._reason]
         if (health := self._health) is not None:
-            counts = ", ".join(
-                f"{name} {count}" for name, count in health.rejected.items() if count
-            )
+            counts = [f"{name} {count}" for name, count in health.rejected.items() if count]
             lines += [
                 f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
-                f"states accepted {health.accepted}, rejected: {counts or 'none'}",
+                f"states accepted {health.accepted}, rejected: {', '.join(counts) or 'none'}",
                 f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
+                f"link: {link_words(health.link)}",
             ]
-            lines.append(f"link: {link_words(health.link)}")
             if {"p50", "p99"} <= set(health.inference_ms):
                 times = "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms"
                 lines.append(times.format(**health.inference_ms))
-        text = "\n\n".join(line for line in lines if line)
-        self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
+        self._canvas.status(lines)
 
 
 def _keep(table: dict[Place, int], key: Place, value: int) -> None:
@@ -445,14 +420,13 @@ def _keep(table: dict[Place, int], key: Place, value: int) -> None:
         del table[next(iter(table))]
 
 
-class Timeline:
+class DriveTime:
     """Where a message stands in time.
 
-    Each episode's steps begin at 0; laid over one another they could not be told apart. So episodes
-    are put end to end on the timelines ``sim_time`` and ``step``, and each has its own besides,
-    ``episode_0`` and so on, that begins at 0 (``episode_0_of_session_2`` where the simulator has
-    been started again). Where each begins is learnt from what is seen, so that a viewer may come
-    late.
+    Each episode's steps begin at 0. On the timelines ``sim_time`` and ``step`` the episodes are put
+    end to end, and each has its own timeline besides, ``episode_0`` and so on, that begins at 0
+    (``episode_0_of_session_2`` where the simulator was started again). Where each begins is learnt
+    from what is seen, so that a viewer may come late: its first step is the first that it saw.
     """
 
     def __init__(self) -> None:
@@ -462,8 +436,7 @@ class Timeline:
         self.period_s = 0.0  # The control period, as soon as a message tells it
 
     def place(self, session: str, episode: int, step: int) -> tuple[str, int]:
-        """The episode's own timeline, and the step with the episodes end to end."""
-        # A viewer that comes late begins at zero as well: its first step is the first it saw.
+        """Return the episode's own timeline, and the step with the episodes end to end."""
         total_step = self._starts.setdefault((session, episode), self._end_step) + step
         self._end_step = max(self._end_step, total_step + 1)
         nth = self._sessions.setdefault(session, len(self._sessions) + 1)

@@ -8,14 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge import inbound
-from bridge.episode import Actuators, vehicle_action
+from bridge.environments import Adapter, describe
+from bridge.episode import vehicle_action
 from bridge.report import SafeStopLog
 from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.manifest import Action
 from edge_runtime.wire import encode
 from hil_tests.testing.environments import ToyEnv
-from hil_tests.testing.messages import HEALTH, make_command, make_feedback
-from hil_tests.testing.policies import STEERING, TASK, T
+from hil_tests.testing.messages import make_command, make_feedback
+from hil_tests.testing.policies import TASK, T
+from hil_tests.testing.recordings import health
 
 
 def checking(task=TASK):
@@ -259,8 +261,9 @@ class PedalEnv(ToyEnv):
 )
 def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied):
     env, rows = environment(), [Action(name=name, low=-1, high=1) for name in names.split()]
+    task = msgspec.structs.replace(describe(env), action=rows)
     env.action_space = spaces.Box(-1.0, 1.0, (len(rows),), np.float32)
-    action = vehicle_action(Actuators(env, rows), decide(make_feedback(3, **changes)))
+    action = vehicle_action(Adapter(env, task), decide(make_feedback(3, **changes)))
     assert (action.dtype, action.tolist()) == (np.float32, pytest.approx(applied))
 
 
@@ -276,18 +279,13 @@ class SteeredEnv(ToyEnv):
 
 def test_a_steered_car_brakes_when_its_vehicle_does():
     environment = SteeredEnv()
-    actuators = Actuators(environment, [STEERING])
+    adapter = Adapter(environment, describe(environment))
     stop = decide(make_feedback(3, mode="safe_stop", action=[0.5]))
-    assert vehicle_action(actuators, stop).tolist() == [0.5]
-    assert vehicle_action(actuators, decide(make_feedback(3))).tolist() == [0.5]
+    assert vehicle_action(adapter, stop).tolist() == [0.5]
+    assert vehicle_action(adapter, decide(make_feedback(3))).tolist() == [0.5]
     silent = decide(make_feedback(3), after_s=1.0)
-    assert vehicle_action(actuators, silent).tolist() == [pytest.approx(0.1)]
+    assert vehicle_action(adapter, silent).tolist() == [pytest.approx(0.1)]
     assert environment.pressed == [True, False, True]
-
-
-def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
-    what = {"vehicle": vehicle, "needs_rearm": needs_rearm, "rejected": rejected}
-    return msgspec.structs.replace(HEALTH, sent_ns=sent_ns, uptime_s=uptime_s, **what)
 
 
 @pytest.mark.parametrize(

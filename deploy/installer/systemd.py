@@ -1,114 +1,70 @@
-"""Who runs the service: systemd, or somebody else (a container's engine, a person).
+"""Run a release as a systemd service, and try it before.
 
-systemd also runs the trial of a release: the release's own runtime with its own policy, settings,
-certificates and user, but without a vehicle, towards a port where nobody listens, in a network of
-its own. Whatever is wrong with it, the vehicle gets no command from it.
+A trial is the release's own runtime with its own policy, settings, certificates and user, but
+without a vehicle, towards a port where nobody listens, in a network of its own. Whatever is wrong
+with it, the vehicle gets no command from it.
 """
 
 from __future__ import annotations
 
 import os
 import pwd
-import re
 import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import Callable, NamedTuple
+from typing import NamedTuple
 
-from deploy.installer.layout import (
-    CONFIG,
-    DEFAULT_ROOT,
-    LAUNCHER,
-    TLS,
-    UNITS,
-    WAY,
-    read_state,
-    write_whole,
-)
-from deploy.installer.verify import UnhealthyError
+from deploy.installer.layout import CONFIG, CURRENT, DEFAULT_ROOT, LAUNCHER, TLS
+from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 
-MAIN_UNIT, TRIAL_UNIT = "phil-edge.service", "phil-trial.service"
+MAIN_UNIT, CAN_UNIT, TRIAL_UNIT = "phil-edge.service", "phil-can.service", "phil-trial.service"
 USER = "phil"
-WAYS = ("systemd", "none")
+SERVICES = ("systemd", "none")
 UNIT_FOLDER = Path("/etc/systemd/system")
-_BOOTED = Path("/run/systemd/system")
-_FITS_A_UNIT = re.compile(r"[A-Za-z0-9._+@/-]+")
-"""Spaces would cut a unit's line in two, and a % would be a specifier (systemd.unit(5))."""
-_UNIT = re.compile(r"(?m)^[A-Za-z0-9][A-Za-z0-9@._-]*$")
+BOOTED = Path("/run/systemd/system")
+"""A folder where systemd runs this computer (sd_booted(3))."""
 _NOWHERE = "127.0.0.1:9"
 """The discard port: nobody listens there, and in a network of its own nobody can."""
 _TRIAL_STOP_S = 3.0
-_LOOK_S = 0.05
 
 
-class Limits(NamedTuple):
-    """How soon a release must be healthy, and how long it must stay so, s."""
+class UnhealthyError(UserError):
+    """A release may not run here. Its text says why, on one line."""
+
+
+class HealthLimits(NamedTuple):
+    """How soon a trial must be ready, and how long a release must then stay healthy, s."""
 
     within_s: float = 10.0
     settle_s: float = 3.0
 
 
-class NoService:
-    """The bundle is installed, and somebody else runs it: nothing to start, try or watch."""
-
-    name = "none"
-
-    def group(self) -> int | None:
-        """The id of the group that reads the TLS key; None for the owner alone."""
-        return None
-
-    def try_release(self, folder: Path, policy_id: str, limits: Limits) -> None:
-        """Raise UnhealthyError where a release does not run well, heard by nobody."""
-
-    def stop(self) -> None:
-        """End the service; nothing where there is none."""
-
-    def prepare(self, release: Path) -> None:
-        """Put in place what starts a release, now and at every boot."""
-
-    def start(self, release: Path) -> None:
-        """Start the service of a release."""
-
-    def watch(self, limits: Limits) -> None:
-        """Raise UnhealthyError unless it is active within the limit and stays so for a while."""
-
-    def describe(self) -> str:
-        """How it is, in a few words."""
-        return "not run by the installer"
-
-    def remove(self) -> None:
-        """Stop it and take away what `prepare` has made."""
-
-
-class Systemd(NoService):
-    """The service as units. `root` replaces /opt/phil in their text."""
-
-    name = "systemd"
+class Systemd:
+    """The service as units, in whose text `root` replaces /opt/phil."""
 
     def __init__(self, root: Path, unit_folder: Path = UNIT_FOLDER) -> None:
-        self._root = str(root)
+        self._root = root
         self._unit_folder = unit_folder
-        self._list = root / "state" / UNITS
 
-    def group(self) -> int | None:
-        """The group of the service's user, made where missing: no rights, no home, no shell."""
+    def group(self) -> int:
+        """The id of the user's group. The user is made where missing: no rights, home or shell."""
         try:
             return pwd.getpwnam(USER).pw_gid
         except KeyError:
             _run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
             return pwd.getpwnam(USER).pw_gid
 
-    def try_release(self, folder: Path, policy_id: str, limits: Limits) -> None:
-        """As `NoService`: ready within the limit, it goes on to say that it works, as this policy.
+    def try_release(self, folder: Path, policy_id: str, limits: HealthLimits) -> None:
+        """Run a release heard by nobody. Raises UnhealthyError where it does not run well.
 
-        `systemd-run` waits for READY=1, and systemd kills what does not say WATCHDOG=1.
+        It must say READY=1 within the limit, go on with WATCHDOG=1, and log this policy's name.
         """
-        self._units(folder)
         protocol = "tls" if (folder / TLS).is_dir() else "tcp"
         with tempfile.TemporaryDirectory(prefix="phil-trial-") as place:
-            log = Path(place) / "log"
+            log = Path(place, "log")
+            log.touch()
             properties = {
                 "NotifyAccess": "main",
                 "PrivateNetwork": "yes",
@@ -131,148 +87,95 @@ class Systemd(NoService):
                     folder / LAUNCHER, "run", "--config", CONFIG, "--vehicle", "none",
                     "--connect", f"{protocol}/{_NOWHERE}", "--log-level", "warning",
                 )  # fmt: skip
-                settle(lambda: _is_active(TRIAL_UNIT), limits, "it")
+                _require_active(TRIAL_UNIT, limits.settle_s)
             except UnhealthyError as error:
-                lines = log.read_text("utf-8", "replace").splitlines() if log.exists() else []
-                result, why = _show(TRIAL_UNIT).get("Result"), lines[-1] if lines else error
+                said = log.read_text("utf-8", "replace").splitlines()
+                result, why = _show(TRIAL_UNIT).get("Result"), said[-1] if said else error
                 raise UnhealthyError(f"trial: {result}: {why}") from None
             finally:
                 self._end_trial()
             if f"policy_id={policy_id}" not in log.read_text("utf-8", "replace"):
-                raise UnhealthyError("it does not say that it has loaded this policy")
-
-    def stop(self) -> None:
-        """As `NoService`."""
-        if (self._unit_folder / MAIN_UNIT).exists():
-            _run("systemctl", "stop", MAIN_UNIT)
-
-    def prepare(self, release: Path) -> None:
-        """As `NoService`: install the release's units."""
-        units = self._units(release)
-        self._forget(set(units))
-        write_whole(self._list, "".join(f"{name}\n" for name in units).encode())
-        for name, text in units.items():
-            write_whole(self._unit_folder / name, text.encode())
-        _run("systemctl", "daemon-reload")
-        for name, text in units.items():
-            if "[Install]" in text:
-                _run("systemctl", "enable", name)
-
-    def start(self, release: Path) -> None:
-        """As `NoService`."""
-        _run("systemctl", "reset-failed", MAIN_UNIT, check=False)
-        _run("systemctl", "start", MAIN_UNIT)
-
-    def watch(self, limits: Limits) -> None:
-        """As `NoService`."""
-        settle(lambda: _is_active(MAIN_UNIT), limits, MAIN_UNIT)
-
-    def describe(self) -> str:
-        """As `NoService`, with the service's own status."""
-        shown = _show(MAIN_UNIT)
-        return f"{shown.get('ActiveState', 'unknown')} {shown.get('StatusText', '')}".strip()
-
-    def remove(self) -> None:
-        """As `NoService`: the units go, the user stays."""
-        self.stop()
-        self._forget(set())
-        self._list.unlink(missing_ok=True)
-        _run("systemctl", "daemon-reload")
-
-    def _units(self, release: Path) -> dict[str, str]:
-        """The text of a release's units by name, for this root. UnhealthyError without the main."""
-        paths = sorted((release / "units").glob("*.*"))
-        units = {path.name: path.read_text().replace(DEFAULT_ROOT, self._root) for path in paths}
-        if MAIN_UNIT not in units:
-            raise UnhealthyError(f"the bundle holds no {MAIN_UNIT}")
-        return units
+                raise UnhealthyError("trial: its log does not name this policy")
 
     def _end_trial(self) -> None:
         for verb in ("stop", "reset-failed"):
             _run("systemctl", verb, TRIAL_UNIT, check=False)
 
-    def _forget(self, kept: set[str]) -> None:
-        """Take away the units of an earlier release that are not among those kept."""
-        names = set(_UNIT.findall(read_state(self._list)))
-        for name in sorted(names - kept):
-            _run("systemctl", "disable", "--now", name, check=False)
+    def stop(self) -> None:
+        """End the service, if there is one."""
+        if (self._unit_folder / MAIN_UNIT).exists():
+            _run("systemctl", "stop", MAIN_UNIT)
+
+    def prepare(self, folder: Path) -> None:
+        """Install the units of a release, which start it now and at every boot."""
+        for path in sorted((folder / "units").iterdir()):
+            text = path.read_text().replace(DEFAULT_ROOT, str(self._root))
+            write_atomic(self._unit_folder / path.name, text.encode())
+        _run("systemctl", "daemon-reload")
+        _run("systemctl", "enable", MAIN_UNIT, CAN_UNIT)
+
+    def start(self, limits: HealthLimits) -> None:
+        """Start the release that `current` names. Raises UnhealthyError where it does not run well.
+
+        `systemctl start` waits for READY=1 as long as the unit and what it comes after allow.
+        systemd ends a service that does not go on with WATCHDOG=1.
+        """
+        _run("systemctl", "reset-failed", MAIN_UNIT, check=False)
+        _run("systemctl", "start", MAIN_UNIT)
+        _require_active(MAIN_UNIT, limits.settle_s)
+
+    def describe(self) -> str:
+        """Say in a few words how the service is."""
+        shown = _show(MAIN_UNIT)
+        return f"{shown.get('ActiveState', 'unknown')} {shown.get('StatusText', '')}".strip()
+
+    def remove(self) -> None:
+        """Stop the service and remove its units; the user stays."""
+        self.stop()
+        _run("systemctl", "disable", "--now", MAIN_UNIT, CAN_UNIT, check=False)
+        for name in (MAIN_UNIT, CAN_UNIT):
             (self._unit_folder / name).unlink(missing_ok=True)
+        _run("systemctl", "daemon-reload")
 
 
-def settle(looks_well: Callable[[], bool], limits: Limits, what: str) -> None:
-    """Look again and again until it has been healthy for `settle_s` without a break.
+def choose(service: str | None, root: Path) -> Systemd | None:
+    """The service of `--service`, None where somebody else runs the release.
 
-    `looks_well` raises UnhealthyError itself where there is no hope. Raises UnhealthyError where
-    it is not well within `within_s`, or not any more after that.
+    Without the option an installation stays as it is, and a first one takes systemd where that runs
+    this computer. Raises UserError where systemd is asked for and does not run it, or is not asked
+    for and runs this installation.
     """
-    end_s = time.monotonic() + limits.within_s
-    since_s = None
-    while since_s is None or time.monotonic() - since_s < limits.settle_s:
-        now_s = time.monotonic()
-        if not looks_well():
-            since_s = None
-            if now_s > end_s:
-                raise UnhealthyError(f"{what} is not healthy within {limits.within_s:g} s")
-        elif since_s is None:
-            since_s = now_s
-        time.sleep(_LOOK_S)
-
-
-def is_there() -> bool:
-    """Whether systemd runs this computer (sd_booted(3))."""
-    return _BOOTED.is_dir()
-
-
-def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
-    """The service of a way; without one, that of the last install here, or what is there.
-
-    Raises UserError where it cannot be run by this user; whoever may `only_look` needs no right.
-    """
-    if way == "systemd" and not is_there():
-        # Before it makes a user and unpacks for a start that cannot come.
+    is_booted, has_unit = BOOTED.is_dir(), (UNIT_FOLDER / MAIN_UNIT).exists()
+    if service == "systemd" and not is_booted:
         raise UserError("--service systemd: no systemd runs this computer; use --service none")
-    kept = read_state(root / "state" / WAY)
-    if (way, kept) == ("none", "systemd") and is_there() and not only_look:
+    if service == "none" and has_unit:
         raise UserError("systemd runs this board: leave --service out, or `uninstall` first")
-    if way is None:
-        way = kept if kept in WAYS else "systemd" if is_there() else "none"
-    if way == "none":
-        return NoService()
-    if os.geteuid() != 0 and not only_look:
-        raise UserError("--service systemd needs root: use sudo, or --service none")
-    if not _FITS_A_UNIT.fullmatch(str(root)):
-        raise UserError(f"--root {root}: a unit's path may hold only letters, digits and ._+@/-")
-    return Systemd(root)
+    is_first = not os.path.lexists(root / CURRENT)
+    if service == "systemd" or (service is None and is_booted and (has_unit or is_first)):
+        return Systemd(root)
+    return None
 
 
-def remember(way: str, root: Path) -> None:
-    """Keep the way, so that `status` and `rollback` need not be told."""
-    write_whole(root / "state" / WAY, way.encode())
-
-
-def _is_active(unit: str) -> bool:
-    """Whether it runs. UnhealthyError where it ended, or was started again."""
+def _require_active(unit: str, settle_s: float) -> None:
+    """Raise UnhealthyError where a unit that was just started has ended or begun anew by then."""
+    time.sleep(settle_s)
     shown = _show(unit)
-    if shown.get("ActiveState") == "failed" or shown.get("NRestarts", "0") != "0":
-        raise UnhealthyError(f"{unit} ended: {shown.get('Result')} (journalctl --unit {unit})")
-    return shown.get("ActiveState") == "active"
+    if shown.get("ActiveState") != "active" or shown.get("NRestarts", "0") != "0":
+        state = f"{shown.get('ActiveState')}, {shown.get('Result')}"
+        raise UnhealthyError(f"{unit} does not stay up: {state} (journalctl --unit {unit})")
 
 
 def _show(unit: str) -> dict[str, str]:
-    """What systemd says of a unit."""
     names = "ActiveState,NRestarts,Result,StatusText"
     lines = _run("systemctl", "show", unit, f"--property={names}").splitlines()
     return dict(line.split("=", 1) for line in lines if "=" in line)
 
 
 def _run(*words: object, check: bool = True) -> str:
-    """Run a command; what it prints. UnhealthyError where it fails, unless told not to check."""
+    """Run a command; return what it prints. Raises UnhealthyError where it fails and is checked."""
     command = [str(word) for word in words]
-    try:
-        done = subprocess.run(command, check=False, text=True, capture_output=True)
-    except OSError as error:
-        raise UserError(f"{command[0]} cannot be run: {error.strerror}") from None
+    done = subprocess.run(command, check=False, text=True, capture_output=True)
     if check and done.returncode != 0:
-        what = " ".join(command[:2] if command[0] == "systemd-run" else command)
-        raise UnhealthyError(f"{what}: {done.stderr.strip() or done.returncode}")
+        said = done.stderr.strip() or f"exit status {done.returncode}"
+        raise UnhealthyError(f"{' '.join(command[:2])}: {said}")
     return done.stdout

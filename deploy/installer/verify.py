@@ -1,8 +1,8 @@
-"""Which bundle is believed: its signature, what it holds, and that it is for this computer.
+"""Decide which bundle is believed: by its signature, and by the computer that it is for.
 
-A bundle is a tar, and beside it stands BUNDLE.tar.sig: what `ssh-keygen -Y sign` says of the whole
-file. So a changed byte anywhere is found, and nothing inside is looked at before that. The board's
-own `ssh-keygen -Y verify` decides; the key is the one that the board trusts.
+A bundle is a tar. BUNDLE.tar.sig beside it is what `ssh-keygen -Y sign` makes of the whole file, so
+a changed byte anywhere is found before anything inside is looked at. The board's own
+`ssh-keygen -Y verify` decides, with the key that the board trusts.
 """
 
 from __future__ import annotations
@@ -12,47 +12,46 @@ import binascii
 import hashlib
 import io
 import json
-import os
 import platform
 import re
 import subprocess
 import sys
 import tarfile
 import tempfile
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 from edge_runtime.util import UserError, read_bytes
 
 MANIFEST = "manifest.json"
 FORMAT = 1
 NAMESPACE = "phil-bundle"
-"""Of the signature: one over something else, with the same key, does not pass for a bundle's."""
+"""A signature over anything else, with the same key, does not pass for a bundle's."""
 _SIGNER = "owner"
 _MAX_BUNDLE_MIB = 1024
-_BEGIN, _END = "-----BEGIN PUBLIC KEY-----", "-----END PUBLIC KEY-----"
+_PEM_FRAME = re.compile(rb"-----(BEGIN|END) PUBLIC KEY-----")
 _ED25519 = bytes.fromhex("302a300506032b6570032100")
-"""What stands before the 32 bytes of a key in a SubjectPublicKeyInfo of Ed25519 (RFC 8410)."""
+"""Precedes the 32 bytes of a key in a SubjectPublicKeyInfo of Ed25519 (RFC 8410)."""
 _SSH_ED25519 = b"\0\0\0\x0bssh-ed25519\0\0\0\x20"
-"""What stands before the same 32 bytes in a public key of OpenSSH (RFC 8709)."""
+"""Precedes the same 32 bytes in a public key of OpenSSH (RFC 8709)."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+-]*(/[A-Za-z0-9_][A-Za-z0-9._+-]*)*")
-VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
-
-
-class UnhealthyError(UserError):
-    """A release that may not run here. Its text says why, on one line."""
+_VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
 
 
 class Target(NamedTuple):
-    """A kind of board: `python` like 3.8, `machine` as uname says, the least `glibc`."""
+    """A kind of board: `python` as "3.8", `machine` as uname names it, the oldest `glibc`."""
 
     name: str
     python: str
     machine: str
     glibc: str
 
+    def __str__(self) -> str:
+        return f"Python {self.python} on {self.machine} with glibc {self.glibc}"
 
-class Manifest(NamedTuple):
-    """What a bundle is. `version` names its bytes and no others."""
+
+class BundleManifest(NamedTuple):
+    """What a bundle says of itself. `version` names its bytes and no others."""
 
     version: str
     target: Target
@@ -60,32 +59,24 @@ class Manifest(NamedTuple):
     policy_id: str
 
 
-class Bundle(NamedTuple):
-    """A verified bundle: what it says of itself, and the bytes of each file by its path."""
-
-    manifest: Manifest
-    files: dict[str, bytes]
-
-
-def read_bundle(path: str, public_key: bytes) -> Bundle:
-    """Read a bundle that the owner of `public_key` (PEM) has signed.
+def read_bundle(path: str, public_key: bytes) -> tuple[BundleManifest, dict[str, bytes]]:
+    """Read a bundle that the owner of `public_key` (PEM) has signed: manifest, and files by path.
 
     It is read once, verified and used from memory, so nobody can change it in between.
     Raises UserError, having written nothing.
     """
-    allowed = ssh_key(public_key)
     data = read_bytes(path, "bundle", _MAX_BUNDLE_MIB)
     signature = read_bytes(f"{path}.sig", "signature", 1)
     try:
-        _check_signature(data, signature, allowed)
+        _check_signature(data, signature, ssh_key(public_key))
         files = _unpack(data)
-        return Bundle(parse_manifest(files.get(MANIFEST, b"")), files)
+        return parse_manifest(files.get(MANIFEST, b"")), files
     except UserError as error:
         raise UserError(f"bundle {path} is refused: {error}") from None
 
 
 def read_public_key(path: str) -> bytes:
-    """The PEM of an Ed25519 public key. Raises UserError for anything else."""
+    """Read an Ed25519 public key in PEM. Raises UserError for anything else."""
     pem = read_bytes(path, "public key", 1)
     try:
         ssh_key(pem)
@@ -95,40 +86,32 @@ def read_public_key(path: str) -> bytes:
 
 
 def key_name(pem: bytes) -> str:
-    """A few digits by which a person tells public keys apart."""
+    """Name a public key by 16 hex digits."""
     return hashlib.sha256(ssh_key(pem).encode()).hexdigest()[:16]
 
 
 def ssh_key(pem: bytes) -> str:
-    """A public key in PEM as OpenSSH writes it in a file of allowed signers."""
-    lines = [line.strip() for line in pem.decode("ascii", "replace").split("\n") if line.strip()]
-    if len(lines) < 3 or lines[0] != _BEGIN or lines[-1] != _END:
-        raise UserError("the public key is not a PEM public key")
+    """Write an Ed25519 public key in PEM as OpenSSH does. Raises UserError for anything else."""
     try:
-        der = base64.b64decode("".join(lines[1:-1]), validate=True)
+        der = base64.b64decode(_PEM_FRAME.sub(b"", pem))
     except binascii.Error:
-        raise UserError("the public key is not a PEM public key") from None
+        der = b""
     if len(der) != len(_ED25519) + 32 or not der.startswith(_ED25519):
-        raise UserError("the public key is not an Ed25519 key")
+        raise UserError("it is no Ed25519 public key in PEM")
     return f"ssh-ed25519 {base64.b64encode(_SSH_ED25519 + der[-32:]).decode()}"
 
 
 def _check_signature(data: bytes, signature: bytes, allowed: str) -> None:
     with tempfile.TemporaryDirectory(prefix="phil-verify-") as place:
-        keys, signed = os.path.join(place, "keys"), os.path.join(place, "sig")
-        for path, content in ((keys, f"{_SIGNER} {allowed}\n".encode()), (signed, signature)):
-            with open(path, "wb") as stream:
-                stream.write(content)
-        command = ["ssh-keygen", "-Y", "verify", "-f", keys, "-I", _SIGNER,
-                   "-n", NAMESPACE, "-s", signed]  # fmt: skip
-        try:
-            done = subprocess.run(command, input=data, capture_output=True, check=False)
-        except OSError as error:
-            raise UserError(f"ssh-keygen cannot be run: {error.strerror}") from None
-    if b"unknown option" in done.stderr:
-        raise UserError("this ssh-keygen verifies no signatures: OpenSSH 8.2 or newer is needed")
+        signers, signed = Path(place, "signers"), Path(place, "sig")
+        signers.write_text(f"{_SIGNER} {allowed}\n")
+        signed.write_bytes(signature)
+        command = ["ssh-keygen", "-Y", "verify", "-f", str(signers), "-I", _SIGNER,
+                   "-n", NAMESPACE, "-s", str(signed)]  # fmt: skip
+        done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode != 0:
-        raise UserError("its signature is not of the key that is trusted here, or it was changed")
+        said = done.stderr.decode(errors="replace")
+        raise UserError(f"it was changed, or signed by a key that is not trusted here ({said})")
 
 
 def _unpack(data: bytes) -> dict[str, bytes]:
@@ -139,48 +122,38 @@ def _unpack(data: bytes) -> dict[str, bytes]:
             for member in tar:
                 stream = tar.extractfile(member) if member.isreg() else None
                 if stream is None or not _NAME.fullmatch(member.name) or member.name in files:
-                    raise UserError(f"it holds what no bundle may hold: {member.name!r}")
+                    raise UserError(f"no bundle may hold {member.name!r}")
                 files[member.name] = stream.read()
     except tarfile.TarError:
-        raise UserError("it is no bundle") from None
+        raise UserError("it is no tar") from None
     return files
 
 
-def to_json(manifest: Manifest) -> bytes:
-    """The one way to write it: sorted keys, no spaces, a newline at the end."""
+def to_json(manifest: BundleManifest) -> bytes:
+    """Write a manifest in its one form: sorted keys, no spaces, a newline at the end."""
     value = {**manifest._asdict(), "format": FORMAT, "target": manifest.target._asdict()}
     return json.dumps(value, sort_keys=True, separators=(",", ":")).encode() + b"\n"
 
 
-def parse_manifest(data: bytes) -> Manifest:
+def parse_manifest(data: bytes) -> BundleManifest:
     """Read `to_json`. Raises UserError for another format or a version that is no folder's name."""
     try:
-        value: dict[str, Any] = json.loads(data)
-        if value["format"] != FORMAT:
-            raise UserError(f"its format is {value['format']}, this installer reads {FORMAT}")
-        names = ("version", "vehicle_id", "policy_id")
-        manifest = Manifest(target=Target(**value["target"]), **{n: value[n] for n in names})
-        if not VERSION.fullmatch(manifest.version):
-            raise ValueError(manifest.version)
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise UserError("its manifest is not valid") from None
-    return manifest
+        value = json.loads(data)
+        target = Target(**value.pop("target"))
+        if value.pop("format") == FORMAT and _VERSION.fullmatch(value["version"]):
+            return BundleManifest(target=target, **value)
+    except (ValueError, TypeError, KeyError, AttributeError):
+        pass
+    raise UserError(f"its manifest is not one of format {FORMAT}")
 
 
 def check_fits(target: Target) -> None:
     """Raise UserError unless Python, processor and C library are what the wheels need."""
+    libc, version = platform.libc_ver()
     python = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    if python != target.python:
-        raise UserError(
-            f"the bundle is for Python {target.python} and this is {python}:"
-            f" run it with python{target.python}"
-        )
-    if platform.machine() != target.machine:
-        raise UserError(f"the bundle is for {target.machine}, this is {platform.machine()}")
-    name, version = platform.libc_ver()
-    if name != "glibc" or _numbers(version) < _numbers(target.glibc):
-        found = f"{name or 'another'} {version}".rstrip()
-        raise UserError(f"the bundle needs glibc {target.glibc}, this is {found}")
+    here = Target("here", python, platform.machine(), version if libc == "glibc" else "none")
+    if here[1:3] != target[1:3] or _numbers(here.glibc) < _numbers(target.glibc):
+        raise UserError(f"the bundle is for {target} or newer, this is {here}")
 
 
 def _numbers(version: str) -> list[int]:

@@ -79,7 +79,7 @@ class Board:
         self.installer = ["-I", str(workshop.folder / NAME)]
 
     def runs_a_process(self) -> None:
-        """From now on the installer knows `--service process` (process_service.py)."""
+        """From now on the installer runs a release as a process (process_service.py)."""
         self.installer = ["-m", "deploy.tests.process_service"]
 
     def command(self, command: str, *arguments: object) -> list[str]:
@@ -90,9 +90,8 @@ class Board:
         line = self.command(command, *arguments)
         return subprocess.run(line, capture_output=True, text=True, timeout=120)
 
-    def install(self, bundle: Path, service: str = "none", *more: str):
-        trust = ("--trust", str(self.workshop.public_key))
-        return self.run("install", bundle, *trust, "--service", service, *QUICK, *more)
+    def install(self, bundle: Path, *more: str):
+        return self.run("install", bundle, "--trust", self.workshop.public_key, *QUICK, *more)
 
     def status(self) -> dict:
         done = self.run("status", "--json")

@@ -1,6 +1,6 @@
 """The installer with a service that is a plain process: in tests, what systemd is on a board.
 
-``python -m deploy.tests.process_service`` takes what `install.pyz` takes, and `--service process`.
+``python -m deploy.tests.process_service`` takes what `install.pyz` takes.
 """
 
 import contextlib
@@ -12,26 +12,42 @@ import time
 from pathlib import Path
 
 from deploy.installer import __main__ as installer
-from deploy.installer.layout import CONFIG, LAUNCHER
-from deploy.installer.systemd import WAYS, Limits, NoService, choose, settle
-from deploy.installer.verify import UnhealthyError
+from deploy.installer.layout import CONFIG, CURRENT, LAUNCHER
+from deploy.installer.systemd import HealthLimits, Systemd, UnhealthyError
 
 
-class ProcessService(NoService):
-    """Runs the runtime itself, and forgets to start it again."""
+class ProcessService(Systemd):
+    """Runs the runtime itself, without a trial, and forgets to start it again."""
 
-    name = "process"
+    def __init__(self, service: object, root: Path) -> None:
+        super().__init__(root)
+        self._current = root / CURRENT
+        self._pid, self._log = root / "state/pid", root / "state/log"
 
-    def __init__(self, root: Path) -> None:
-        self._pid, self._log = root / "state" / "pid", root / "state" / "log"
+    def group(self) -> int:
+        return os.getgid()
 
-    def start(self, release: Path) -> None:
+    def try_release(self, folder: Path, policy_id: str, limits: HealthLimits) -> None:
+        pass
+
+    def prepare(self, folder: Path) -> None:
+        pass
+
+    def start(self, limits: HealthLimits) -> None:
         with open(self._log, "wb") as log:
             run = subprocess.Popen(
-                [release / LAUNCHER, "run", "--config", CONFIG], cwd=release,
+                [self._current / LAUNCHER, "run", "--config", CONFIG], cwd=self._current.resolve(),
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         self._pid.write_text(str(run.pid))
+        end_s = time.monotonic() + limits.within_s
+        while "ready " not in self._log.read_text():
+            time.sleep(0.05)
+            if self.pid() is None or time.monotonic() > end_s:
+                raise UnhealthyError("the service does not get ready")
+        time.sleep(limits.settle_s)
+        if self.pid() is None:
+            raise UnhealthyError("the service ended")
 
     def stop(self) -> None:
         while (pid := self.pid()) is not None:
@@ -39,16 +55,11 @@ class ProcessService(NoService):
                 os.kill(pid, signal.SIGTERM)
             time.sleep(0.02)
 
-    def watch(self, limits: Limits) -> None:
-        settle(self._is_ready, limits, "the service")
-
     def describe(self) -> str:
         return "stopped" if self.pid() is None else "active"
 
     def remove(self) -> None:
         self.stop()
-        for path in (self._pid, self._log):
-            path.unlink(missing_ok=True)
 
     def pid(self) -> int | None:
         """The process while it lives, and is no zombie of ours."""
@@ -59,21 +70,7 @@ class ProcessService(NoService):
             return None
         return None if state == "Z" else pid
 
-    def _is_ready(self) -> bool:
-        if self.pid() is None:
-            raise UnhealthyError("the service ended")
-        return "ready " in self._log.read_text()
-
-
-def choose_process(way: str | None, root: Path, only_look: bool = False) -> NoService:
-    """As `choose`, with a further way that is remembered like the others."""
-    kept = root / "state" / "way"
-    if way == "process" or (way is None and kept.exists() and kept.read_text() == "process"):
-        return ProcessService(root)
-    return choose(way, root, only_look)
-
 
 if __name__ == "__main__":
-    installer.WAYS = (*WAYS, "process")  # type: ignore[assignment]
-    installer.choose = choose_process
+    installer.choose = ProcessService
     sys.exit(installer.main(sys.argv[1:]))

@@ -6,7 +6,6 @@ import shutil
 import stat
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from cryptography import x509
@@ -14,7 +13,7 @@ from cryptography.hazmat.primitives import serialization as form
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
-from deploy.certs import _make_authority, _pem, _write_folder, issue, read_authority
+from deploy.certs import _pem, _write_folder, issue, make_authority, read_authority
 from edge_runtime.tls import load_tls
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import exit_status
@@ -62,7 +61,7 @@ def test_each_party_has_what_it_needs_and_no_more(made):
         assert stat.S_IMODE(key.parent.stat().st_mode) == 0o700
 
 
-def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path, capsys):
+def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path):
     folder = tmp_path / "certs"
     assert make(folder, "--vehicle-id", "one") == 0
     before = contents(folder)
@@ -77,72 +76,47 @@ def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path, capsys)
     assert addresses == {"127.0.0.1", "::1", "10.0.0.7"}
     (folder / "edge-one").rename(tmp_path / "old")
     assert make(folder, "--vehicle-id", "one") == 0
-    assert f"kept as it is: {folder / 'router'}" in capsys.readouterr().out
     again = contents(folder)
     changed = {str(path) for path in after if again[path] != after[path]}
-    assert changed <= {"edge-one/cert.pem", "edge-one/key.pem"}
-    assert contents(tmp_path / "old") != contents(folder / "edge-one")
+    assert changed == {"edge-one/cert.pem", "edge-one/key.pem"}
     (folder / "ca/ca.key.pem").unlink()
     assert make(folder, "--vehicle-id", "new") == 2
-    assert "ca.key.pem" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("options", "word"),
+    "options",
     [
-        ("hunter01", "nothing is overwritten"),
-        ("a/b", "a/b"),
-        ("new --host tcp/host:1", "tcp/host:1"),
-        ("new --days 0", "--days: '0'"),
-        ("new --days soon", "'soon' is not a whole number from 1 to 3650"),
-        ("new --host a..b", "a..b"),
-        ("new --days 99999999999", "from 1 to 3650"),
-        ("x" * 55, "shorter --vehicle-id"),
+        *("hunter01", "a/b", "x" * 55, "new --host tcp/host:1", "new --host a..b"),
+        *(f"new --days {days}" for days in ("0", "soon", "99999999999")),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsys):
+def test_bad_input_is_one_line_and_nothing_is_written(made, options, capsys):
     before = contents(made)
     assert make(made, "--vehicle-id", *options.split()) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert word in line
+    assert len(capsys.readouterr().err.splitlines()) == 1
     assert contents(made) == before
 
 
-def test_nothing_is_valid_for_longer_than_its_authority(tmp_path, capsys):
-    assert make(tmp_path / "new", "--days", "3650") == 0
-    yesterday = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=36)
-    old = _make_authority(yesterday)
-    _write_folder(tmp_path / "old/ca", old, {"ca.key.pem": _pem(old.key)})
-    assert make(tmp_path / "old", "--days", "3650") == 2
-    assert "longer than the authority's own 3648 days" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "old").iterdir()] == ["ca"]
+def test_nothing_is_valid_for_longer_than_its_authority(tmp_path):
+    old = make_authority(datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=3600))
+    _write_folder(tmp_path / "ca", old, {"ca.key.pem": _pem(old.key)})
+    assert make(tmp_path, "--days", "3650") == 0
+    ends = old.certificate.not_valid_after_utc
+    certificate = x509.load_pem_x509_certificate((tmp_path / "viewer/cert.pem").read_bytes())
+    assert certificate.not_valid_after_utc <= ends
+    assert load_tls(tmp_path / "viewer").name == "viewer"
 
 
 @pytest.mark.parametrize("name", ["ca.pem", "cert.pem", "key.pem"])
-def test_a_file_that_is_missing_or_no_pem_is_named(party, name):
-    (party / name).write_bytes(b"nonsense")
-    with pytest.raises(UserError, match=f"{name} is not a"):
-        load_tls(party)
+@pytest.mark.parametrize("content", [None, "", "other"])
+def test_a_file_that_is_missing_no_pem_or_another_partys_is_refused(party, made, name, content):
     (party / name).unlink()
-    with pytest.raises(UserError, match=f"{name} does not exist"):
-        load_tls(party)
-    with pytest.raises(UserError, match="no directory"):
-        load_tls(party / "nowhere")
-
-
-@pytest.mark.parametrize(
-    ("source", "match"),
-    [
-        ("certs/viewer/key.pem", "does not fit"),
-        ("other/ca/ca.pem", "not issued by"),
-        ("other/edge-hunter01/cert.pem", "does not fit"),
-    ],
-)
-def test_files_of_different_parties_do_not_mix(party, made, source, match):
-    if not (made.parent / "other").exists():
-        assert make(made.parent / "other") == 0
-    shutil.copyfile(made.parent / source, party / Path(source).name)
-    with pytest.raises(UserError, match=match):
+    if content is not None:
+        (party / name).write_text(content)
+    if content == "other":
+        make(made.parent / "other")
+        shutil.copyfile(made.parent / "other/edge-hunter01" / name, party / name)
+    with pytest.raises(UserError, match=name):
         load_tls(party)
 
 
@@ -155,7 +129,7 @@ def test_a_key_that_others_can_read_is_refused(party, mode, is_fine):
         load_tls(party)
 
 
-@pytest.mark.parametrize(("shift_days", "match"), [(-30, "expired at"), (30, "is the clock set")])
+@pytest.mark.parametrize(("shift_days", "match"), [(-30, "expired"), (30, "clock")])
 def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
     authority = read_authority(made / "ca")
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=shift_days)
@@ -179,7 +153,7 @@ def test_a_pair_fits_together_is_private_and_never_overwritten(tmp_path, capsys)
     for refused in (keys, ["keys", "--out", str(tmp_path / "file" / "keys")]):
         capsys.readouterr()
         assert exit_status(main, refused) == 2
-        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+        assert len(capsys.readouterr().err.splitlines()) == 1
     assert private_path.read_bytes() == pem
 
 

@@ -10,8 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from edge_runtime.controller import ActionLimit, Controller, Received, limit_action, shared_limits
-from edge_runtime.ride import Ride
+from edge_runtime.controller import (
+    ActionLimit,
+    Controller,
+    ControllerConfig,
+    Received,
+    Ride,
+    limit_action,
+    shared_limits,
+)
 from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mock import MockVehicle
@@ -32,7 +39,9 @@ KINDS: dict = {  # of states that come, and how the policy answers them
 
 
 def make(needs_rearm=False, actions=(PEDAL,), vehicle=None, **options):
-    return Controller(shared_limits(actions, vehicle or {}), T, needs_rearm, **options)
+    return Controller(
+        ControllerConfig(shared_limits(actions, vehicle or {}), T, needs_rearm, **options)
+    )
 
 
 def begin(controller, step, arrived_s, now_s, **changes):
@@ -47,7 +56,7 @@ def answer(controller, step, now_s, output=GOOD, **changes):
 
 def riding(max_s, needs_rearm, vehicle=None):
     limits = shared_limits([PEDAL], vehicle or {})
-    return Controller(limits, T, needs_rearm, ride=Ride(max_s, T, limits, plays=needs_rearm))
+    return Controller(ControllerConfig(limits, T, needs_rearm, ride_s=max_s))
 
 
 def test_a_vehicle_is_played_the_plan_until_it_ends_and_then_it_stops():
@@ -277,7 +286,7 @@ def test_a_safe_stop_is_the_manifests_or_holds_the_last_value():
 
 @pytest.mark.parametrize("period_s", [0.01, 0.05, 1.0])
 def test_every_limit_follows_the_policys_control_period(period_s):
-    controller = Controller(shared_limits([PEDAL], {}), period_s, needs_rearm=False)
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), period_s))
     story = [(0.0, "state", "drive"), (2.19, "tick", None), (2.21, "tick", SILENT)]
     story += [(0.0, "next tick", SILENT), (3.3, "begin", None), (4.29, "tick", SILENT)]
     play(controller, [(periods * period_s, *row) for periods, *row in story])

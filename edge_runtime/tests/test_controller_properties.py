@@ -17,8 +17,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
-from edge_runtime.controller import ActionLimit, Controller, Order, Received, shared_limits
-from edge_runtime.ride import Ride
+from edge_runtime.controller import (
+    ActionLimit,
+    Controller,
+    ControllerConfig,
+    Order,
+    Received,
+    shared_limits,
+)
 
 T = 0.1
 SILENT_S = 2 * T + 0.02  # a grace within the contract's 50 ms
@@ -41,8 +47,9 @@ class AnyHistory(RuleBasedStateMachine):
         super().__init__()
         self.vehicle = vehicle
         self.limits = shared_limits([PEDAL, STEERING], SLOW if vehicle else {})
-        ride = Ride(ride_s, T, self.limits, plays=vehicle) if ride_s else None
-        self.controller = Controller(self.limits, T, vehicle, armed_at_start, ride=ride)
+        self.controller = Controller(
+            ControllerConfig(self.limits, T, vehicle, armed_at_start, ride_s=ride_s)
+        )
         self.ride_s = ride_s
         self.answered_s = -math.inf  # the last order that was no ridden one
         self.now_s = 100.0

@@ -12,9 +12,8 @@ from hil_tests.testing.policies import PEDAL
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.controller import Controller, Received, shared_limits
-from edge_runtime.freshness import DRIFT, Freshness
-from edge_runtime.ride import Ride
+from edge_runtime.controller import Controller, ControllerConfig, Received, shared_limits
+from edge_runtime.latest import DRIFT, Freshness
 from edge_runtime.vehicles.mock import MockVehicle
 
 T = 0.1
@@ -40,6 +39,14 @@ def test_a_lag_is_what_a_state_has_above_the_quickest_of_its_session():
     assert lags((5.0, 10.0), (5.1, 10.15), (5.2, 10.19), (5.3, 10.6)) == near(0, 0.05, 0, 0.31)
     # Whatever the pace: a backlog that comes in step is as late as one that comes at once.
     assert lags((0.0, 0.0), *((T * n, T * n + 3.0) for n in (1, 2, 3)))[1:] == near(3, 3, 3)
+
+
+def test_a_quicker_state_is_the_new_measure_and_is_not_late_itself():
+    # Of a sender that does not say what it heard.
+    assert lags((0.0, 3.0), (3.1, 3.1), (3.2, 6.2)) == near(0, 0, 3)
+    # Of one that does, while it stands.
+    states, trips = [(0.0, 0.2), (T, 0.2), (2 * T, 0.4)], {0: 0.25, 1: 0.15}
+    assert lags(*states, trips=trips, stands={1}) == near(0, 0, 0.1)
 
 
 def test_clocks_that_drift_apart_are_followed():
@@ -89,7 +96,7 @@ def test_a_final_state_that_comes_past_the_injected_network_teaches_nothing():
 
 
 def test_a_state_that_gets_too_late_while_the_policy_computes_is_left_out_and_ends_no_silence():
-    controller = Controller(shared_limits([PEDAL], {}), T, False)
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T))
     seen = []
     for step, delay_s in enumerate([0.0, 0.1, 0.2, 0.215, 0.215, 0.215]):
         now_s = 1000.0 + step * T + delay_s
@@ -121,7 +128,7 @@ def answered(controller, step, now_s, lag_s=0.0, output=GOOD):
 
 
 def test_no_permission_that_was_given_beside_a_late_state_outlasts_a_silence():
-    controller = Controller(shared_limits([PEDAL], MockVehicle.limits), T, True)
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], MockVehicle.limits), T, True))
     for step, lag_s in enumerate([0.0, 3.0, 3.0, 3.0, 0.0, 3.0]):
         answered(controller, step, 1000.0 + T * step, lag_s)
     assert controller.rearm(1000.51)
@@ -131,7 +138,7 @@ def test_no_permission_that_was_given_beside_a_late_state_outlasts_a_silence():
 
 @pytest.mark.parametrize(("fault", "output"), [("estop", GOOD), ("", GOOD * np.float32(np.nan))])
 def test_what_else_stops_it_is_the_reason_while_states_are_late(fault, output):
-    controller = Controller(shared_limits([PEDAL], MockVehicle.limits), T, True)
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], MockVehicle.limits), T, True))
     answered(controller, 0, 1000.0)
     controller.vehicle_fault = fault
     reasons = []
@@ -147,7 +154,7 @@ def test_what_else_stops_it_is_the_reason_while_states_are_late(fault, output):
 )
 def test_jitter_both_ways_does_not_keep_it_in_a_stop(period_s, delay_s, jitter_s):
     rng, drives = np.random.default_rng(7), 0
-    controller = Controller(shared_limits([PEDAL], {}), period_s, False)
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), period_s))
     for step in range(1000):
         up_s, down_s = rng.normal(delay_s, jitter_s, 2).clip(0.001)
         sent_s = 1000.0 + step * period_s
@@ -166,8 +173,7 @@ class World:
 
     def __init__(self, vehicle: bool, ride_s: float, down_s: float = 0.05) -> None:
         limits = shared_limits([PEDAL], MockVehicle.limits if vehicle else {})
-        ride = Ride(ride_s, T, limits, plays=vehicle) if ride_s else None
-        self.controller = Controller(limits, T, vehicle, ride=ride)
+        self.controller = Controller(ControllerConfig(limits, T, vehicle, ride_s=ride_s))
         self.vehicle, self.ride_s = vehicle, ride_s
         self.now_s, self.step, self.clock_s = 1000.0, 0, 0.0
         self.up_s, self.down_s = 0.01, down_s

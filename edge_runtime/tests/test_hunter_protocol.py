@@ -23,7 +23,7 @@ def test_golden_vectors():
         (0.0, 0.2, "00 00 00 00 00 00 00 C8"),
         (-0.15, -0.2, "FF 6A 00 00 00 00 FF 38"),
     ):
-        assert protocol.encode_motion(speed_mps, inner_rad, HUNTER_2) == bytes.fromhex(golden)
+        assert protocol.motion(speed_mps, inner_rad, HUNTER_2).data == bytes.fromhex(golden)
     assert encode(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.CAN_CONTROL)) == b"\x01"
     assert encode(protocol.CLEAR_COMMAND, protocol.ClearCommand()) == b"\x00"
 
@@ -44,7 +44,7 @@ def test_feedback_by_hand():
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
 @given(speed=st.floats(-1e308, 1e308), angle=st.floats(-1e308, 1e308))
 def test_no_command_leaves_the_models_limits(spec, speed, angle):
-    told = decode(0x111, protocol.encode_motion(speed, angle, spec))
+    told = decode(0x111, protocol.motion(speed, angle, spec).data)
     for value, wanted, most in zip(
         told, (speed, angle), (spec.max_speed_mps, spec.max_inner_steering_rad)
     ):
@@ -58,7 +58,7 @@ def test_what_is_not_finite_is_never_a_count(value):
         with pytest.raises(ValueError, match="no number for the bus"):
             encode(protocol.MOTION_COMMAND, message)
     with pytest.raises(ValueError, match="no number for the bus"):
-        protocol.encode_motion(math.nan, 0.0, HUNTER_2)
+        protocol.motion(math.nan, 0.0, HUNTER_2)
 
 
 def test_what_a_field_cannot_hold_is_clamped_to_its_ends():

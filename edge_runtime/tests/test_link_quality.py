@@ -2,7 +2,6 @@
 
 import math
 import random
-import time
 from typing import Any
 
 import pytest
@@ -85,15 +84,6 @@ def test_delays_are_within_their_error_whatever_the_clocks_say(
         assert link[name] == pytest.approx(spread_ms / math.sqrt(12.0), rel=0.15, abs=0.01)
 
 
-def test_ways_that_are_alike_are_told_apart_from_their_jitter():
-    chance = random.Random(1)
-    link = Network(5000.0).run(300, lambda: 50 + chance.expovariate(0.05), lambda: 50.0)
-    assert (link["up_ms"], link["down_ms"]) == (
-        pytest.approx(70.0, abs=2.5), pytest.approx(50.0, abs=1.0),
-    )  # fmt: skip
-    assert link["up_jitter_ms"] > 15.0 > 1.0 > link["down_jitter_ms"]
-
-
 @settings(max_examples=20)
 @given(up=st.floats(0.0, 0.3), down=st.floats(0.0, 0.3), seed=st.integers(0, 99))
 def test_the_share_lost_is_what_was_lost(up, down, seed):
@@ -102,13 +92,8 @@ def test_the_share_lost_is_what_was_lost(up, down, seed):
     for way in ("up", "down"):  # what the newest messages lost shows with the next that comes
         expected = 100.0 * network.lost[way] / network.sent[way]
         assert link[f"{way}_lost_percent"] == pytest.approx(expected, abs=0.8)
-
-
-def test_losses_are_forgotten_as_the_window_moves_on():
-    network = Network()
-    network.run(200, lose=lambda way: network.step % 4 == 0)
-    assert network.quality.measured()["up_lost_percent"] > 20.0
-    assert network.run(1300)["up_lost_percent"] == 0.0
+    good = network.run(1300)  # the window moves on
+    assert good["up_lost_percent"] == good["down_lost_percent"] == 0.0
 
 
 def test_late_states_are_not_lost_and_copies_count_once():
@@ -163,16 +148,3 @@ def test_a_poor_link_is_poor_until_it_is_well_within_the_limits(name):
         found.append(poor)
         assert is_poor({}, 0.1, poor) is poor  # an unknown one is as it was
     assert found == [False, True, True, True, False, False]
-
-
-def test_a_message_costs_some_microseconds():
-    quality, took_s = LinkQuality(), []
-    heard: dict[str, int] = {}
-    for step in range(5000):
-        state = make_state(step, sent_ns=step, **heard)
-        begun_s = time.perf_counter()
-        quality.note_state(state, step + 5)
-        quality.note_command(0, step + 6)
-        took_s.append(time.perf_counter() - begun_s)
-        heard = {"heard": step + 1, "heard_sent_ns": step + 6, "heard_ns": step + 7}
-    assert sorted(took_s)[len(took_s) // 2] < 50e-6  # 4 on an idle machine

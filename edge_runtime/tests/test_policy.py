@@ -95,41 +95,35 @@ def test_a_policy_of_any_observation_and_action_drives(plain, kinds):
 
 
 @pytest.mark.parametrize(
-    ("kinds", "changes", "match"),
+    ("kinds", "changes"),
     [
-        ({"ranges": ROVER_INPUTS["ranges"]}, {}, r"its input must be camera tensor\(uint8\)"),
-        ({**ROVER_INPUTS, "more": "float[b]"}, {}, "its input more is not in the manifest"),
-        ({**ROVER_INPUTS, "camera": "float[b, 4, 6, 3]"}, {}, "its input must be camera"),
-        (
-            {**ROVER_INPUTS, "camera": "uint8[b, 6, 4, 3]"},
-            {},
-            r"camera tensor\(uint8\) \[batch, 4, 6, 3\], it is .* \['b', 6, 4, 3\]",
-        ),
-        ({**ROVER_INPUTS, "camera": "uint8[2, 4, 6, 3]"}, {}, r"it is .* \[2, 4, 6, 3\]"),
-        ({**ROVER_INPUTS, "lit": "float[b]"}, {}, r"lit tensor\(bool\) \[batch\], it is"),
-        (ROVER_INPUTS, {"action": WHEELS[:1]}, "its output must be action"),
+        ({"ranges": ROVER_INPUTS["ranges"]}, {}),
+        ({**ROVER_INPUTS, "more": "float[b]"}, {}),
+        ({**ROVER_INPUTS, "camera": "float[b, 4, 6, 3]"}, {}),
+        ({**ROVER_INPUTS, "camera": "uint8[b, 6, 4, 3]"}, {}),
+        ({**ROVER_INPUTS, "camera": "uint8[2, 4, 6, 3]"}, {}),
+        ({**ROVER_INPUTS, "lit": "float[b]"}, {}),
+        (ROVER_INPUTS, {"action": WHEELS[:1]}),
     ],
 )
-def test_inputs_and_output_must_be_the_manifests(plain, kinds, changes, match):
+def test_inputs_and_output_must_be_the_manifests(plain, kinds, changes):
     write_rover(plain, kinds, **changes)
-    refused(plain, match, allow_unsigned=True)
+    refused(plain, "its (input|output)", allow_unsigned=True)
 
 
 @pytest.mark.parametrize(
-    ("public_key", "match"),
+    "public_key",
     [
-        (public_pem(Ed25519PrivateKey.generate()), "another key signed it"),
-        (b"not a key", "not a PEM public key"),
-        (public_pem(X25519PrivateKey.generate()), "not an Ed25519 key"),
-        (None, "does not exist"),
+        public_pem(Ed25519PrivateKey.generate()), b"not a key",
+        public_pem(X25519PrivateKey.generate()), None,
     ],
-)
-def test_another_key_or_none_is_refused(make_policy, public_key, match):
+)  # fmt: skip
+def test_another_key_or_none_is_refused(make_policy, public_key):
     signed = make_policy()
     signed.public_key.unlink()
     if public_key:
         signed.public_key.write_bytes(public_key)
-    refused(signed.path, match, public_key=signed.public_key, allow_unsigned=True)
+    refused(signed.path, "public key", public_key=signed.public_key, allow_unsigned=True)
 
 
 @pytest.mark.parametrize("shape", [(1, 0), (2, 1), (1, 2), (), (1,), (0, 1), (1, 1, 1)])
@@ -196,42 +190,38 @@ def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypat
     refused(signed.path, "no public key")
 
 
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"manifest_changes": {"action": [PEDAL, STEERING]}}, "its output must be action"),
-        ({"manifest_changes": {"action": []}}, "no action"),
-        *(
-            ({"manifest_changes": {"control_period_s": period_s}}, "control period is")
-            for period_s in (0.0099, 1.001)
-        ),
-        ({"manifest_changes": {"schema": 1}}, "schema 1, .* export the policy again"),
-        ({"manifest_changes": {"observation": {}}}, "no observation"),
-        *(
-            ({"manifest_changes": {"observation": {"frames": entry}}}, match)
-            for entry, match in (
-                (Entry(dtype="float64", shape=[2, 45, 80]), "the wire carries uint8, int32"),
-                (Entry(dtype="uint8", shape=[2, 0, 80]), "has the shape"),
-                (Entry(dtype="uint8", shape=[4096, 1024]), "the wire carries 4190208 at most"),
-                (Entry(dtype="float32", shape=[2, 45, 80]), "its input must be frames"),
-            )
-        ),
-        ({"opset": 12}, "opset 12"),
-        ({"opset": 22}, "opset 22"),
-        ({"ir_version": 11}, "IR version 11"),
-        ({"value": 1.5}, "outside its manifest's"),
-        ({"value": float("nan")}, "not finite"),
-        ({"actions": (action("x", low=0.5, high=0.5),)}, "must be finite, and not empty"),
-        ({"actions": (action("x", high=float("inf")),)}, "not valid: "),  # JSON has no such number
-        ({"actions": (action("x", stop=1.5),)}, "safe stop of x is 1.5, outside"),
-        ({"actions": (action("x", slew_per_s=0.0),)}, "slew_per_s of x is 0.0"),
-        ({"actions": (PEDAL, PEDAL)}, "names an action twice: pedal, pedal"),
-        ({"actions": [action(f"a{i}") for i in range(601)]}, "names 601 actions; 600 at most"),
-    ],
-)
-def test_manifest_and_graph_must_agree(plain, options, match):
-    write_policy(plain, **options)
-    refused(plain, match, allow_unsigned=True)
+MANIFESTS: dict = {
+    "output": {"action": [PEDAL, STEERING]},
+    "actions": {"action": []},
+    "control period is 0.0099": {"control_period_s": 0.0099},
+    "control period is 1.001": {"control_period_s": 1.001},
+    "schema 1": {"schema": 1},
+    "no observation": {"observation": {}},
+    "float64": {"observation": {"frames": Entry(dtype="float64", shape=[2, 45, 80])}},
+    "shape": {"observation": {"frames": Entry(dtype="uint8", shape=[2, 0, 80])}},
+    "4190208": {"observation": {"frames": Entry(dtype="uint8", shape=[4096, 1024])}},
+    "input": {"observation": {"frames": Entry(dtype="float32", shape=[2, 45, 80])}},
+}
+OPTIONS: dict = {
+    "opset 12": {"opset": 12},
+    "opset 22": {"opset": 22},
+    "IR version 11": {"ir_version": 11},
+    "outside": {"value": 1.5},
+    "finite": {"value": float("nan")},
+    "not empty": {"actions": (action("x", low=0.5, high=0.5),)},
+    "not valid": {"actions": (action("x", high=float("inf")),)},  # JSON has no such number
+    "safe stop": {"actions": (action("x", stop=1.5),)},
+    "slew_per_s": {"actions": (action("x", slew_per_s=0.0),)},
+    "2 actions": {"actions": (PEDAL, PEDAL)},
+    "601 actions": {"actions": [action(f"a{i}") for i in range(601)]},
+    **{word: {"manifest_changes": changes} for word, changes in MANIFESTS.items()},
+}
+
+
+@pytest.mark.parametrize("word", OPTIONS)
+def test_manifest_and_graph_must_agree(plain, word):
+    write_policy(plain, **OPTIONS[word])
+    refused(plain, word, allow_unsigned=True)
 
 
 def test_what_onnxruntime_prints_stays_off_stdout(plain, monkeypatch, capfd):

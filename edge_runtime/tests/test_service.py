@@ -1,4 +1,4 @@
-"""What a service needs: lines for machines, priority, the board watched."""
+"""The runtime as a service, and its loop: real threads between a fake policy and a fake link."""
 
 import contextlib
 import gc
@@ -10,8 +10,6 @@ import socket
 import sys
 import threading
 import time
-from collections import Counter
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -21,30 +19,16 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.edge import run_edge
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
+from hil_tests.testing.vehicles import BrokenVehicle
 
-from edge_runtime import log, loop, realtime
-from edge_runtime.controller import Controller, shared_limits
-from edge_runtime.loop import ControlLoop
+from edge_runtime import log, loop, service
+from edge_runtime.controller import Controller, ControllerConfig, shared_limits
+from edge_runtime.loop import ControlLoop, LoopParts
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
-from edge_runtime.tests.test_commands import HOSTILE
-from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import Reason, Rejection, encode
-
-
-def test_rejections_are_one_line_a_second_for_each_reason(monkeypatch):
-    lines = []
-    monkeypatch.setattr(log, "event", lambda level, name, **said: lines.append(said))
-    counts: Counter[str] = Counter()
-    one: Any = SimpleNamespace(_logged_rejection_s={}, _latest=SimpleNamespace(rejected=counts))
-    for tenth in range(11):
-        for reason in (Reason.STALE, Reason.SCHEMA)[: 1 + (tenth == 5)]:
-            counts[reason.value] += 1
-            ControlLoop._log_rejection(one, Rejection(reason, "why"), 5.0 + tenth / 10)
-    expected = [("stale", 1), ("schema", 1), ("stale", 11)]
-    assert [(said["reason"], said["so_far"]) for said in lines] == expected
 
 
 def test_the_hottest_sensor_counts_and_a_silent_one_does_not(tmp_path):
@@ -64,30 +48,31 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.append(cpus))
     lock = MagicMock(return_value=-1)  # C's word for a failure
-    monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: MagicMock(mlockall=lock))
+    monkeypatch.setattr(service.ctypes, "CDLL", lambda *_, **__: MagicMock(mlockall=lock))
     for limit, user, tries in ((2**16, 1000, 0), (2**16, 0, 1), (resource.RLIM_INFINITY, 1000, 2)):
         monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
         monkeypatch.setattr(os, "geteuid", lambda user=user: user)
-        assert realtime.claim_resources(0, [], True) == ["lock_memory"]
+        assert service.claim_resources(0, [], True) == ["lock_memory"]
         assert lock.call_count == tries  # with a limit, an allocation would fail in mid-drive
     lock.return_value = 0
-    assert realtime.claim_resources(50, [1], True) == ["realtime_priority"]
+    assert service.claim_resources(50, [1], True) == ["realtime_priority"]
     assert (asked, lock.call_count) == ([[1]], 3)
-    assert realtime.claim_resources(0, [1, 7], False) == ["cpus"]
-    assert realtime.claim_resources(0, [], False) == []
+    assert service.claim_resources(0, [1, 7], False) == ["cpus"]
+    assert service.claim_resources(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json_without_what_a_terminal_acts_upon(capfd):
+    hostile = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e"
     for log_format in log.FORMATS:
         log.configure("info", log_format)
         log.event("debug", "unseen")
-        log.event("info", "rejected", detail=HOSTILE, name=HOSTILE.strip())
+        log.event("info", "rejected", detail=hostile, name=hostile)
         log.event("warning", "mode", was="drive", detail="two words", level="no level")
         log.close()
     hostile_text, text, hostile_line, line = capfd.readouterr().err.split("\n")[:-1]
-    for hostile in (hostile_text, hostile_line):
-        assert hostile.isprintable()
-        assert "1b[2J" in hostile
+    for shown in (hostile_text, hostile_line):
+        assert shown.isprintable()
+        assert "1b[2J" in shown
     assert text.endswith("Z WARNING mode was=drive detail='two words' level='no level'")
     fields = json.loads(line)
     assert fields.pop("time").endswith("Z")
@@ -144,12 +129,10 @@ def systemd():
 
 
 def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
-    settings = tmp_path / "edge.toml"
+    settings, signed = tmp_path / "edge.toml", make_policy()
     settings.write_text("log_format = 'json'\ncpus = [4095]\n")
     environment = {"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "400000"}
-    endpoint = free_endpoint()
-    signed = make_policy()
-    flags = [*signed.flags, "--connect", endpoint, "--config", str(settings)]
+    flags = [*signed.flags, "--connect", free_endpoint(), "--config", str(settings)]
     with run_edge(*flags, environment=environment) as edge:
         assert edge.output.startswith("ready ")
         assert edge.output.rstrip().endswith(f" verified_by={signed.public_key}")
@@ -165,10 +148,36 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
     assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
-    assert "this process may use" in lines[0]["help"]
-    nobody = f"nobody listens on port {endpoint.split(':')[1]} of 127.0.0.1 (connection refused)"
-    assert lines[1]["why"] == f"{endpoint}: {nobody}"
+    assert "connection refused" in lines[1]["why"]
     assert lines[2]["accepted"] == 0
+
+
+PERIOD = {"WATCHDOG_USEC": "3000000"}
+
+
+@pytest.mark.parametrize(
+    ("environment", "period_s"),
+    [
+        (PERIOD, 1.5), ({**PERIOD, "WATCHDOG_PID": str(os.getpid())}, 1.5),
+        ({**PERIOD, "WATCHDOG_PID": "1"}, None), ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+        ({}, None), ({"NOTIFY_SOCKET": ""}, None), ({"NOTIFY_SOCKET": "vsock:2"}, None),
+    ],
+)  # fmt: skip
+def test_the_watchdog_period_is_half_of_systemds_or_nothing_is_said(environment, period_s):
+    notifier = Notifier(environment)
+    notifier.tell("READY=1")
+    assert notifier.watchdog_period_s == period_s
+
+
+def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
+    end = Systemd(str(tmp_path / "notify"))
+    notifier = end.notifier()
+    for _ in range(2000):  # more than the socket takes
+        notifier.tell("WATCHDOG=1")
+    end.socket.close()
+    notifier.tell("STOPPING=1")
+    notifier.tell("STOPPING=1")
 
 
 class FakePolicy:
@@ -211,9 +220,9 @@ def running():
         def start(notifier: Any, vehicle: Any = None) -> Any:
             policy: Any = FakePolicy()
             link: Any = FakeLink()
-            controller = Controller(shared_limits([PEDAL], {}), T, needs_rearm=False)
+            controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T))
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
-            control = ControlLoop(policy, controller, link, runner, notifier)
+            control = ControlLoop(LoopParts(policy, controller, link, notifier, runner))
             control.start()
             main = threading.Thread(target=control.run)
             main.start()
@@ -287,7 +296,7 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     vehicle = BrokenVehicle()
     running(systemd.notifier(), vehicle)
     assert systemd.next() == "WATCHDOG=1"
-    vehicle.broken = "hang"
+    vehicle.hangs = "feedback"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
     vehicle.go_on()
     assert systemd.until("WATCHDOG") == "WATCHDOG=1"
@@ -297,11 +306,10 @@ def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
     vehicle = BrokenVehicle()
     control, link, _ = running(Notifier({}), vehicle)
     link.state_comes(encode(make_state(0)))
-    vehicle.says = ["the battery is hot"]
+    vehicle.odd = {"faults": ["the battery is hot"]}
     wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
-    vehicle.says = []
+    vehicle.odd = {}
     wait_until(lambda: not control._vehicle.fault(time.monotonic()), "the end of the fault")
-    time.sleep(0.2)
     assert control.health().vehicle_fault == "the battery is hot"
 
 
@@ -326,29 +334,11 @@ def test_tens_of_thousands_of_states_leave_the_memory_as_it_is(running):
     assert health.superseded > 0
 
 
-def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
-    end = Systemd(str(tmp_path / "notify"))
-    notifier = end.notifier()
-    for _ in range(2000):  # more than the socket takes
-        notifier.tell("WATCHDOG=1")
-    end.socket.close()
-    notifier.tell("STOPPING=1")
-    notifier.tell("STOPPING=1")
-
-
-PERIOD = {"WATCHDOG_USEC": "3000000"}
-
-
-@pytest.mark.parametrize(
-    ("environment", "period_s"),
-    [
-        (PERIOD, 1.5), ({**PERIOD, "WATCHDOG_PID": str(os.getpid())}, 1.5),
-        ({**PERIOD, "WATCHDOG_PID": "1"}, None), ({"WATCHDOG_USEC": "0"}, None),
-        ({"WATCHDOG_USEC": "soon"}, None),
-        ({}, None), ({"NOTIFY_SOCKET": ""}, None), ({"NOTIFY_SOCKET": "vsock:2"}, None),
-    ],
-)  # fmt: skip
-def test_the_watchdog_period_is_half_of_systemds_or_nothing_is_said(environment, period_s):
-    notifier = Notifier(environment)
-    notifier.tell("READY=1")
-    assert notifier.watchdog_period_s == period_s
+def test_rejections_are_one_line_a_second_for_each_reason(running, monkeypatch):
+    control, lines = running(Notifier({}))[0], []
+    monkeypatch.setattr(log, "event", lambda level, name, **said: lines.append(said["reason"]))
+    for tenth in range(11):
+        for reason in (Reason.STALE, Reason.SCHEMA)[: 1 + (tenth == 5)]:
+            control._latest.reject(Rejection(reason, "why"))
+            control._log_rejection(Rejection(reason, "why"), 5.0 + tenth / 10)
+    assert lines == ["stale", "schema", "stale"]

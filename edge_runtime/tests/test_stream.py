@@ -34,9 +34,9 @@ def started():
 
 def test_it_sends_fifty_times_a_second(started):
     _, sent = started()
-    wait_until(lambda: len(sent) > 50, "a second of sending")
+    wait_until(lambda: len(sent) > 25, "half a second of sending")
     # A machine that pauses loses periods; nothing may make it send more often than asked.
-    assert sent[50] - sent[0] > 0.9
+    assert sent[25] - sent[0] > 0.45
 
 
 def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(started, monkeypatch):
@@ -50,14 +50,14 @@ def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(start
 
 
 def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
-    monkeypatch.setattr(stream, "PERIOD_S", 2.0)
-    _, sent = started(pause_s=2.5)
+    monkeypatch.setattr(stream, "PERIOD_S", 1.0)
+    _, sent = started(pause_s=1.25)
     wait_until(lambda: len(sent) >= 2, "the next")
-    assert sent[1] - sent[0] < 3.9  # the next period would have come 4 s after the first
+    assert sent[1] - sent[0] < 1.9  # the next period would have come 2 s after the first
 
 
 def test_after_a_pause_it_sends_once_and_not_for_each_missed_period(started):
-    _, sent = started(pause_s=0.5)
+    _, sent = started(pause_s=0.3)
     wait_until(lambda: len(sent) > 10, "ten more")
     assert sent[10] - sent[1] > 0.12
 

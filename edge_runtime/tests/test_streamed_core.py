@@ -11,17 +11,13 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.vehicles.core import (
-    DEVIATES_S,
-    FOLLOWS_S,
     LEADS_TO,
-    STANDS_MPS,
-    Event,
-    Finding,
-    FollowWatch,
     Speeds,
-    State,
+    VehicleEvent,
+    VehicleState,
 )
 from edge_runtime.vehicles.mapping import wish_of
+from edge_runtime.vehicles.plausibility import Fault, Finding
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -36,7 +32,7 @@ def rig(make):
 
 def test_a_new_core_knows_and_sends_nothing(rig):
     core, report = rig.core, rig.core.report(0.0)
-    assert (core.state, core.cause, core.words) == (State.DISABLED, None, "")
+    assert (core.state, core.cause, core.words) == (VehicleState.DISABLED, None, "")
     assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
@@ -44,7 +40,7 @@ def test_a_new_core_knows_and_sends_nothing(rig):
     core.brake(rig.now_s)
     rig.step(100, PEDAL)
     assert not core.close(rig.now_s)
-    assert (rig.sent, core.state) == ([], State.DISABLED)
+    assert (rig.sent, core.state) == ([], VehicleState.DISABLED)
 
 
 @pytest.mark.parametrize(
@@ -81,73 +77,18 @@ def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig
     for _ in range(2):
         rig.core.enable(rig.now_s)
         rig.step(45)
-    assert rig.core.state is State.ENABLING
+    assert rig.core.state is VehicleState.ENABLING
 
 
 def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
     rig.driving(1.0)
     rig.obeys, rig.speed_mps = False, 0.7
     rig.step(130, {"pedal": -1.0})
-    assert rig.core.cause is Event.STUCK
+    assert rig.core.cause is Fault.STUCK
     rig.enabled().step(40, {"pedal": -1.0})
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
     rig.step(30, {"pedal": -1.0})
-    assert rig.core.cause is Event.STUCK
-
-
-def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_while():
-    watch = FollowWatch(1.0, FOLLOWS_S)
-    for now_s, asked_mps, measured_mps, stuck in [
-        (-3.0, 9.0, 0.0, False),  # it has had no time to follow
-        (-2.0625, 9.0, 0.0, False),
-        (-2.0, 9.0, 0.0, False),
-        (-1.9375, 9.0, 0.0, False),
-        (-1.875, 9.0, 0.0, True),
-        (-1.5, 2.0, 9.0, False),
-        (-0.5, 2.0, 10.0, False),  # as was asked for a second ago
-        (-0.375, 2.0, 9.0, False),  # no more
-        (-0.25, 2.0, 9.0, True),
-        (-0.125, 2.0, 3.0, False),  # the highest that counts as 2 m/s
-        (-0.0625, 2.0, 9.0, False),
-        (-0.03125, 2.0, 1.0, False),  # the lowest
-        (0.0, 2.0, 0.5, False),
-        (DEVIATES_S, 2.0, 9.0, False),
-        (DEVIATES_S + 0.001, 2.0, 0.5, True),
-    ]:
-        assert watch.is_stuck(asked_mps, measured_mps, now_s) is stuck, now_s
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_wheel_from_elsewhere_has_the_time_to_come_at_its_rate(sign):
-    """0.1 rad to each side, 0.5 s to follow, 1 rad/s."""
-    watch = FollowWatch(0.1, 0.5, 1.0)
-    for now_s, asked, measured, stuck in [
-        (0.0, 0.0, 1.0, False),
-        (0.4375, 0.0, 1.0, False),
-        (0.5, 0.0, 1.0, False),  # it may begin to turn now
-        (0.5, 0.0, 1.0, False),  # twice in one moment
-        (0.75, 0.0, 0.78, False),
-        (1.0, 0.0, 0.53, False),
-        (1.25, 0.0, 0.29, False),  # too slow, but only just now
-        (1.3125, 0.0, 0.29, False),
-        (1.375, 0.0, 0.29, True),
-        (1.5, 0.0, 0.09, False),
-        (1.625, 1.0, -0.09, False),
-        (2.0, 1.0, -0.09, False),
-        (2.0625, 1.0, 0.0, False),  # it has stuck
-        (2.125, 1.0, 0.0, False),  # 0.0 was asked for 0.625 s ago, and still 0.5 s ago
-        (2.1875, 1.0, 0.0, False),  # no more: now it turns by 1 rad/s
-        (2.25, 1.0, 0.0, False),
-        (2.375, 1.0, 0.0, True),
-        (2.625, 1.0, None, False),  # nothing is asked of it, or known
-        (2.75, 0.0, 1.0, False),  # anew
-        (3.1875, 0.0, 1.0, False),
-        (3.25, 0.0, 1.2, False),
-        (3.3125, 0.0, 1.0, False),
-        (3.375, 0.0, 1.0, True),
-    ]:
-        measured = None if measured is None else sign * measured
-        assert watch.is_stuck(sign * asked, measured, now_s) is stuck, now_s
+    assert rig.core.cause is Fault.STUCK
 
 
 TOLERANCE_RAD = 0.1 * SPEC.centre_rad(SPEC.max_inner_steering_rad)
@@ -171,16 +112,16 @@ def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
     rig.jammed_rad = math.copysign(SPEC.inner_rad(wheel_rad), wheel_rad)
     wrong = abs(wheel_rad - asked_rad) > TOLERANCE_RAD
     rig.step(round(FOUND_WITHIN_S / STREAM_S), {"steering": steering}, scenario_speed_mps=4.0)
-    assert rig.core.cause is (Event.ASTRAY if wrong else None)
+    assert rig.core.cause is (Fault.STEERING_STUCK if wrong else None)
     assert rig.core.set_point.speed_mps == 0.0 if wrong else rig.speed_mps > 0.9
 
 
 def test_a_wheel_need_not_turn_before_it_is_to_drive(rig):
     rig.jammed_rad = 0.5
     rig.enabled().step(200, {"pedal": -1.0, "steering": -1.0})
-    assert rig.core.state is State.ENABLED
+    assert rig.core.state is VehicleState.ENABLED
     rig.step(60, PEDAL)
-    assert rig.core.cause is Event.ASTRAY
+    assert rig.core.cause is Fault.STEERING_STUCK
     assert 0.0 < max(rig.speeds()) < 0.75
 
 
@@ -189,7 +130,7 @@ def test_a_wheel_need_not_turn_where_it_stands_nor_where_it_is_to_stand(rig, spe
     rig.jammed_rad = 0.5
     rig.enabled().obeys, rig.speed_mps = False, speed_mps
     rig.step(100, {"pedal": pedal})
-    assert rig.core.cause is (Event.STUCK if pedal > 0 else None)
+    assert rig.core.cause is (Fault.STUCK if pedal > 0 else None)
 
 
 @pytest.mark.parametrize(("period_s", "lag_s"), [(0.1, 0.36), (0.5, 1.16)])
@@ -202,15 +143,15 @@ def test_a_wheel_may_lag_behind_all_the_time(rig, period_s, lag_s):
         asked_rad.append(rig.core.set_point.inner_rad)
         rig.jammed_rad = asked_rad.pop(0)
         rig.step(1, {**PEDAL, "steering": 1.0 if tick // 75 % 2 else -1.0})
-        assert rig.core.state is State.ENABLED, rig.words
+        assert rig.core.state is VehicleState.ENABLED, rig.words
     assert max(asked_rad) > 0.5
 
 
 def test_of_two_findings_the_graver_is_named(rig, monkeypatch):
     rig.driving()
-    monkeypatch.setattr(rig.core._steering_watch, "is_stuck", lambda *_: True)
+    monkeypatch.setattr(rig.core._drive_watch._steering, "is_stuck", lambda *_: True)
     rig.core.tick(rig.core.late_at_s + 1.0)
-    assert rig.core.cause is Event.SILENT
+    assert rig.core.cause is Fault.SILENT
 
 
 @pytest.mark.parametrize("pedal", [0.05, 1.0])
@@ -223,15 +164,7 @@ def test_a_runaway_is_found_at_any_scale_and_throttle(make, scale, pedal):
     for _ in range(60):
         rig.speed_mps = min(rig.speed_mps + 2.0 * STREAM_S, 1.6)
         rig.step(1, {"pedal": pedal})
-    assert rig.core.cause is Event.STUCK
-
-
-def test_a_drive_with_a_lag_is_not_stuck(rig):
-    rig.enabled().obeys = False
-    for tick in range(1000):
-        rig.step(1, {"pedal": 1.0 if (tick // 150) % 2 == 0 else -1.0})
-        rig.speed_mps += (rig.core.set_point.speed_mps - rig.speed_mps) * STREAM_S / 0.3
-        assert rig.core.state is State.ENABLED, rig.words
+    assert rig.core.cause is Fault.STUCK
 
 
 def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
@@ -265,34 +198,6 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(m
     rig.step(100, {"steering": 1.0}, scenario_speed_mps=0.0)
     assert rig.speed_mps == 0.0
     assert rig.inner_rad < -0.05
-
-
-def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig):
-    rig.driving().core.brake(rig.now_s, latch=False)
-    count = len(rig.asked)
-    rig.step(500)
-    assert set(rig.speeds(count)) == {0.0}
-    assert rig.core.state is State.ENABLED
-    rig.step(20, PEDAL)
-    assert rig.speed_mps > 0
-
-
-@pytest.mark.parametrize(
-    ("action", "speed_mps", "words"),
-    [
-        *(({"pedal": value}, None, "not finite") for value in (math.nan, math.inf)),
-        *(({"steering": value}, 1.0, "not finite") for value in (math.nan, math.inf)),
-        *(({}, value, "not finite") for value in (math.nan, math.inf)),
-        # No pedal means the speed of the scenario's car only where there is a steering beside it.
-        *((lacks, speed, "lacks an action") for lacks, speed in (({}, 6.0), ({}, None))),
-        ({"steering": 0.1}, None, "lacks an action"),
-    ],
-)
-def test_a_command_that_is_not_finite_or_lacks_an_action_is_refused(rig, action, speed_mps, words):
-    with pytest.raises(ValueError, match=words):
-        rig.enabled().core.command(action, rig.now_s, speed_mps)
-    rig.step(10)
-    assert rig.speed_mps == 0
 
 
 def fall_silent(rig):
@@ -337,8 +242,9 @@ def be_astray(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Event.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
-        (lie, Event.LYING), (be_stuck, Event.STUCK), (be_astray, Event.ASTRAY),
+        (fall_silent, Fault.SILENT), (command_no_more, VehicleEvent.COMMAND_LATE),
+        (brake, VehicleEvent.BRAKE),
+        (lie, Fault.LYING), (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
     ],
 )  # fmt: skip
 def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
@@ -361,20 +267,22 @@ def after(state, event):
 
 
 def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
-    ways = {(event, *way) for event in Event for way in LEADS_TO[event].items()}
+    ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
     assert all(before is not then for _, before, then in ways)
-    assert {event for event, _, then in ways if then is State.ENABLED} == {Event.CONFIRMED}
-    out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
-    assert out_of_stopped == {Event.ENABLE, Event.CLOSE}
+    assert {event for event, _, then in ways if then is VehicleState.ENABLED} == {
+        VehicleEvent.CONFIRMED
+    }
+    out_of_stopped = {event for event, before, _ in ways if before is VehicleState.STOPPED}
+    assert out_of_stopped == {VehicleEvent.ENABLE, VehicleEvent.CLOSE}
 
 
 def test_the_readme_shows_the_table():
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
-    assert render_table(Event, State, after) in readme
+    assert render_table(LEADS_TO, VehicleState, after) in readme
 
 
-@pytest.mark.parametrize("state", State)
-@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("state", VehicleState)
+@pytest.mark.parametrize("event", LEADS_TO)
 def test_the_core_goes_where_the_table_says(rig, state, event):
     core = rig.core
     core.state = state
@@ -383,7 +291,7 @@ def test_the_core_goes_where_the_table_says(rig, state, event):
     core._apply(Finding(event, "why"), rig.now_s)
     leads_to = after(state, event)
     assert core.state is leads_to
-    if leads_to is State.STOPPED and state is not State.STOPPED:
+    if leads_to is VehicleState.STOPPED and state is not VehicleState.STOPPED:
         assert (core.cause, core.words) == (event, "why")
         assert core.set_point.speed_mps == 0
         assert core._wish is None
@@ -418,7 +326,7 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(
                 rig.step()
                 for speed_mps in filter(None, rig.speeds(count)):
                     assert may_move
-                    assert rig.sent_in is State.ENABLED
+                    assert rig.sent_in is VehicleState.ENABLED
                     assert 0.0 < speed_mps <= SPEC.max_speed_mps
                     assert rig.now_s - commanded_s <= 0.25 + STREAM_S
         elif what == "command":
@@ -442,9 +350,9 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(
 def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
-    for speed_mps in (3.0, STANDS_MPS, -STANDS_MPS):
+    for speed_mps in (3.0, 0.02, -0.02, 0.0199):
         speeds.note(speed_mps, 0.0)
-        assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
+        assert (speeds.stands, speeds.acceleration_mps2()) == (speed_mps == 0.0199, 0.0)
 
 
 periods = st.floats(0.005, 0.1)

@@ -67,12 +67,12 @@ def test_the_table_knows_every_topic_of_the_wire():
 
 
 def test_a_wrong_name_says_which_would_be_right():
-    tls.check_name("edge-a", tls.common_name(tls.EDGE, "a"))
-    with pytest.raises(UserError, match=r"certificate of viewer.*simulator-a or router"):
-        tls.check_name("viewer", tls.common_name(tls.SIMULATOR, "a"), tls.common_name(tls.ROUTER))
-    with pytest.raises(UserError, match=r"of viewer, .* that of router; choose another directory$"):
-        tls.check_name("viewer", tls.common_name(tls.ROUTER))
-    with pytest.raises(UserError, match="vehicle id"):
+    able = tls.common_name(tls.SIMULATOR, "a"), tls.common_name(tls.ROUTER)
+    for name in able:
+        tls.check_name(name, *able)
+    with pytest.raises(UserError, match=r"viewer.*simulator-a or router"):
+        tls.check_name("viewer", *able)
+    with pytest.raises(UserError):
         tls.common_name(tls.EDGE, "a/b")
 
 
@@ -84,39 +84,21 @@ def test_a_certificate_is_valid_until_the_second_of_its_end():
         files.require_valid(ends.timestamp())
 
 
-SM2 = """-----BEGIN PRIVATE KEY-----
-MIGHAgEAMBMGByqGSM49AgEGCCqBHM9VAYItBG0wawIBAQQgOT8zVOhnwMqKGmhW
-bOaBqhJfcbJUpXzXnCKMbtoIVWqhRANCAASw9HXpv3hPTdG7qCzE6RYVYMKrbQRH
-Vr/LhzTsFDjPQKyiO3ZuVQ2q4nEoMMYUN0FiBWkZ5VWDR6fIxYHvmw3f
------END PRIVATE KEY-----
-"""
-"""Of a curve that cryptography reads and does not know."""
-
-
 def pem(key, encryption=None):
     encryption = encryption or form.NoEncryption()
     return key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, encryption)
 
 
-def test_a_signing_key_is_read_and_one_of_another_kind_is_a_private_key(tmp_path):
-    path, key = tmp_path / "policy.key", Ed25519PrivateKey.generate()
+def test_only_an_ed25519_key_without_a_password_signs(tmp_path):
+    path, key, other = tmp_path / "key", Ed25519PrivateKey.generate(), ec.SECP256R1()
     path.write_bytes(pem(key))
     assert tls.read_signing_key(path).public_key() == key.public_key()
-    path.write_bytes(pem(ec.generate_private_key(ec.SECP256R1())))
+    path.write_bytes(pem(ec.generate_private_key(other)))
     assert isinstance(tls.read_private_key(path), ec.EllipticCurvePrivateKey)
-
-
-@pytest.mark.parametrize(
-    ("data", "part"),
-    [
-        (b"no key", "is not a private key"),
-        (SM2.encode(), "is not a private key"),
-        (pem(Ed25519PrivateKey.generate(), form.BestAvailableEncryption(b"secret")), "password"),
-        (pem(ec.generate_private_key(ec.SECP256R1())), "is not an Ed25519 key"),
-    ],
-)
-def test_what_cannot_sign_is_said(tmp_path, data, part):
-    path = tmp_path / "some.key"
-    path.write_bytes(data)
-    with pytest.raises(UserError, match=part):
-        tls.read_signing_key(path)
+    locked = pem(key, form.BestAvailableEncryption(b"secret"))
+    for data in (b"no key", locked, path.read_bytes()):
+        path.write_bytes(data)
+        with pytest.raises(UserError):
+            tls.read_signing_key(path)
+    with pytest.raises(UserError, match="deploy keys"):
+        tls.read_signing_key(tmp_path / "absent")

@@ -12,12 +12,12 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.commands import run_command
 from hil_tests.testing.edge import Simulator
 from hil_tests.testing.messages import make_state
-from hil_tests.testing.vehicles import CAR, a_manifest
+from hil_tests.testing.vehicles import CAR, BrokenVehicle, a_manifest
 
 import edge_runtime
+from edge_runtime.config import BUILT_IN
 from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
-from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mock import MockVehicle
@@ -28,7 +28,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 
 class Cart(MockVehicle):
     name = "cart"
-    open = classmethod(Vehicle.open.__func__)  # no settings of the mock
+    arguments_of = classmethod(Vehicle.arguments_of.__func__)  # no settings of the mock
     def __init__(self, wheels=4, port=""):
         super().__init__()
         self.wheels = wheels
@@ -118,8 +118,17 @@ WHOLE = msgspec.structs.asdict(CAR)
 )
 def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words):
     table = "cart" if ":" in name else name
-    with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
-        make_vehicle(name, {table: settings}, a_manifest())
+    for read in (make_vehicle, *([vehicle_limits] if name in BUILT_IN else [])):
+        with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
+            read(name, {table: settings}, a_manifest())
+
+
+def test_the_limits_are_known_without_opening_anything():
+    opens = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
+    for name, settings in opens.items():
+        assert vehicle_limits(name, {name: settings}, a_manifest())
+    with pytest.raises(UserError, match="settings of cart"):
+        vehicle_limits("milk_cart", {"milk_cart": {"speed": 3}}, a_manifest())
 
 
 @pytest.mark.parametrize(
@@ -137,25 +146,6 @@ def test_limits_that_bound_nothing_are_refused_wherever_they_are_read(limit, mon
             read("carts:Cart", {}, a_manifest())
     with pytest.raises(UserError, match="limits"):
         vehicle_limits("carts:Unknown", {}, a_manifest())
-
-
-@pytest.mark.parametrize(
-    ("name", "settings", "words"),
-    [
-        ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
-        ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`"),
-        ("mock", {"slew_per_s": -1.0}, "slew_per_s -1.0 .*above 0"),
-        ("hunter", {"bus": "can0"}, "bus 'can0'.*INTERFACE:CHANNEL"),
-        ("hunter", {"profile": "v9"}, "vehicle.hunter.profile 'v9'"),
-        ("ros2", {"connect": "nowhere"}, "endpoint 'nowhere'"),
-        ("ros2", {"twist_topic": "a b"}, "topic 'a b'"),
-    ],
-)
-def test_a_wrong_setting_is_found_without_opening_anything(name, settings, words):
-    with pytest.raises(UserError, match=words):
-        vehicle_limits(name, {name: settings}, a_manifest())
-    opens = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
-    vehicle_limits(name, {name: opens.get(name, {})}, a_manifest())
 
 
 def test_a_driver_of_another_package_gets_its_own_table():

@@ -1,6 +1,6 @@
 """The door of every vehicle: by name, as an entry point of another package, or as module:Class.
 
-What one of them needs is imported for that one only.
+Only the chosen driver's module is imported.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by n
 
 
 def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
-    """The driver of that name, open for a policy. Nothing is sent before it is enabled.
+    """Open the driver of a name for a policy. Nothing is sent before it is enabled.
 
     Raises UserError where there is none, for its settings, and where it cannot be opened.
     """
     kind, settings = _find(name, tables)
-    vehicle = _call(kind.open, name, settings, manifest)
+    vehicle = _call(name, kind.open, settings, manifest)
     check_driver(vehicle)
     return vehicle
 
@@ -43,42 +43,41 @@ def check_driver(vehicle: Any) -> None:
     try:
         if not isinstance(vehicle.name, str):
             raise UserError(f"vehicle {type(vehicle).__name__}: its name must be text")
-        _call(lambda: _checked(vehicle.name, vehicle.limits), vehicle.name)
+        _call(vehicle.name, lambda: _checked(vehicle.name, vehicle.limits))
     except UserError:
         close_in_time(vehicle)
         raise
 
 
 def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
-    """What the vehicle of that name lets each action be, without opening anything; "none": {}.
+    """Return the limits of the vehicle of a name without opening anything; of "none": {}.
 
     Raises UserError where there is none, and for its settings.
     """
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    return _checked(name, _call(kind.limits_of, name, settings, manifest))
+    return _checked(name, _call(name, kind.limits_of, settings, manifest))
 
 
 def _checked(name: str, limits: Any) -> Limits:
-    """The limits; UserError for what a comparison would let through, or fail on."""
-    pairs = limits.items() if isinstance(limits, dict) else [("", None)]
-    if not all(isinstance(key, str) and _is_limit(limit) for key, limit in pairs):
-        form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
-        raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
-    checked: Limits = limits
-    return checked
+    """Return the limits. Raises UserError for what a comparison would let through, or fail on."""
+
+    def is_limit(limit: Any) -> bool:
+        numbers = (limit.low, limit.high, limit.slew_per_s)
+        is_real = all(isinstance(n, Real) and not isinstance(n, bool) for n in numbers)
+        return is_real and -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
+
+    if isinstance(limits, dict) and all(
+        isinstance(key, str) and isinstance(limit, ActionLimit) and is_limit(limit)
+        for key, limit in limits.items()
+    ):
+        return limits
+    form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
+    raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
 
 
-def _is_limit(limit: Any) -> bool:
-    if not isinstance(limit, ActionLimit):
-        return False
-    numbers = (limit.low, limit.high, limit.slew_per_s)
-    is_real = all(isinstance(n, Real) and not isinstance(n, bool) for n in numbers)
-    return is_real and -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
-
-
-def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
+def _call(name: str, door: Callable[..., _Made], *arguments: Any) -> _Made:
     try:
         return door(*arguments)
     except UserError:
@@ -88,7 +87,7 @@ def _call(door: Callable[..., _Made], name: str, *arguments: Any) -> _Made:
 
 
 def find_vehicle(name: str) -> Type[Vehicle]:
-    """The class of a driver. Raises UserError where it cannot be loaded, or is no Vehicle."""
+    """Return the class of a driver. Raises UserError if it is no Vehicle, or cannot be loaded."""
     place = name if ":" in name else BUILT_IN.get(name)
     if place is None:
         others = {point.name: point.value for point in _others()}
@@ -99,6 +98,8 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     module, _, member = place.partition(":")
     try:
         kind = getattr(import_module(module), member)
+    except UserError:
+        raise
     except BaseException as error:  # whatever a stranger's module raises
         raise UserError(f"vehicle {name!r} cannot be loaded: {_words(error)}") from None
     if not (isinstance(kind, type) and issubclass(kind, Vehicle)):
@@ -110,7 +111,7 @@ def find_vehicle(name: str) -> Type[Vehicle]:
 
 
 def installed_as(own_name: str) -> str:
-    """The installed name of the driver that calls itself `own_name`, as a recording has it.
+    """Return the installed name of the driver that calls itself `own_name`, as a recording has it.
 
     Where none is installed it is `own_name` itself.
     """
@@ -122,7 +123,7 @@ def installed_as(own_name: str) -> str:
 
 
 def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
-    """The class, and its table: that of its name here, of a module:Class that of its own name.
+    """Return the class, and its table: by its name here, or a module:Class by its own name.
 
     Raises UserError where another looks like it: a misspelt speed cap would stay at its default.
     """
@@ -138,7 +139,7 @@ def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
 
 
 def _others() -> Iterable[Any]:
-    """The entry points of other packages."""
+    """Return the entry points of other packages."""
     found: Any = entry_points()
     # Before Python 3.10 a dict of lists; two folders on the path may both name one.
     return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())

@@ -1,26 +1,24 @@
-"""What a vehicle driver must do, whether it can be believed, and the thread that runs it.
+"""The contract of a vehicle driver, and the thread that runs one.
 
-A driver is called by one thread at a time, and is passed the time as monotonic seconds. The thread
-is apart from the control loop: so the feedback goes on when the loop hangs, and shows the vehicle
-braking by itself; and the loop goes on, and says safe stop, when the driver raises or hangs.
+One thread at a time calls a driver, and passes it the time in monotonic seconds. That thread is
+apart from the control loop: feedback goes on when the loop hangs, and shows the vehicle braking by
+itself; and the loop goes on, and says safe stop, when the driver raises or hangs.
 """
 
 from __future__ import annotations
 
 import abc
 import inspect
-import math
 import threading
 import time
-from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import MIN_PERIOD_S
-from edge_runtime.safety import SILENCE_PERIODS
 from edge_runtime.util import UserError, ends_within, printable
+from edge_runtime.vehicles.plausibility import PEDAL, REASONS, Fault, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 if TYPE_CHECKING:
@@ -30,10 +28,10 @@ if TYPE_CHECKING:
 class VehicleReport(NamedTuple):
     """What the vehicle does. `action` is what its actuators have reached, in the units of `limits`.
 
-    `faults` says in words why it does not drive, until it is enabled again; `standing` are those
+    `faults` say in words why it does not drive, until it is enabled again; `standing` are those
     whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
-    instead of a pedal says which one it is asked for (m/s of its own), and what its own speed is
-    in the scenario; its pedal is then worked out from its speed.
+    instead of a pedal works its pedal out from its speed, and reports two speeds more: its own in
+    the scenario, and the one that it is asked for (m/s of its own).
     """
 
     action: dict[str, float]
@@ -49,9 +47,9 @@ class VehicleReport(NamedTuple):
 class Vehicle(abc.ABC):
     """A vehicle under command. `limits` is keyed by the action names of the manifest, in its units.
 
-    `name` is what others see of it, and its table in the settings; the class's own name by default.
+    `name` is what others see, and the table in the settings; by default the class's own name.
     The runtime sets `control_period_s` to the policy's before `enable`; until then it is the
-    shortest there is, which brakes soonest.
+    shortest that a policy may have, which brakes soonest.
     """
 
     name: ClassVar[str]
@@ -65,172 +63,73 @@ class Vehicle(abc.ABC):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """The driver for a policy, with the settings of its table. Sends nothing before `enable`.
+        """Make the driver for a policy from the settings of its table; send nothing.
 
-        By default they are the constructor's arguments. Raises UserError for settings that are
-        not valid, and where what it hangs on cannot be opened.
+        Raises UserError for settings that are not valid, and where a port cannot be opened.
         """
-        cls._check_names(settings)
-        return cls(**settings)
+        bound = cls.arguments_of(settings, manifest)
+        return cls(*bound.args, **bound.kwargs)
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> dict[str, ActionLimit]:
-        """What `limits` of the driver would be, without opening anything: a replay needs them.
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
+        """Return the constructor's arguments; by default the settings. Opens nothing.
 
-        By default those of the class. Raises UserError where it has none, or as `open` does.
+        Raises UserError for settings that are not valid.
         """
-        if cls.open.__func__ is Vehicle.open.__func__:  # type: ignore[attr-defined]
-            cls._check_names(settings)
-        if not hasattr(cls, "limits"):
-            raise UserError(f"vehicle {cls.name}: what it lets an action be is not known unopened")
-        return cls.limits
-
-    @classmethod
-    def _check_names(cls, settings: Mapping[str, Any]) -> None:
-        """Raise UserError for settings that are no arguments of the constructor."""
         known = inspect.signature(cls)
         try:
-            known.bind(**settings)
+            return known.bind(**settings)
         except TypeError as error:
             names = ", ".join(known.parameters) or "none"
             raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
 
+    @classmethod
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> dict[str, ActionLimit]:
+        """Return `limits` of the driver to be, by default the class's. Opens nothing.
+
+        Raises UserError where they are not known, or as `arguments_of` does.
+        """
+        if inspect.getattr_static(cls, "open") is vars(Vehicle)["open"]:  # another asks for its own
+            cls.arguments_of(settings, manifest)
+        if not hasattr(cls, "limits"):
+            raise UserError(f"vehicle {cls.name}: what it lets an action be is not known unopened")
+        return cls.limits
+
     @abc.abstractmethod
     def enable(self, now_s: float) -> None:
-        """Take control, at the start and again at each re-arm: what stopped it is forgotten.
+        """Take control, at the start and at each re-arm; what stopped it is forgotten. Never waits.
 
-        Does not wait: until the vehicle confirms, it stands, and `feedback` says how it goes. It
-        stands as well until the first command.
+        The vehicle stands until it confirms, which `feedback` tells, and until the first command.
         """
 
     @abc.abstractmethod
     def command(
         self, action: dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """Ask for an action; it holds for 2 T, after which the vehicle brakes by itself.
+        """Ask for an action, which holds for 2 T; then the vehicle brakes by itself.
 
-        Raises ValueError for one that lacks what the vehicle needs: it never guesses.
-
-        `scenario_speed_mps` is the speed of the scenario's car: what a policy without a pedal
-        has in place of one. Moves nothing while the vehicle is stopped (`brake`, or a fault).
+        `scenario_speed_mps` is the speed of the scenario's car, for a policy without a pedal.
+        Moves nothing while the vehicle is stopped (`brake`, or a fault). Raises ValueError for an
+        action that lacks what the vehicle needs: a driver never guesses.
         """
 
     @abc.abstractmethod
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Full brake at once, steering held; it needs no repetition.
+        """Brake fully at once with the steering held; it needs no repetition.
 
-        It moves again only after `enable`; with `latch` False (the end of an episode) already
+        The vehicle moves again after `enable`; with `latch` False (the end of an episode) already
         with the next command.
         """
 
     @abc.abstractmethod
     def feedback(self, now_s: float) -> VehicleReport:
-        """What the vehicle does now."""
+        """Report what the vehicle does now."""
 
     @abc.abstractmethod
     def close(self) -> None:
         """Brake, give control back and free what the driver holds. Safe to call twice."""
-
-
-PEDAL = "pedal"
-SILENT, STUCK, LYING = "vehicle_silent", "vehicle_stuck", "vehicle_lying"
-BRAKING = "vehicle_self_braking"
-ENABLE_TIMEOUT_S = 1.0  # a vehicle may take so long to confirm that it is enabled
-LAG_S = 0.3  # an actuator may still follow a command of this age
-DEVIATION = 0.125  # of an action's range, outside of all that was asked within LAG_S
-DEVIATES_S = 0.1  # for this long without a break
-MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
-SPEED_NOISE_MPS = 0.5
-_ROUNDING = 5e-4  # of an action's range
-
-
-class VehicleWatch:
-    """Told every command and report; `fault` says what is wrong. Not thread-safe."""
-
-    def __init__(self, control_period_s: float, limits: Limits) -> None:
-        self._silence_s, self._limits = 2 * control_period_s, limits
-        self._brakes_s = SILENCE_PERIODS * control_period_s
-        self._drives, self._enabled_s, self._braking_since_s = False, -math.inf, math.inf
-        self._asked: deque[tuple[float, dict[str, float]]] = deque()
-        self._reported_s: Optional[float] = None
-        self._believed: Optional[tuple[float, float]] = None  # time, speed of the last possible one
-        self._deviates_since_s = math.inf
-        self._lies = False
-
-    @property
-    def silent_at_s(self) -> float:
-        """When it counts as silent if no further report comes; inf before the first report."""
-        return math.inf if self._reported_s is None else self._reported_s + self._silence_s
-
-    def begin(self, now_s: float) -> None:
-        """From now on it owes reports."""
-        self._reported_s = now_s
-
-    def enable(self, now_s: float) -> None:
-        """It is asked to take control: until it has, it brakes by itself."""
-        self._enabled_s = now_s
-
-    def command(self, action: dict[str, float], now_s: float, drives: bool = True) -> None:
-        """Note what was asked; of a safe stop, too."""
-        self._drives = drives
-        self._asked.append((now_s, action))
-        # One entry older than LAG_S stays: it was in force when the window began.
-        while len(self._asked) > 1 and self._asked[1][0] < now_s - LAG_S:
-            self._asked.popleft()
-
-    def report(self, report: VehicleReport, now_s: float) -> None:
-        """Note what the vehicle says of itself."""
-        self._lies = self._is_impossible(report, now_s)
-        if not self._lies:
-            self._believed = (now_s, report.speed_mps)
-        self._reported_s = now_s
-        deviates = self._deviates(report, now_s)
-        self._deviates_since_s = min(self._deviates_since_s, now_s) if deviates else math.inf
-        if not report.self_braking:
-            self._enabled_s = -math.inf  # it has taken control
-        brakes = self._drives and report.self_braking
-        self._braking_since_s = min(self._braking_since_s, now_s) if brakes else math.inf
-
-    def fault(self, now_s: float) -> str:
-        """SILENT, LYING, BRAKING, STUCK, or empty where nothing is wrong."""
-        if now_s > self.silent_at_s:
-            return SILENT
-        if self._lies:
-            return LYING
-        if now_s - max(self._braking_since_s, self._enabled_s + ENABLE_TIMEOUT_S) > self._brakes_s:
-            return BRAKING  # it obeys nobody, and would drive off with the next command
-        return STUCK if now_s - self._deviates_since_s > DEVIATES_S else ""
-
-    def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
-        for name, value in report.action.items():
-            low, high = self._range(name)
-            slack = _ROUNDING * (high - low)
-            if not low - slack <= value <= high + slack:  # NaN is in no range
-                return True
-        if not math.isfinite(report.speed_mps):
-            return True
-        # From the last possible report on: a leap is a lie until that speed could be real.
-        since_s, speed_mps = self._believed or (now_s, report.speed_mps)
-        most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
-        return abs(report.speed_mps - speed_mps) > most_mps
-
-    def _deviates(self, report: VehicleReport, now_s: float) -> bool:
-        if not self._asked or report.self_braking or self._asked[0][0] > now_s - LAG_S:
-            return False  # it obeys no command yet, or has had no time to
-        for name, value in report.action.items():
-            if name == PEDAL and report.commanded_speed_mps is not None:
-                continue  # worked out from a speed, whose limits it cannot know: the driver judges
-            asked = [action[name] for _, action in self._asked if name in action]
-            low, high = self._range(name)
-            most = DEVIATION * (high - low)
-            if asked and not min(asked) - most <= value <= max(asked) + most:
-                return True
-        return False
-
-    def _range(self, name: str) -> tuple[float, float]:
-        """Of an action of the vehicle; it may report more than it takes, in -1 to 1."""
-        limit = self._limits.get(name)
-        return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
 
 
 _LEAVE_S = 3.0  # a Hunter that is to stand and give control back takes half of it
@@ -251,11 +150,11 @@ def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
     for call in calls:
         try:
             call()
-        except BaseException as error:  # the rest must still come to its end
+        except BaseException as error:  # the other calls must still be made
             log.event("error", "driver_not_closed", vehicle=vehicle.name, detail=repr(error))
 
 
-class _Task(NamedTuple):
+class _Order(NamedTuple):
     """A command, and what the vehicle needs besides."""
 
     command: Command
@@ -267,29 +166,26 @@ class _Task(NamedTuple):
 class VehicleRunner:
     """Owns the vehicle: once started, its own thread alone calls it until `close`.
 
-    `action_names` are the policy's, in the order of a command's action.
+    `action_names` are the policy's, in the order of a command's action. No method but `start` and
+    `close` waits.
     """
 
     def __init__(
         self, vehicle: Vehicle, action_names: Sequence[str], publish: Callable[[Feedback], None]
     ) -> None:
         self.name = vehicle.name
-        self._vehicle = vehicle
-        self._action_names = action_names
-        self._publish = publish
         self.on_fault: Callable[[], None] = lambda: None
+        self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
         self._watch = VehicleWatch(vehicle.control_period_s, vehicle.limits)
-        self._silence_s = 2 * vehicle.control_period_s
-        # As often as the topic says, and twice before its silence would be a fault.
+        self._order_holds_s = 2 * vehicle.control_period_s
+        # As often as the topic says, and twice before silence would be a fault.
         self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
-        self._refuses = False  # the driver raised at the newest command
+        self._refuses = self._fails = False  # the driver raised at the newest command, report
         self._not_enabled = ""  # why the newest `enable` failed
-        self._failing = False
-        self._next: Optional[_Task] = None  # the newest, until the driver takes it
+        self._next: Optional[_Order] = None  # the newest, until the driver takes it
         self._last: Optional[Command] = None
-        self._report_seen: Optional[VehicleReport] = None
-        self._enable_due = False
-        self._stopping = False
+        self._heard: Optional[VehicleReport] = None
+        self._enable_due = self._stopping = False
         self._busy_since_s: Optional[float] = None  # its thread is in the driver
         self._due = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
@@ -300,22 +196,22 @@ class VehicleRunner:
         return self._watch.silent_at_s
 
     def busy_s(self, now_s: float) -> float:
-        """For how long the driver has kept its thread; 0 while that waits. Never waits."""
+        """Return for how long the driver has kept its thread; 0 while that waits."""
         since_s = self._busy_since_s
         return 0.0 if since_s is None else now_s - since_s
 
     def fault(self, now_s: float) -> str:
-        """What is wrong with the vehicle, empty if nothing. Never waits."""
+        """Return what is wrong with the vehicle, empty if nothing."""
         with self._due:
-            if self._enable_due:
-                return self._seen_fault(now_s)
-            words = [self._not_enabled, *(self._report_seen.faults if self._report_seen else [])]
+            words = [self._not_enabled, *(self._heard.faults if self._heard else [])]
+            if self._enable_due:  # its old faults no longer count
+                words = []
         return self._seen_fault(now_s) or next(filter(None, words), "")
 
     def standing_fault(self, now_s: float) -> str:
-        """What enabling the vehicle now would not end, empty if nothing. Never waits."""
-        seen = self._report_seen
-        return self._seen_fault(now_s) or (seen.standing[0] if seen and seen.standing else "")
+        """Return what enabling the vehicle now would not end, empty if nothing."""
+        heard = self._heard
+        return self._seen_fault(now_s) or (heard.standing[0] if heard and heard.standing else "")
 
     def start(self, armed: bool = True) -> None:
         """Start the vehicle's feedback, and enable it unless that is to wait for an operator.
@@ -331,10 +227,9 @@ class VehicleRunner:
             raise UserError(f"vehicle {self.name} cannot be enabled: {words}")
 
     def enable(self) -> None:
-        """Have the vehicle enabled again: an operator has re-armed it. Never waits.
+        """Have the vehicle enabled again: an operator has re-armed it.
 
-        Its old faults no longer count; a command that is still on its way is dropped, because a
-        stop from before would undo it.
+        A command that is still on its way is dropped: a stop from before would undo it.
         """
         with self._due:
             self._enable_due, self._next = True, None
@@ -343,13 +238,13 @@ class VehicleRunner:
     def command(
         self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
     ) -> None:
-        """Hand on a command, in place of one that the driver has not taken yet. Never waits.
+        """Hand on a command, in place of one that the driver has not taken yet.
 
         `scenario_speed_mps` is that of the state it answers. A safe stop with `latch` False may
         be followed by a drive without `enable`.
         """
         with self._due:
-            self._next = _Task(command, scenario_speed_mps, latch, time.monotonic())
+            self._next = _Order(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
 
     def close(self) -> bool:
@@ -372,13 +267,18 @@ class VehicleRunner:
             _end(vehicle, lambda: vehicle.brake(time.monotonic()), vehicle.close)
 
     def _live(self, next_s: float) -> float:
-        """Do what is due, or wait for it; returns when the next report is."""
-        enables, task = self._wait(next_s)
+        """Do what is due, or wait for it; return when the next report is."""
+        with self._due:
+            self._due.wait_for(
+                lambda: self._next is not None or self._enable_due or self._stopping,
+                max(0.0, next_s - time.monotonic()),
+            )
+            enables, order, self._next = self._enable_due, self._next, None
         self._busy_since_s = time.monotonic()
         if enables:
             self._enable()
-        if task is not None:
-            self._obey(task)
+        if order is not None:
+            self._obey(order)
         now_s = time.monotonic()
         if now_s >= next_s:
             # Absolute deadlines; after a long pause one report, not one for each missed period.
@@ -387,52 +287,40 @@ class VehicleRunner:
         self._busy_since_s = None
         return next_s
 
-    def _wait(self, until_s: float) -> tuple[bool, Optional[_Task]]:
-        """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
-        with self._due:
-            self._due.wait_for(
-                lambda: self._next is not None or self._enable_due or self._stopping,
-                max(0.0, until_s - time.monotonic()),
-            )
-            task, self._next = self._next, None
-            return self._enable_due, task
-
     def _enable(self) -> None:
-        self._take_control(time.monotonic())
-        if not self._not_enabled:
-            self._ask()
+        failure, now_s = "", time.monotonic()
+        self._watch.enable(now_s)
+        try:
+            self._vehicle.enable(now_s)
+        except BaseException as error:
+            failure = printable(str(error) or type(error).__name__)
+            log.event("error", "not_enabled", detail=failure)
+        self._not_enabled = failure
+        if not failure:
+            self._ask()  # before its faults count again
         with self._due:
             self._enable_due = False
             self._due.notify()
-        if self._not_enabled:
+        if failure:
             self.on_fault()
 
-    def _take_control(self, now_s: float) -> None:
-        try:
-            self._watch.enable(now_s)
-            self._vehicle.enable(now_s)
-            self._not_enabled = ""
-        except BaseException as error:
-            self._not_enabled = printable(str(error) or type(error).__name__)
-            log.event("error", "not_enabled", detail=self._not_enabled)
-
-    def _obey(self, task: _Task) -> None:
-        """Ask the driver. A safe stop's mode alone means brake."""
-        self._last = command = task.command
+    def _obey(self, order: _Order) -> None:
+        """Ask the driver. The mode alone makes a safe stop, whatever number is the policy's."""
+        self._last = command = order.command
         now_s = time.monotonic()
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
-        if command.mode == SAFE_STOP:  # It brakes, whatever number is the policy's stop.
+        if command.mode == SAFE_STOP:
             self._watch.command({**action, PEDAL: -1.0}, now_s, drives=False)
         try:
             if command.mode == SAFE_STOP:
-                self._vehicle.brake(now_s, task.latch)
+                self._vehicle.brake(now_s, order.latch)
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif self._not_enabled:
                 return  # that is the fault
-            elif now_s - task.given_s <= self._silence_s:  # One that hung must not obey the past.
-                self._vehicle.command(action, now_s, task.scenario_speed_mps)
+            elif now_s - order.given_s <= self._order_holds_s:  # after a hang it has grown old
+                self._vehicle.command(action, now_s, order.scenario_speed_mps)
         except BaseException as error:
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)
@@ -468,34 +356,34 @@ class VehicleRunner:
         )
 
     def _seen_fault(self, now_s: float) -> str:
-        return SILENT if self._refuses else self._watch.fault(now_s)
+        fault = Fault.SILENT if self._refuses else self._watch.fault(now_s)
+        return REASONS[fault] if fault else ""
 
     def _ask(self) -> Optional[VehicleReport]:
-        """The vehicle's report; None where the driver fails, which is silence like any other."""
+        """Return the vehicle's report; None where the driver fails: silence like any other."""
         try:
             report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
         except BaseException as error:
-            if not self._failing:
+            if not self._fails:
                 log.event("error", "no_feedback", detail=error)
-            self._failing = True
+            self._fails = True
             return None
-        self._failing = False
-        self._report_seen = report
+        self._fails, self._heard = False, report
         return report
 
 
 def _plain(report: VehicleReport, names: Sequence[str]) -> VehicleReport:
-    """In Python's own types: a driver's numbers may be numpy's.
+    """Return the report in Python's own types: a driver's numbers may be numpy's.
 
-    Raises for what is no report, and for one that leaves out an action of these names: nobody could
-    see whether it obeys.
+    Raises for what is no report, and where an action of these names is missing: nobody could see
+    whether the vehicle obeys.
     """
-    more = (None if value is None else float(value) for value in report[5:])
     action = {name: float(value) for name, value in report.action.items()}
     if lacking := [name for name in names if name not in action]:
         raise ValueError(f"feedback without {', '.join(lacking)}")
     said = (report.faults, report.standing)
     faults, standing = ([printable(str(words)) for words in each] for each in said)
+    more = (None if value is None else float(value) for value in report[5:])
     speed_mps, braking = float(report.speed_mps), bool(report.self_braking)
     return VehicleReport(action, speed_mps, braking, faults, standing, *more)

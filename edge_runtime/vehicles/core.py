@@ -14,12 +14,13 @@ import abc
 import math
 from collections import deque
 from enum import Enum
-from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
+from typing import Deque, Dict, List, Optional, Tuple
 
 from edge_runtime.manifest import MIN_PERIOD_S
 from edge_runtime.safety import SILENCE_PERIODS
-from edge_runtime.vehicles.base import ENABLE_TIMEOUT_S, VehicleReport
+from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, DriveWatch, Fault, Finding
 
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
@@ -27,17 +28,11 @@ LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
 # At the end zeros go out for so long, unless it is known to stand before; and what is then not
 # known to stand gets the parking brake, where there is one.
 STOP_TAKES_S = 1.0
-
-FOLLOWS_S = 1.0  # a drive may still follow a set-point of this age
-STEERS_S = 0.2  # so may a wheel, by its dead time and lag; what is heard of it is older still
-DEVIATION = 0.1  # of top speed, or of full lock (a wheel has play), outside of all that was asked
-DEVIATES_S = 0.1
 STANDS_MPS = 0.02
-IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
 _WINDOW_S = 0.11
 
 
-class State(str, Enum):
+class VehicleState(str, Enum):
     """DISABLED: nothing is sent. ENABLING and STOPPED: speed 0 is sent. ENABLED: commands are."""
 
     DISABLED = "disabled"
@@ -46,8 +41,8 @@ class State(str, Enum):
     STOPPED = "stopped"
 
 
-class Event(str, Enum):
-    """What can happen. All after CLOSE are what the vehicle, the bus or time do."""
+class VehicleEvent(str, Enum):
+    """What can happen, besides a `Fault`. After CLOSE: what the vehicle, the bus or time do."""
 
     ENABLE = "enable"
     BRAKE = "brake"
@@ -60,49 +55,38 @@ class Event(str, Enum):
     STANDBY = "chassis_standby"  # or another mode that is not CAN control
     LOCKED = "brake_locked"
     FAULT = "chassis_fault"
-    SILENT = "feedback_silent"
-    LYING = "feedback_impossible"
-    STUCK = "speed_stuck"
-    ASTRAY = "steering_stuck"
     BUS = "bus_error"
     FOREIGN = "foreign_command"  # somebody else commands the chassis
 
 
-_D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
+_D, _G, _E, _X = VehicleState
 
 # By the state before. A state that is not named stays as it is.
-LEADS_TO: Dict[Event, Dict[State, State]] = {
-    Event.ENABLE: {_D: _G, _E: _G, _X: _G},
-    Event.BRAKE: {_G: _X, _E: _X},
-    Event.CLOSE: {_G: _D, _E: _D, _X: _D},
-    Event.CONFIRMED: {_G: _E},
-    Event.NOT_CONFIRMED: {_G: _X},
-    Event.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
-    Event.REMOTE: {_G: _X, _E: _X},
-    Event.ESTOP: {_G: _X, _E: _X},
-    Event.STANDBY: {_E: _X},  # while ENABLING that is what is to be ended; so for the next three
-    Event.LOCKED: {_E: _X},
-    Event.FAULT: {_E: _X},
-    Event.SILENT: {_E: _X},
-    Event.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
-    Event.STUCK: {_E: _X},
-    Event.ASTRAY: {_E: _X},
-    Event.BUS: {_G: _X, _E: _X},
-    Event.FOREIGN: {_G: _X, _E: _X},
+LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
+    VehicleEvent.ENABLE: {_D: _G, _E: _G, _X: _G},
+    VehicleEvent.BRAKE: {_G: _X, _E: _X},
+    VehicleEvent.CLOSE: {_G: _D, _E: _D, _X: _D},
+    VehicleEvent.CONFIRMED: {_G: _E},
+    VehicleEvent.NOT_CONFIRMED: {_G: _X},
+    VehicleEvent.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
+    VehicleEvent.REMOTE: {_G: _X, _E: _X},
+    VehicleEvent.ESTOP: {_G: _X, _E: _X},
+    VehicleEvent.STANDBY: {_E: _X},  # what ENABLING is to end; so are the next three
+    VehicleEvent.LOCKED: {_E: _X},
+    VehicleEvent.FAULT: {_E: _X},
+    Fault.SILENT: {_E: _X},
+    Fault.LYING: {_G: _X, _E: _X},  # it confirms nothing, and need not be waited for
+    Fault.STUCK: {_E: _X},
+    Fault.STEERING_STUCK: {_E: _X},
+    VehicleEvent.BUS: {_G: _X, _E: _X},
+    VehicleEvent.FOREIGN: {_G: _X, _E: _X},
 }
-
-
-class Finding(NamedTuple):
-    """An event with what it is in words, empty where our own side asked for it."""
-
-    event: Event
-    words: str
 
 
 class Speeds:
     """The speeds that a vehicle reported in the last 0.1 s, and what follows from them.
 
-    After `silence_s` without feedback it counts as silent.
+    It counts as silent after `silence_s` without feedback.
     """
 
     def __init__(self) -> None:
@@ -110,18 +94,16 @@ class Speeds:
         self._noted: Deque[Tuple[float, float]] = deque()
 
     def note(self, speed_mps: float, now_s: float) -> None:
-        """The newest one."""
         self._noted.append((now_s, speed_mps))
         while self._noted[0][0] < now_s - _WINDOW_S:
             self._noted.popleft()
 
     def forget(self) -> None:
-        """Those from before count no more."""
         self._noted.clear()
 
     @property
     def speed_mps(self) -> float:
-        """The newest one, 0 before the first."""
+        """The newest speed, 0 before the first."""
         return self._noted[-1][1] if self._noted else 0.0
 
     @property
@@ -130,58 +112,25 @@ class Speeds:
         return abs(self.speed_mps) < STANDS_MPS
 
     def acceleration_mps2(self) -> float:
-        """Over the last 0.1 s; 0 while there is too little to tell."""
+        """Return the mean of the last 0.1 s; 0 while there is too little to tell."""
         if len(self._noted) < 2:
             return 0.0
         (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
         return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
 
 
-class FollowWatch:
-    """Whether what is measured stays outside of all that a healthy actuator can do.
-
-    It is, give or take `tolerance`, where it was asked to be within `follows_s`. At first, or where
-    it was not judged for a time, it comes from elsewhere: by `rate` a second.
-    """
-
-    def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
-        self._tolerance, self._follows_s, self._rate = tolerance, follows_s, rate
-        self._asked: Deque[Tuple[float, float]] = deque()
-        self._low = self._high = 0.0  # a healthy one is in between
-        self._deviates_since_s = math.inf
-
-    def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
-        """Note what is asked and measured now, and judge; a None is not judged."""
-        if measured is None:
-            self._asked.clear()
-            return False
-        nearer = self._rate * (now_s - self._asked[-1][0]) if self._asked else 0.0
-        self._asked.append((now_s, asked))
-        while len(self._asked) > 1 and self._asked[1][0] < now_s - self._follows_s:
-            self._asked.popleft()
-        if self._asked[0][0] > now_s - self._follows_s:
-            self._low, self._high, self._deviates_since_s = measured, measured, math.inf
-            return False  # it has had no time to follow
-        values = [value for _, value in self._asked]
-        self._low = min(*values, self._low + nearer)
-        self._high = max(*values, self._high - nearer)
-        follows = self._low - self._tolerance <= measured <= self._high + self._tolerance
-        self._deviates_since_s = math.inf if follows else min(self._deviates_since_s, now_s)
-        return now_s - self._deviates_since_s > DEVIATES_S
-
-
 class StreamedCore(abc.ABC):
     """The state machine, and what is asked for. `heard` is what the vehicle said of itself."""
 
     def __init__(self, similarity: Similarity, heard: Speeds) -> None:
-        self.state = State.DISABLED
-        self.cause: Optional[Event] = None  # what stopped it
+        self.state = VehicleState.DISABLED
+        self.cause: Optional[Enum] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
-        self._reach = similarity.reach  # Worked out once: reports come with every frame.
+        self._reach = similarity.reach  # worked out once: reports come with every frame
         self.follow_period(MIN_PERIOD_S)
-        self._watch_anew()
+        self._drive_watch = DriveWatch(self._spec, heard.silence_s)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
@@ -192,33 +141,31 @@ class StreamedCore(abc.ABC):
         self._heard.silence_s = max(2 * control_period_s, LEAST_SILENCE_S)
 
     def enable(self, now_s: float) -> None:
-        """Ask for control, from now on until the vehicle confirms it."""
-        self._watch_anew()  # a new chance to follow
-        self._apply(Finding(Event.ENABLE, ""), now_s)
+        self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)  # a new chance to follow
+        self._apply(Finding(VehicleEvent.ENABLE, ""), now_s)
         self._since_s = now_s
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """The newest command; forgotten where it may not drive. ValueError: see `wish_of`."""
+        """Take the newest command; forget it where it may not drive. ValueError: see `wish_of`."""
         wish = wish_of(action, scenario_speed_mps)
-        if self.state is State.ENABLED:
+        if self.state is VehicleState.ENABLED:
             self._wish, self._wished_s = wish, now_s
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
+        """Ask for speed 0 until the next command, or (latched) the next `enable`."""
         self._wish = None
         self.set_point.speed_mps = 0.0
         if latch:
-            self._apply(Finding(Event.BRAKE, ""), now_s)
+            self._apply(Finding(VehicleEvent.BRAKE, ""), now_s)
 
     @property
     def late_at_s(self) -> float:
-        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+        """When the newest command becomes too old to be obeyed; inf where there is none."""
         return math.inf if self._wish is None else self._wished_s + self.command_timeout_s
 
     def report(self, now_s: float) -> VehicleReport:
-        """What the vehicle does, in the policy's terms and in its own."""
         speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
         centre_rad = self._centre_rad()
         steering = self.similarity.steering(self._asked_rad() if centre_rad is None else centre_rad)
@@ -228,45 +175,42 @@ class StreamedCore(abc.ABC):
             # A milliradian beyond its reach would count as a lie.
             action={"pedal": self._pedal(), "steering": clamp(steering, self._reach)},
             speed_mps=speed_mps,
-            self_braking=self.state is not State.ENABLED,
-            faults=faults if self.state is State.STOPPED else [],
+            self_braking=self.state is not VehicleState.ENABLED,
+            faults=faults if self.state is VehicleState.STOPPED else [],
             standing=standing,
             scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
 
     def standing(self, now_s: float) -> List[str]:
-        """What would make an `enable` now be in vain, in words."""
-        may_ask = self.state in (State.STOPPED, State.DISABLED)
-        return self._obstacles(now_s) if may_ask else []
+        """Return in words what would make an `enable` now be in vain."""
+        return [] if self._has_asked else self._obstacles(now_s)
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or no more can be done about it."""
+        """Return whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
-        """SILENT where feedback is missing that was due since `since_s`."""
+        """Return SILENT where feedback is missing that was due since `since_s`."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:
-        """In words why the vehicle did not confirm an `enable` in time."""
+        """Return in words why the vehicle did not confirm an `enable` in time."""
 
     @abc.abstractmethod
     def _centre_rad(self) -> Optional[float]:
-        """The steering angle that the vehicle reports, not clamped; None where it is not known."""
+        """Return the steering angle that the vehicle reports; None where it is not known."""
+
+    @property
+    def _has_asked(self) -> bool:
+        return self.state in (VehicleState.ENABLING, VehicleState.ENABLED)
 
     def _asked_rad(self) -> float:
         return self._spec.centre_rad(self.set_point.inner_rad)
 
-    def _watch_anew(self) -> None:
-        spec, follows_s = self._spec, STEERS_S + self._heard.silence_s
-        most_rad = DEVIATION * spec.centre_rad(spec.max_inner_steering_rad)
-        self._speed_watch = FollowWatch(DEVIATION * spec.max_speed_mps, FOLLOWS_S)
-        self._steering_watch = FollowWatch(most_rad, follows_s, spec.max_steering_rate_radps)
-
     def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands."""
+        """Return in words what stands between the vehicle and our commands."""
         silence = self._silence(-math.inf, now_s)
         return [silence.words] if silence else []
 
@@ -275,40 +219,41 @@ class StreamedCore(abc.ABC):
         if after is self.state:
             return
         self.state, self._since_s, self._wish = after, now_s, None
-        self.set_point.speed_mps = 0.0  # Whatever state comes next begins at a stand.
-        self.cause, self.words = finding if after is State.STOPPED else (None, "")
+        self.set_point.speed_mps = 0.0  # whatever state comes next begins at a stand
+        self.cause, self.words = finding if after is VehicleState.STOPPED else (None, "")
 
-    def _watch(self, now_s: float) -> None:
-        """What time alone tells."""
-        if self.state is State.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
-            self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
-        if self.state is not State.ENABLED:
+    def _look(self, now_s: float) -> None:
+        """Find what time alone tells."""
+        if self.state is VehicleState.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
+            why = self._why_not_confirmed(now_s)
+            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, why), now_s)
+        if self.state is not VehicleState.ENABLED:
             return
-        found = self._silence(self._since_s, now_s)
-        if found is None and now_s > self.late_at_s:
-            found = Finding(Event.COMMAND_LATE, f"no command for {self.command_timeout_s:.2f} s")
-        asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps
-        if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
-            words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"
-            found = Finding(Event.STUCK, words)
-        drives = asked_mps > 0.0 and not self._heard.stands  # a wheel need not turn at a stand
-        asked_rad, turned_rad = self._asked_rad(), self._centre_rad() if drives else None
-        if self._steering_watch.is_stuck(asked_rad, turned_rad, now_s) and found is None:
-            words = f"the steering stays at {turned_rad:.2f} rad, asked for {asked_rad:.2f}"
-            found = Finding(Event.ASTRAY, words)
+        asked_mps, heard = self.set_point.speed_mps, self._heard
+        drives = asked_mps > 0.0 and not heard.stands  # a wheel need not turn at a stand
+        stuck = self._drive_watch.stuck(
+            (asked_mps, self._asked_rad()),
+            (heard.speed_mps, self._centre_rad() if drives else None),
+            now_s,
+        )
+        found = self._silence(self._since_s, now_s) or self._late(now_s) or stuck
         if found is not None:
             self._apply(found, now_s)
+
+    def _late(self, now_s: float) -> Optional[Finding]:
+        words = f"no command for {self.command_timeout_s:.2f} s"
+        return Finding(VehicleEvent.COMMAND_LATE, words) if now_s > self.late_at_s else None
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""
         step_s, self._ticked_s = now_s - self._ticked_s, now_s
-        if self.state is State.ENABLED and self._wish is not None:
+        if self.state is VehicleState.ENABLED and self._wish is not None:
             self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
         else:
             self.set_point.speed_mps = 0.0
 
     def _pedal(self) -> float:
-        """From the measured acceleration; the brake where it stands and is to stand."""
+        """Return the pedal of the measured acceleration; the brake of a stand that was asked."""
         if self._heard.stands and self.set_point.speed_mps == 0.0:
             return -1.0
         return self.similarity.pedal(self._heard.acceleration_mps2())

@@ -29,7 +29,6 @@ _LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for
 
 
 def clamp(value: float, most: float) -> float:
-    """The value within -`most` to `most`."""
     return min(max(value, -most), most)
 
 
@@ -47,7 +46,7 @@ class HunterSpec(NamedTuple):
     max_steering_rate_radps: float
 
     def inner_rad(self, centre_rad: float) -> float:
-        """The inner wheel's angle for that of a wheel in the middle of the axle, within its limit.
+        """Return the inner wheel's angle for a centre angle, within its limit.
 
         The inner wheel's circle is half a track narrower: tan(inner) = wheelbase / (radius -
         track/2) with the radius wheelbase / tan(centre) of the rear axle's middle (Ackermann).
@@ -59,7 +58,7 @@ class HunterSpec(NamedTuple):
         return math.copysign(inner_rad, centre_rad)
 
     def centre_rad(self, inner_rad: float) -> float:
-        """The centre angle of an inner wheel's angle; the inverse of the above."""
+        """Return the centre angle for an inner wheel's angle: the inverse of `inner_rad`."""
         slope = math.tan(abs(inner_rad))
         centre_rad = math.atan2(
             self.wheelbase_m * slope, self.wheelbase_m + 0.5 * self.track_m * slope
@@ -82,19 +81,19 @@ class Similarity(NamedTuple):
     scale: float
 
     def acceleration_mps2(self, pedal: float) -> float:
-        """The robot's acceleration for a pedal in -1 to 1: throttle above 0, brake below."""
+        """Return the robot's acceleration for a pedal in -1 to 1: throttle above 0, brake below."""
         full_mps2 = self.car.throttle_mps2 if pedal > 0 else self.car.brake_mps2
         return pedal * full_mps2 * self.scale
 
     def pedal(self, acceleration_mps2: float) -> float:
-        """The pedal that gives the robot this acceleration, within -1 to 1."""
+        """Return the pedal that gives the robot this acceleration, within -1 to 1."""
         full_mps2 = self.car.throttle_mps2 if acceleration_mps2 > 0 else self.car.brake_mps2
         return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
 
     def pedal_to_speed(
         self, speed_mps: float, pedal: float, step_s: float, measured_mps: float
     ) -> float:
-        """The speed to ask for after `speed_mps` when the pedal was held for `step_s`."""
+        """Return the speed to ask for after `speed_mps` when the pedal was held for `step_s`."""
         lead_mps = self.acceleration_mps2(1.0) * LEAD_S
         speed_mps = min(speed_mps + self.acceleration_mps2(pedal) * step_s, measured_mps + lead_mps)
         if pedal > 0:  # a brake that does not bite is asked for all the more
@@ -103,20 +102,20 @@ class Similarity(NamedTuple):
         return min(max(speed_mps, 0.0), self.spec.max_speed_mps)
 
     def follow_speed(self, speed_mps: float, scenario_mps: float, step_s: float) -> float:
-        """The speed to ask for where the scenario has the pedals: its car's, as fast as it can."""
+        """Return the speed to ask for where the scenario has the pedals: that of its car."""
         most_mps, least_mps = (self.acceleration_mps2(pedal) * step_s for pedal in (1.0, -1.0))
         change_mps = min(max(scenario_mps * self.scale - speed_mps, least_mps), most_mps)
         return min(max(speed_mps + change_mps, 0.0), self.spec.max_speed_mps)
 
     def centre_rad(self, steering: float) -> float:
-        """The angle of a wheel in the middle of the front axle, for a steering in -1 to 1.
+        """Return the angle of a wheel in the middle of the front axle, for a steering in -1 to 1.
 
         The robot is a bicycle that turns about its rear axle: tan(angle) = wheelbase x curvature.
         """
         return math.atan(self.spec.wheelbase_m * (self.car.curvature(steering) / self.scale))
 
     def steering(self, centre_rad: float) -> float:
-        """The steering whose path the robot drives, within -1 to 1."""
+        """Return the steering whose path the robot drives, within -1 to 1."""
         curvature = math.tan(centre_rad) / self.spec.wheelbase_m
         return clamp(self.car.steering(curvature * self.scale), 1.0)
 
@@ -126,7 +125,7 @@ class Similarity(NamedTuple):
         return abs(self.steering(self.spec.centre_rad(self.spec.max_inner_steering_rad)))
 
     def limits(self) -> Dict[str, ActionLimit]:
-        """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
+        """Return ranges and slew rates. A pedal is integrated: any leap of it is a ramp."""
         reach = self.reach
         full_rad = abs(self.spec.inner_rad(self.centre_rad(reach)))
         rate_per_s = self.spec.max_steering_rate_radps * reach / full_rad
@@ -137,12 +136,12 @@ class Similarity(NamedTuple):
 
 
 def similarity_to(car: Car, spec: HunterSpec, scale: Optional[float] = None) -> Similarity:
-    """The similarity of a robot; by default its top speed is the car's top speed."""
+    """Return the similarity of a robot; by default its top speed is the car's top speed."""
     return Similarity(car, spec, spec.max_speed_mps / car.max_speed_mps if scale is None else scale)
 
 
 class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What stands in the table of each vehicle that takes a speed and an angle.
+    """Settings of every vehicle that takes a speed and an angle.
 
     `scale`: metres of the vehicle for one of the scenario; None: top speed is top speed. `car`: in
     place of the manifest's.
@@ -153,9 +152,7 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     car: Optional[Car] = None
 
     def similarity(self, vehicle: str, manifest: Manifest) -> Similarity:
-        """From the policy's car to this vehicle. Raises UserError where one of them is not known,
-        and for numbers that cannot be.
-        """
+        """Return the similarity to the policy's car. Raises UserError for bad settings."""
         table = f"vehicle.{vehicle}"
         check_choice(f"{table}.model", self.model, tuple(SPECS))
         given = self.car or manifest.car
@@ -167,13 +164,13 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         numbers = msgspec.structs.asdict(given)
         if self.scale is not None:
             numbers["scale"] = self.scale
+        full_rad = numbers.pop("full_steering_rad")  # below 0 where it turns to the right
+        if not 0.0 < abs(full_rad) < 1.5:
+            words = f"full_steering_rad {full_rad} is not valid"
+            raise UserError(f"{table}: {words}: it must be above 0 and below 1.5, or minus that")
         for name, value in numbers.items():
-            fits, words = 0.0 < value < float("inf"), "above 0"
-            if name == "full_steering_rad":  # to the right, the full angle is below 0
-                fits = 0.0 < abs(value) < 1.5
-                words = "above 0 and below 1.5 rad, or below 0 and above -1.5"
-            if not fits:
-                raise UserError(f"{table}: {name} {value} is not valid: it must be {words}")
+            if not 0.0 < value < math.inf:
+                raise UserError(f"{table}: {name} {value} is not valid: it must be above 0")
         return similarity_to(given, SPECS[self.model], self.scale)
 
 
@@ -186,7 +183,7 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """The command of an action, within -1 to 1.
+    """Return the command of an action, within -1 to 1.
 
     Raises ValueError for what is not finite, and for what leaves out how fast to drive.
     """
@@ -201,7 +198,7 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
 
 
 class SetPoint:
-    """What is asked of the vehicle now, within the model's limits."""
+    """Speed and inner wheel's angle that are asked of the vehicle now, within its limits."""
 
     def __init__(self, similarity: Similarity) -> None:
         self.speed_mps = 0.0
@@ -209,7 +206,6 @@ class SetPoint:
         self._similarity = similarity
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
-        """One step of time towards what is wished for."""
         similarity, spec, speed_mps = self._similarity, self._similarity.spec, self.speed_mps
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:

@@ -6,6 +6,7 @@ test with made-up times sees exactly what a process sees.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
@@ -37,7 +38,7 @@ class MockParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class MockVehicle(Vehicle):
-    """Takes pedal and steering; brakes by itself when no command came for 2 T."""
+    """Obeys pedal and steering; brakes by itself when no command came for 2 T."""
 
     name: ClassVar[str] = "mock"
     # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
@@ -54,22 +55,17 @@ class MockVehicle(Vehicle):
         self._latched = True  # until it is enabled
 
     @classmethod
-    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """As quick as the policy's car, where that is known and the settings say nothing else."""
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
+        """Be as quick as the policy's car, where that is known and the settings do not say."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
         parameters = convert({**known, **settings}, MockParameters, "vehicle.mock")
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
-        return cls(parameters)
-
-    @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
-        """As `Vehicle.limits_of`; making a mock opens nothing."""
-        if cls.open.__func__ is MockVehicle.open.__func__:  # type: ignore[attr-defined]
-            cls.open(settings, manifest)
-        return super().limits_of(settings, manifest)
+        return inspect.signature(cls).bind(parameters)
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
@@ -79,7 +75,7 @@ class MockVehicle(Vehicle):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """An action that a policy does not have is zero: no pedal, wheels straight."""
+        """Take an action; one that a policy does not have is zero: no pedal, wheels straight."""
         if not action.keys() & self.limits.keys():
             raise ValueError(f"a command that lacks an action: {action}")
         if not all(map(math.isfinite, action.values())):
@@ -92,7 +88,7 @@ class MockVehicle(Vehicle):
         self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Full brake without the dead time of the command's way."""
+        """Brake without the dead time of a command's way."""
         self._integrate(now_s)
         self._latched = self._latched or latch
         self._on_the_way.clear()
@@ -100,7 +96,6 @@ class MockVehicle(Vehicle):
         self._target = (-1.0, self._target[1])
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """Where the actuators are and how fast the body is."""
         self._integrate(now_s)
         return VehicleReport(
             action={"pedal": self._pedal, "steering": self._steering},
@@ -110,7 +105,7 @@ class MockVehicle(Vehicle):
         )
 
     def close(self) -> None:
-        """Nothing to free; it stands, and stays so."""
+        """Stand, and stay so."""
         self._latched = True
         self._on_the_way.clear()
         self._target = (-1.0, self._target[1])
@@ -133,7 +128,7 @@ class MockVehicle(Vehicle):
             self._speed_mps = min(max(speed_mps, 0.0), car.max_speed_mps)
 
     def _follow(self, position: float, target: float, step_s: float) -> float:
-        """First-order lag towards the target, no faster than the actuator's rate."""
+        """Lag towards the target by the time constant, no faster than the actuator's rate."""
         change = (target - position) * (1.0 - math.exp(-step_s / self._parameters.time_constant_s))
         most = self._parameters.slew_per_s * step_s
         return position + min(max(change, -most), most)

@@ -9,6 +9,7 @@ inherits the priority that the runtime gave the process.
 from __future__ import annotations
 
 import abc
+import inspect
 import threading
 import time
 from typing import TYPE_CHECKING, Any, Callable, ClassVar, Dict, Mapping, Optional, Type
@@ -17,7 +18,7 @@ from edge_runtime import log
 from edge_runtime.config import convert
 from edge_runtime.controller import Limits
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
-from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
+from edge_runtime.vehicles.core import STOP_TAKES_S, StreamedCore, VehicleState
 from edge_runtime.vehicles.mapping import RobotSettings
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ _JOIN_S = 0.5
 class StreamedVehicle(Vehicle):
     """A core behind a lock, and the stream that sends what it asks for.
 
-    It is made of its settings and the similarity of its robot to the policy's car. Whoever derives
-    from it starts the stream at the end of `__init__`: nothing leaves before `enable`.
+    A driver is made of its settings and the similarity of its robot to the policy's car. It starts
+    the stream at the end of `__init__`: nothing leaves before `enable`.
     """
 
     settings_type: ClassVar[Type[RobotSettings]]
@@ -45,28 +46,24 @@ class StreamedVehicle(Vehicle):
         self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
 
     @classmethod
-    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """As `Vehicle.open`."""
+    def arguments_of(
+        cls, settings: Mapping[str, Any], manifest: Manifest
+    ) -> inspect.BoundArguments:
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        make: Any = cls
-        vehicle: StreamedVehicle = make(given, given.similarity(cls.name, manifest))
-        with vehicle._lock:  # it listens before it is enabled
-            vehicle._core.follow_period(manifest.control_period_s)
-        return vehicle
+        return inspect.signature(cls).bind(given, given.similarity(cls.name, manifest))
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        """As `Vehicle.limits_of`."""
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given.similarity(cls.name, manifest).limits()
+        _, similarity = cls.arguments_of(settings, manifest).args
+        limits: Limits = similarity.limits()
+        return limits
 
     @property
-    def state(self) -> State:
-        """Where its state machine stands."""
+    def state(self) -> VehicleState:
         return self._core.state
 
     def enable(self, now_s: float) -> None:
-        """Ask for control; `feedback` tells whether it came. Nothing once closed."""
+        """Ask for control; `feedback` tells whether it came. Does nothing once closed."""
         if self._closed:
             return
         with self._lock:
@@ -77,19 +74,19 @@ class StreamedVehicle(Vehicle):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """A pedal, or the speed of the scenario's car; and a steering, which else stays."""
+        """Take a pedal or the speed of the scenario's car, and a steering, which else stays."""
         with self._lock:
             self._core.command(action, now_s, scenario_speed_mps)
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Speed 0 leaves at once, not with the next period."""
+        """Send speed 0 at once, not with the next period."""
         with self._lock:
             self._core.brake(now_s, latch)
         self._stream.wake()
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """From the newest that was heard of the vehicle."""
         with self._lock:
+            self._core.follow_period(self.control_period_s)  # it listens before it is enabled
             report = self._core.report(now_s)
             state, words = self._core.state.value, self._core.words
         if (state, words) != self._logged:  # here, because the stream's thread must not wait
@@ -98,7 +95,6 @@ class StreamedVehicle(Vehicle):
         return report
 
     def close(self) -> None:
-        """Stand, send no more, give control back and free what the driver holds."""
         if self._closed:
             return
         self._closed = True
@@ -109,11 +105,11 @@ class StreamedVehicle(Vehicle):
 
     @abc.abstractmethod
     def _send_due(self) -> bool:
-        """Send what the core's `tick` gives; whether anything was. Never raises."""
+        """Send what the core's `tick` gives; return whether anything was. Never raises."""
 
     @abc.abstractmethod
     def _leave(self) -> None:
-        """The stream has ended: give control back, and free what is held."""
+        """Give control back, and free what is held; the stream has ended."""
 
     def _is_at_rest(self) -> bool:
         with self._lock:
@@ -138,9 +134,7 @@ class Stream:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin; nothing where it has begun."""
-        if self._thread.ident is None:
-            self._thread.start()
+        self._thread.start()
 
     def wake(self) -> None:
         """Send now: somebody brakes."""
@@ -156,8 +150,7 @@ class Stream:
         """End the thread; one that hangs in `send` is left alone."""
         self._stopping = True
         self._wake.set()
-        if self._thread.ident is not None:
-            self._thread.join(_JOIN_S)
+        self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
         next_s = time.monotonic()

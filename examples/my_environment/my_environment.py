@@ -1,4 +1,4 @@
-"""A cart rolls up to a dock and must touch it gently: an environment with all hooks, on a page."""
+"""A cart must touch a dock gently: an environment with all optional attributes, on a page."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ class Dock(gymnasium.Env):
         return self._seen(), reward, docked, False, info
 
     def render(self) -> np.ndarray:
-        """The cart and the dock, uint8 [60, 240, 3]."""
+        """Draw the cart and the dock, uint8 [60, 240, 3]."""
         picture = np.full((60, 240, 3), 230, np.uint8)
         picture[:, 220:] = (60, 60, 60)
         left = int(200 - 18 * max(self.distance_m, 0.0))
@@ -53,7 +53,7 @@ class Dock(gymnasium.Env):
         return picture
 
     def expert(self) -> "Expert":
-        """The scripted human."""
+        """Make the scripted human."""
         return Expert(self)
 
     def _seen(self) -> np.ndarray:
@@ -75,7 +75,7 @@ class Expert:
         return np.clip([4.0 * (wanted_mps - self.env.speed_mps)], -2.0, 1.0)
 
     def wants_control(self, policy_action: np.ndarray) -> str | None:
-        """Why it takes over."""
+        """Return why it takes over, or None."""
         speed_mps = self.env.speed_mps + 0.1 * float(policy_action[0])
         if speed_mps > 0.45 and speed_mps**2 > 3.0 * self.env.distance_m:
             return "collision"

@@ -38,13 +38,13 @@ class Rover(Vehicle):
         self._socket.setblocking(False)
 
     def enable(self, now_s: float) -> None:
-        """It stands until the first command."""
+        """Take control; the rover stands until the first command."""
         self._enabled = True
 
     def command(
         self, action: dict[str, float], now_s: float, scenario_speed_mps: float | None = None
     ) -> None:
-        """Nothing while it is stopped; what is no command is refused even then."""
+        """Drive, unless it is stopped; refuse what is no command even then."""
         if "pedal" not in action or not all(map(math.isfinite, action.values())):
             raise ValueError(f"a rover needs a pedal, and finite numbers: {action}")
         if self._enabled:
@@ -53,12 +53,12 @@ class Rover(Vehicle):
             self._send(min(max(pedal, -1.0), 1.0), 2 * self.control_period_s)
 
     def brake(self, now_s: float, latch: bool = True) -> None:
-        """Latched it waits for `enable`; else for the next command."""
+        """Brake until `enable`, or (not latched) until the next command."""
         self._enabled = self._enabled and not latch
         self._send(-1.0, 0.0)
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """From the newest answer. An error is as good as silence: the runtime stops for both."""
+        """Report by the newest answer. The runtime stops for an error as for silence."""
         self._socket.send(b"?")
         self._unanswered += 1
         with contextlib.suppress(BlockingIOError):
@@ -81,7 +81,7 @@ class Rover(Vehicle):
 
 
 def be_a_rover(port: int = 7450) -> None:
-    """3 m/s2 at full pedal, 2 m/s at most."""
+    """Move by 3 m/s2 at full pedal, 2 m/s at most."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind(("127.0.0.1", port))
         speed_mps, pedal, steering, then_s, until_s = 0.0, -1.0, 0.0, time.monotonic(), 0.0

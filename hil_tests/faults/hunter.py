@@ -19,17 +19,18 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
-from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
 from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
+from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
+    BusFrame,
     CanMonitor,
     CommandSeen,
-    Heard,
     drives_between,
 )  # fmt: skip
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import Try, at_any_phase, fault
+from hil_tests.faults.rows import at_any_phase
+from hil_tests.faults.table import Try, fault
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
 from hil_tests.mock_hunter.hunter import MODELS
 
@@ -48,15 +49,15 @@ _REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
 
 
 class Expect(NamedTuple):
-    """A fault of the mock: words of it in the feedback, and which frame shows it first, if any."""
+    """A fault of the mock: its words in the feedback, and which frame shows it first, if any."""
 
     name: str
     says: str
-    shown: Callable[[Heard], bool] | None = None
+    shown: Callable[[BusFrame], bool] | None = None
 
 
-def speed_mps(frame: Heard) -> float:
-    """Of 0x111 and 0x221, by hand."""
+def speed_mps(frame: BusFrame) -> float:
+    """Decode the speed of 0x111 or 0x221 by hand."""
     return _number(frame.data[:2])
 
 
@@ -65,7 +66,7 @@ def _number(data: bytes) -> float:
 
 
 def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
-    """Stops for it, stands when it is over, and drives again once re-armed."""
+    """Judge that it stops for the fault, stands when it is over, and drives once re-armed."""
     rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
     at_any_phase(number)
     on_s = rig.chassis.switch(expect.name, True)
@@ -80,7 +81,7 @@ def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
 
 
 def stuck(rig: Rig, number: int) -> Try:
-    """Its motors hold their speed; nobody can know before it is asked for another one."""
+    """Hold the motors' speed, which nobody can know before it is asked for another one."""
     rig.bright(True)
     rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
     at_any_phase(number)
@@ -114,7 +115,7 @@ def _when_over(
 
 
 def _drives(monitor: CanMonitor) -> bool:
-    """By its reports: all is well still."""
+    # By its reports: all is well still.
     recent = monitor.heard[-20:]
     return any(one.can_id == 0x221 and speed_mps(one) > _FAST_MPS for one in recent)
 
@@ -129,7 +130,7 @@ def _known_s(expect: Expect, monitor: CanMonitor, on_s: float) -> float:
 
 
 def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
-    """Since when every set-point has been speed 0; the end of the window where it never was."""
+    """Return since when every set-point has been speed 0; ``until_s`` where it never was."""
     asked = [one for one in monitor.of(0x111, on_s) if one.seen_s < until_s]
     moving = [place for place, one in enumerate(asked) if speed_mps(one) != 0.0]
     after = asked[moving[-1] + 1 :] if moving else asked
@@ -146,7 +147,7 @@ def _stayed(rig: Rig, stop: CommandSeen, stands_s: float, until_s: float) -> lis
 
 
 def _kept_to_its_own(monitor: CanMonitor) -> list[str]:
-    """Wrong where a frame or a set-point was on the bus that should never be."""
+    """Return lines where a frame or a set-point was on the bus that should never be."""
     most_mps = MODELS[MODEL].max_speed_mps
     fast = [one for one in monitor.of(0x111) if abs(speed_mps(one)) > most_mps]
     wrong = [f"0x{one.can_id:x} was on the bus" for one in monitor.strange[:1]]
@@ -163,7 +164,7 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
 
 
-def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
+def _status(test: Callable[[bytes], bool]) -> Callable[[BusFrame], bool]:
     return lambda frame: frame.can_id == 0x211 and test(frame.data)
 
 

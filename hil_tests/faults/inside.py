@@ -67,13 +67,11 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Stand at the start of the road."""
         super().reset(seed=seed)
         self._speed_mps = self._distance_m = 0.0
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control period."""
         first, period_s = self._task.action[0], self.control_period_s
         pedal = 2.0 * (float(action[0]) - first.low) / (first.high - first.low) - 1.0
         speed_mps = self._speed_mps + pedal * _FULL_MPS2 * period_s
@@ -83,7 +81,7 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._observation(), 0.0, ended, False, self._info()
 
     def press_brake(self, pressed: bool) -> None:
-        """Told every tick whether the vehicle brakes; only changes are written."""
+        """Write down when the vehicle begins or ends to brake."""
         if pressed != self._braking:
             self._braking = pressed
             with (self._directory / BRAKES).open("a") as brakes:
@@ -98,7 +96,7 @@ class EndlessEnv(gymnasium.Env[Observation, np.ndarray]):
 
 
 def noise(task: Task, generator: np.random.Generator, bright: bool = False) -> Observation:
-    """An observation of random numbers; pictures are below half brightness, or white."""
+    """Draw an observation; pictures are below half brightness, or white."""
 
     def draw(entry: Entry) -> np.ndarray:
         if entry.dtype == "uint8" and bright:
@@ -133,13 +131,11 @@ class FaultyMockVehicle(MockVehicle):
     _switch = Path(os.environ.get(DIRECTORY, "")) / VEHICLE
 
     def enable(self, now_s: float) -> None:
-        """As the mock, where it can be."""
         if self._word() == "locked":
             raise RuntimeError("no control of the gearbox")
         super().enable(now_s)
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """The mock's report: none, one of stuck actuators, an impossible one, or a fault's."""
         word = self._word()
         report = super().feedback(now_s)
         if word == "self_braking":
@@ -160,7 +156,7 @@ class FaultyMockVehicle(MockVehicle):
 
 
 def step_clock_on_signals() -> None:
-    """The wall clock of this process: SIGUSR1 steps it one hour ahead, SIGUSR2 back again."""
+    """Let SIGUSR1 step this process's wall clock one hour ahead, and SIGUSR2 back again."""
     real, real_ns, step_s = time.time, time.time_ns, [0]
     time.time = lambda: real() + step_s[0]
     time.time_ns = lambda: real_ns() + step_s[0] * 10**9
@@ -169,7 +165,7 @@ def step_clock_on_signals() -> None:
 
 
 def slow_down_on_switch() -> None:
-    """An inference takes SLOW_S more while the switch is there."""
+    """Let an inference take SLOW_S more while the switch is there."""
     real, switch = Policy.act, Path(os.environ.get(DIRECTORY, "")) / SLOW
 
     def act(*seen: Any) -> np.ndarray:
@@ -180,7 +176,7 @@ def slow_down_on_switch() -> None:
 
 
 def launch(package: str) -> None:
-    """Be the command, with a clock that can be stepped and a policy that can be slowed down."""
+    """Run a package's command, with a clock to be stepped and a policy to be slowed down."""
     step_clock_on_signals()
     slow_down_on_switch()
     sys.argv = [package, *sys.argv[2:]]
@@ -188,7 +184,7 @@ def launch(package: str) -> None:
 
 
 def route(listen: str, connect: str) -> None:
-    """Route until SIGTERM."""
+    """Be a Zenoh router until SIGTERM."""
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())
     with open_session(listen=listen, connect=connect, mode="router"):

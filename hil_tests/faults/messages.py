@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -16,7 +15,7 @@ from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, noisy_state
-from hil_tests.faults.rows import GAP, Try, drives_on, fault
+from hil_tests.faults.table import GAP, Try, drives_on, fault
 from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
@@ -156,7 +155,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     decode, prefix = DECODERS[topic], "health_" if topic == "health" else ""
     legal = "foreign_session" if topic in ("state", "command") else ""
     if topic == "state":
-        decode = partial(wire.decode_state, layout=Layout(rig.task))
+        decode = Layout(rig.task).decode
     sent: Counter[str] = Counter()
     begin_s = time.monotonic()
     for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):
@@ -170,7 +169,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
 
 
 def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
-    """(reason, payload) of what must not reach the policy, around the newest step."""
+    """Yield (reason, payload) of states that must be rejected, around the newest step."""
     state, (name, *_) = noisy_state(step + 1, task), task.observation
     large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
     valid = encode(state)
@@ -186,7 +185,7 @@ def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
-    """A drive command to the newest state, or to one ``ahead`` of it."""
+    """Make a drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
     middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
     command = Command(
@@ -197,7 +196,7 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
 
 
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
-    """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
+    """Yield ``count`` mutations, the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
     names = sorted(msgspec.msgpack.decode(valid))
 
@@ -229,12 +228,12 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
-    """The same MessagePack map with fields replaced by values of any type."""
+    """Replace fields of a MessagePack map by values of any type."""
     return msgspec.msgpack.encode({**msgspec.msgpack.decode(valid), **changes})
 
 
 def without(valid: bytes, name: str) -> bytes:
-    """The same map without one of its fields."""
+    """Remove a field of a MessagePack map."""
     fields = msgspec.msgpack.decode(valid)
     del fields[name]
     return msgspec.msgpack.encode(fields)

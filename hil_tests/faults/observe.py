@@ -1,4 +1,4 @@
-"""What is seen of a drive and when: a timeline, and those who fill it from the wire and the bus.
+"""What is seen of a drive and when, on the wire and on the CAN bus.
 
 Times are monotonic seconds: that clock is one for all processes of a machine, so the times of the
 probe, of the edge runtime's log and of the simulated vehicle can be taken from one another.
@@ -58,7 +58,7 @@ class ModeSeen(NamedTuple):
 
 
 @dataclass
-class Timeline:
+class DriveTimeline:
     """Events in order of arrival. Threads only append; a reader sees whole entries."""
 
     states: dict[Place, float] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Timeline:
 def unsafe_commands(
     commands: Iterable[CommandSeen], states: Mapping[Place, float], task: Task = TASK
 ) -> list[str]:
-    """Why each unsafe command is one; empty where all is well.
+    """Return what is wrong with each unsafe command.
 
     A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or that
     was to be rejected, and later than the reaction limit after the state that it answers.
@@ -100,18 +100,18 @@ def unsafe_commands(
 
 
 def later_s(task: Task) -> float:
-    """How much later than the limits of T = 0.1 s this task's 2 T are."""
+    """Return by how much 2 T of this task exceed those of T = 0.1 s, s."""
     return 2.0 * (task.control_period_s - TASK.control_period_s)
 
 
 def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
-    """The longest stretch within [begin, end] without an event."""
+    """Return the longest stretch within [begin, end] without an event, s."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
     return max(after - before for before, after in pairwise(inside))
 
 
 def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float) -> list[str]:
-    """A line for each reason of the safe stops in between, where the drive was to go on."""
+    """Return a line for each reason of the safe stops in between, where it was to drive on."""
     seen = [c for c in list(commands) if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
     return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
 
@@ -119,13 +119,13 @@ def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float)
 def drives_between(
     commands: Iterable[CommandSeen], begin_s: float, end_s: float = math.inf
 ) -> list[str]:
-    """Wrong where it drove in between, before it was re-armed."""
+    """Return a line where it drove in between, before it was re-armed."""
     drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in list(commands))
     return ["was told to drive before it was re-armed"] if drove else []
 
 
 def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:
-    """Minimum, median and maximum in ms; None of nothing."""
+    """Return minimum, median and maximum in ms; None of nothing."""
     values_ms = sorted(value_s * 1e3 for value_s in values_s)
     if not values_ms:
         return None
@@ -134,10 +134,10 @@ def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:
 
 
 class Probe:
-    """A Zenoh router between the two ends that stamps what passes; ``put`` sends anything.
+    """A Zenoh router between the two ends that stamps what passes; ``put`` sends any bytes.
 
-    It listens for the edge runtime and connects to the simulator, so that it still hears the edge
-    when the simulator is gone, and the other way round. It ends with the ``stack``.
+    It listens for the edge runtime and connects to the simulator, so that it hears each while the
+    other is gone. It ends with the ``stack``.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Probe:
         listen: str,
         connect: str | None,
         vehicle_id: str,
-        timeline: Timeline,
+        timeline: DriveTimeline,
         stack: ExitStack,
     ) -> None:
         self.timeline = timeline
@@ -164,11 +164,10 @@ class Probe:
             stack.enter_context(session.declare_subscriber(key, hear))
 
     def put(self, topic: str, payload: bytes) -> None:
-        """Send bytes as they are."""
         self._publishers[topic].put(payload)
 
     def note_state(self, state: wire.State, seen_s: float) -> None:
-        """Remember a state that a policy may answer."""
+        """Note a state that a policy may answer."""
         self.timeline.states.setdefault((state.session, state.episode, state.step), seen_s)
         self.timeline.flow_s.append(seen_s)
 
@@ -190,7 +189,7 @@ class Probe:
                 self.timeline.unreadable += topic == "command"
 
 
-class Heard(NamedTuple):
+class BusFrame(NamedTuple):
     """A frame, and its monotonic time."""
 
     seen_s: float
@@ -199,28 +198,26 @@ class Heard(NamedTuple):
 
 
 class CanMonitor(can.Listener):
-    """Hears all frames of a CAN bus in a thread, and keeps those of HEARD."""
+    """Listens to a CAN bus in a thread, and keeps the frames of HEARD."""
 
     def __init__(self, bus: str) -> None:
-        self.heard: list[Heard] = []
-        self.strange: list[Heard] = []  # Frames that are not the Hunter's: nobody should send any
+        self.heard: list[BusFrame] = []
+        self.strange: list[BusFrame] = []  # Not the Hunter's: nobody should send any
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=_POLL_S)
 
-    def of(self, can_id: int, since_s: float = float("-inf")) -> list[Heard]:
-        """The frames of an identifier since a moment, in order."""
+    def of(self, can_id: int, since_s: float = float("-inf")) -> list[BusFrame]:
+        """Return the frames of an identifier since a moment, in order."""
         return [one for one in list(self.heard) if one.can_id == can_id and one.seen_s > since_s]
 
     def close(self) -> None:
-        """End the thread, then close the bus."""
         self._notifier.stop()
         self._bus.shutdown()
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Called by the notifier."""
         # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
         seen_s = msg.timestamp + time.monotonic() - time.time()
-        heard = Heard(seen_s, msg.arbitration_id, bytes(msg.data))
+        heard = BusFrame(seen_s, msg.arbitration_id, bytes(msg.data))
         if heard.can_id in HEARD:
             self.heard.append(heard)
         if heard.can_id not in FRAMES or msg.is_extended_id:

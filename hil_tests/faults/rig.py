@@ -1,8 +1,8 @@
-"""A drive to be disturbed: edge runtime, simulator and, where a row asks, a link or a router.
+"""A drive to be disturbed, of real processes.
 
-    [chassis process --] edge process -- [link | router process --] probe -- simulator process
+    [mock Hunter --] edge runtime --- [relay | router ---] probe --- simulator
 
-The simulator may also be the rig's own sender, where a row sends states of its own.
+In place of the simulator the rig may send states itself, where a row sends states of its own.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -32,11 +32,12 @@ from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT,
 from hil_tests.faults.observe import (
     CanMonitor,
     CommandSeen,
+    DriveTimeline,
     ModeSeen,
     Probe,
-    Timeline,
     longest_gap_s,
 )
+from hil_tests.faults.relay import Relay
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import TASK
@@ -45,7 +46,6 @@ E = TypeVar("E")
 VEHICLE_ID = "faults"
 RIDE_S = 0.5  # Of the rows with ride-through
 SESSION = "campaign"
-LOOPBACK = "127.0.0.1"
 _INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) .*motion=(\w+)")
@@ -53,10 +53,6 @@ _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_PERIODS, _SETTLED_COMMANDS = 3.5, 3
 _REARM_EVERY_S = 2.0
 _HEALTH_S = 0.6  # Longer than a period of the health message
-_CHUNK_BYTES = 4096  # Small, so that a throttled link hands over bit by bit
-_STATE_BYTES = 20
-"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
-(then 47 bytes for each are on the link)."""
 
 
 class Rig:
@@ -64,14 +60,14 @@ class Rig:
 
     ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
     ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
-    Edge runtime and probe meet at a ``link`` or a ``router`` where ``between`` says so. ``sender``
+    Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
     sends states here, without a simulator. With the vehicle ``hunter`` there is a mock of it on a
     CAN bus. The attributes below exist only where the options ask for them.
     """
 
     simulator: Process
     sender: Sender
-    link: Link
+    relay: Relay
     router: Process
     chassis: ChassisProcess
     monitor: CanMonitor
@@ -86,7 +82,7 @@ class Rig:
         sender: bool = False,
         ride_s: float = 0.0,
     ) -> None:
-        self.timeline = Timeline()
+        self.timeline = DriveTimeline()
         self.directory = directory
         self.crashes: list[str] = []
         self._policy, self._vehicle = policy, vehicle
@@ -105,10 +101,10 @@ class Rig:
             connect = None if sender else self._simulator_endpoint
             self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline, self._closing)
             self.edge_endpoint = self._hub  # Where the edge runtime connects
-            if between == "link":
-                self.link = Link(self._hub)
-                self._closing.callback(self.link.close)
-                self.edge_endpoint = self.link.endpoint
+            if between == "relay":
+                self.relay = Relay(self._hub)
+                self._closing.callback(self.relay.close)
+                self.edge_endpoint = self.relay.endpoint
             if between == "router":
                 self.edge_endpoint = free_endpoint()
                 self.router = self.start_router()
@@ -125,7 +121,7 @@ class Rig:
             self._closing = self._closing.pop_all()
 
     def start_edge(self) -> Process:
-        """The edge runtime, not waited for."""
+        """Start the edge runtime; do not wait for it."""
         bus = ("--bus", self._bus) if self._bus else ()
         return self._start(
             "edge", _INSIDE, "edge_runtime", "run", *self._policy, "--connect", self.edge_endpoint,
@@ -133,26 +129,27 @@ class Rig:
         )  # fmt: skip
 
     def start_simulator(self) -> Process:
-        """`bridge simulate` in real time, not waited for."""
+        """Start `bridge simulate` in real time; do not wait for it."""
         return self._start(
             "simulator", _INSIDE, "bridge", "simulate", "--env", ENVIRONMENT,
             "--clock", "realtime", "--listen", self._simulator_endpoint,
             "--vehicle-id", VEHICLE_ID, "--out", str(self.directory / "report.json"),
         )  # fmt: skip
 
-    def start_recorder(self, path: Path) -> Process:
-        """`bridge record` of this drive, once it listens."""
+    def start_recorder(self) -> tuple[Process, Path]:
+        """Start `bridge record` of this drive into a new file, and wait until it listens."""
+        path = self.directory / f"{time.monotonic_ns()}.mcap"  # a disturbed try is done again
         record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
         recorder = self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
         recorder.wait_for_line("recording")
-        return recorder
+        return recorder, path
 
     def start_router(self) -> Process:
-        """The router process between edge and probe, not waited for."""
+        """Start the router between edge and probe; do not wait for it."""
         return self._start("router", _INSIDE, "router", self.edge_endpoint, self._hub)
 
     def wait_until_driving(self, ready: Callable[[], bool] = lambda: True) -> None:
-        """Until it drives steadily, its brake off, and is ``ready``; a vehicle is re-armed."""
+        """Wait until it drives steadily, its brake off, and is ``ready``; re-arm a vehicle."""
         rearmed_s = time.monotonic()
 
         def driving() -> bool:
@@ -171,7 +168,7 @@ class Rig:
         return self._vehicle != "none"
 
     def brakes(self) -> list[tuple[float, bool]]:
-        """When the simulated vehicle's brake was pressed (True) or released so far."""
+        """Return when the simulated vehicle's brake was pressed (True) or released so far."""
         lines = (self.directory / BRAKES).read_text().splitlines()
         return [(float(a), b == "1") for a, b in (line.split() for line in lines)]
 
@@ -189,22 +186,22 @@ class Rig:
         """Turn the frames white, or back."""
         self.switch(BRIGHT, "" if on else None)
 
+    def try_rearm(self) -> bool:
+        """Ask once for a re-arm; return whether the runtime accepted it."""
+        with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
+            return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
+        return False
+
     def rearm(self) -> None:
-        """As an operator does, until the runtime takes it."""
+        """Ask for a re-arm until the runtime accepts it."""
         wait_until(self.try_rearm, "the vehicle to be re-armed")
 
     def drive_again(self, ready: Callable[[], bool] = lambda: True) -> float:
-        """Re-arm it; s until the first drive command, once it drives steadily and is ``ready``."""
+        """Re-arm it, wait until it drives steadily; return s until the first drive command."""
         self.rearm()
         rearmed_s = time.monotonic()
         self.wait_until_driving(ready)
         return self.recovered_after_s(rearmed_s)
-
-    def try_rearm(self) -> bool:
-        """Ask once; whether the runtime took it."""
-        with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
-            return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
-        return False
 
     def end_drive(self) -> None:
         """Let the simulator end its episode and write its report."""
@@ -212,69 +209,71 @@ class Rig:
         self.simulator.wait()
 
     def last_drive_s(self) -> float:
-        """When the newest drive command came; -inf before the first."""
+        """Return when the newest drive command came; -inf before the first."""
         times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
         return next(times, float("-inf"))
 
     def last_state_s(self, before_s: float) -> float:
-        """When the probe saw the newest state before ``before_s``."""
+        """Return when the probe saw the newest state before ``before_s``."""
         return max(s for s in list(self.timeline.states.values()) if s < before_s)
 
     def last_answered_s(self, before_s: float) -> float:
-        """When the probe saw the newest state that a drive command had answered by then."""
+        """Return when the probe saw the newest state that a drive command had answered by then."""
         states, commands = self.timeline.states, self.timeline.commands
         answered = (c.place for c in commands if c.mode == DRIVE and c.seen_s < before_s)
         return max(states[place] for place in answered if place in states)
 
     def own_brake_s(self, since_s: float) -> float:
-        """When the simulated vehicle's brake went on after ``since_s``."""
-        what = "the simulator's own brake"
-        return _await_first(self.brakes, lambda b: b[1] and b[0] > since_s, what)[0]
+        """Wait for the simulated vehicle's own brake after ``since_s``; return when it went on."""
+        return _first(
+            lambda: (at_s for at_s, on in self.brakes() if on and at_s > since_s),
+            "the simulator's own brake",
+        )
 
     def stop_command(self, since_s: float) -> CommandSeen:
-        """The first safe_stop command after ``since_s``."""
-        return _await_first(
-            lambda: self.timeline.commands,
-            lambda c: c.seen_s > since_s and c.mode == SAFE_STOP,
+        """Wait for the first safe_stop command after ``since_s``."""
+        commands = self.timeline.commands
+        return _first(
+            lambda: (c for c in commands if c.seen_s > since_s and c.mode == SAFE_STOP),
             "a safe_stop command",
         )
 
     def logged_stop(self, since_s: float) -> ModeSeen:
-        """When the edge runtime went into safe stop by its log, and why."""
-        return _await_first(
-            lambda: self.timeline.modes,
-            lambda m: m.seen_s > since_s and m.mode == SAFE_STOP,
+        """Wait for the edge runtime's safe stop in its log after ``since_s``."""
+        modes = self.timeline.modes
+        return _first(
+            lambda: (m for m in modes if m.seen_s > since_s and m.mode == SAFE_STOP),
             "safe_stop in the log",
         )
 
     def recovered_after_s(self, ended_s: float) -> float:
-        """From the fault's end to the arrival of the first drive command after it."""
-        # By its sending: what a link held up was driven before.
-        command = _await_first(
-            lambda: self.timeline.commands,
-            lambda c: c.sent_s > ended_s and c.mode == DRIVE,
+        """Wait for the first drive command sent after the fault's end; return s until it came."""
+        commands = self.timeline.commands
+        # By its sending: what a relay held up was driven before.
+        command = _first(
+            lambda: (c for c in commands if c.sent_s > ended_s and c.mode == DRIVE),
             "a drive command",
         )
         return command.seen_s - ended_s
 
     def must_stop_first(self, since_s: float) -> list[str]:
-        """Wrong where the first command after a silence is a drive."""
+        """Return a line where the first command after a silence is a drive."""
         modes = (c.mode for c in self.timeline.commands if c.sent_s > since_s)
         return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
 
     def longest_gap(self, begin_s: float, end_s: float) -> float:
-        """The longest time without a command at the probe, s."""
+        """Return the longest time without a command at the probe, s."""
         return longest_gap_s([c.seen_s for c in self.timeline.commands], begin_s, end_s)
 
     def edge_counts(self) -> Counter[str]:
-        """The edge's rejections by reason, by a health message sent after all sent so far."""
+        """Return the edge's rejections by reason, counting all messages sent so far."""
         time.sleep(_HEALTH_S)
         seen = len(self.probe.health)
         wait_until(lambda: len(self.probe.health) > seen, "a health message")
         return Counter(self.probe.health[-1].rejected)
 
     def simulator_counts(self) -> Counter[str]:
-        """The simulator's rejections by reason, from the report that it wrote at its end."""
+        """Return the simulator's rejections by reason, from the report that it wrote at its end."""
         report = json.loads((self.directory / "report.json").read_text())
         return Counter(report["rejected_by_simulator"])
 
@@ -308,46 +307,42 @@ class Rig:
         return process
 
 
-def _await_first(events: Callable[[], list[E]], wanted: Callable[[E], bool], what: str) -> E:
-    """The first event of that kind, as soon as it is there; TimeoutError."""
-    found = wait_until(lambda: [event for event in events() if wanted(event)][:1], what)
-    return cast(E, found[0])
+def _first(events: Callable[[], Iterator[E]], what: str) -> E:
+    """Wait for the first of the events and return it; TimeoutError."""
+    found: E = wait_until(lambda: next(events(), None), what)
+    return found
 
 
 class Sender:
-    """The rig's own simulator: step after step at absolute ticks until it is stopped."""
+    """The rig's own simulator: sends step after step at absolute ticks until it is stopped."""
 
     def __init__(self, probe: Probe, task: Task) -> None:
         self.step = 0
-        self._task = task
         self.running = threading.Event()
         self.running.set()
-        self._probe = probe
-        self._stopping = threading.Event()
         self.lock = threading.Lock()
+        self._probe, self._task = probe, task
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def send(self, state: State) -> None:
-        """Send one acceptable state and remember it as such. Hold ``lock`` to keep the order."""
+        """Send one acceptable state and note it as such. Hold ``lock`` to keep the order."""
         self._probe.note_state(state, time.monotonic())
         self._probe.put("state", encode(state))
 
-    def send_next(self) -> None:
+    def send_next(self, final: bool = False) -> None:
         """Send the next step now."""
         with self.lock:
             self.step += 1
-            self.send(noisy_state(self.step, self._task))
+            self.send(noisy_state(self.step, self._task, final=final))
 
     def end_episode(self) -> None:
         """Send a final state, and no other until ``running`` is set."""
         self.running.clear()
-        with self.lock:
-            self.step += 1
-            self.send(noisy_state(self.step, self._task, final=True))
+        self.send_next(final=True)
 
     def stop(self) -> None:
-        """End the thread."""
         self._stopping.set()
         self._thread.join()
 
@@ -391,20 +386,21 @@ class ChassisProcess:
         return bool(self.truth) and self.truth[-1].moves
 
     def switch(self, name: str, on: bool) -> float:
-        """Switch a fault; when it took effect, monotonic s."""
+        """Switch a fault; return when it took effect, monotonic s."""
         count, order = len(self.switched), (name, "on" if on else "off")
-        what = " ".join(order)
-        self.process.tell(what)
-        done = wait_until(lambda: [s for s in self.switched[count:] if s[1:] == order], what)
+        self.process.tell(" ".join(order))
+        done = wait_until(
+            lambda: [s for s in self.switched[count:] if s[1:] == order], f"fault {order}"
+        )
         return float(done[0][0])
 
     def stands_s(self, since_s: float, timeout_s: float) -> float:
-        """When it stood, at or after a moment; TimeoutError where it goes on moving."""
+        """Return when it stood, at or after a moment; TimeoutError where it goes on moving."""
         wait_until(lambda: not self.moves, "the vehicle to stand", timeout_s)
         return max(self.truth[-1].since_s, since_s)
 
     def moved_between(self, begin_s: float, end_s: float) -> bool:
-        """Whether it moved at any moment in between."""
+        """Return whether it moved at any moment in between."""
         before = [one for one in self.truth if one.since_s <= begin_s][-1:]
         inside = [one for one in self.truth if begin_s < one.since_s < end_s]
         return any(one.moves for one in before + inside)
@@ -417,93 +413,7 @@ class ChassisProcess:
 
 
 def free_bus() -> str:
-    """A bus of its own: Linux mixes buses that share a port, whatever their groups."""
+    """Return a bus of its own: Linux mixes buses that share a port, whatever their groups."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
         return f"udp_multicast:{GROUP}:{one.getsockname()[1]}"
-
-
-class Link:
-    """A TCP link from ``endpoint`` to ``target``, an endpoint of this machine.
-
-    It can be cut, stalled and restored.
-    """
-
-    def __init__(self, target: str) -> None:
-        self.last_state_s = float("-inf")
-        """When the last bytes of a state went to whoever connected, monotonic s."""
-        self._target = (LOOPBACK, int(target.rpartition(":")[2]))
-        self._flowing = threading.Event()
-        self._flowing.set()
-        self._is_cut = False
-        self._bytes_per_s = float("inf")
-        self._lock = threading.Lock()
-        self._open: list[socket.socket] = []
-        self._listener = socket.create_server((LOOPBACK, 0))
-        self.endpoint = f"tcp/{LOOPBACK}:{self._listener.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def cut(self) -> None:
-        """Break every connection and refuse new ones; what was under way is lost."""
-        with self._lock:
-            self._is_cut = True
-            while self._open:
-                _shut(self._open.pop())
-
-    def stall(self) -> None:
-        """Keep the connections and hold what comes, as a radio link that repeats does."""
-        self._flowing.clear()
-
-    def throttle(self, bytes_per_s: float) -> None:
-        """Hand no more to whoever connected; what is not handed over yet waits."""
-        self._bytes_per_s = bytes_per_s
-
-    def restore(self) -> None:
-        """Be a link again; what was held comes at once."""
-        self._is_cut, self._bytes_per_s = False, float("inf")
-        self._flowing.set()
-
-    def close(self) -> None:
-        """Break all and stop listening."""
-        self._flowing.set()
-        self.cut()
-        _shut(self._listener)
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
-            while True:
-                self._join(self._listener.accept()[0])
-
-    def _join(self, near: socket.socket) -> None:
-        with self._lock:
-            try:
-                if self._is_cut:
-                    raise ConnectionError
-                far = socket.create_connection(self._target, timeout=1.0)
-            except OSError:
-                near.close()
-                return
-            far.settimeout(None)
-            for end in (near, far):
-                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._open += [near, far]
-        for pair in ((near, far, False), (far, near, True)):
-            threading.Thread(target=self._pump, args=pair, daemon=True).start()
-
-    def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(_CHUNK_BYTES):
-                self._flowing.wait()
-                if to_caller:
-                    time.sleep(len(data) / self._bytes_per_s)
-                sink.sendall(data)
-                if to_caller and len(data) > _STATE_BYTES:
-                    self.last_state_s = time.monotonic()
-        _shut(source)
-        _shut(sink)
-
-
-def _shut(end: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        end.shutdown(socket.SHUT_RDWR)
-    end.close()

@@ -1,4 +1,4 @@
-"""Rows of the fault table: what a row is, and the faults of both ends and of what is between them.
+"""Faults of both ends, and of the link between them.
 
 A new row is a function that takes a driving rig and the number of its try, does the fault once,
 undoes it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it
@@ -18,137 +18,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from bridge.recording import Recording, heard_of
 from edge_runtime.wire import SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
-from hil_tests.faults.observe import (
-    REACTION_LIMIT_S,
-    RECOVERY_LIMIT_S,
-    drives_between,
-    stops_between,
-)  # fmt: skip
+from hil_tests.faults.observe import REACTION_LIMIT_S, drives_between, stops_between
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig
+from hil_tests.faults.table import GAP, Try, drives_on, fault
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing.policies import T
-
-GAP = "longest gap between commands"
-
-
-@dataclass(frozen=True)
-class Try:
-    """One fault, done and undone.
-
-    ``reaction_s``: from the last good state to the safe stop on the wire (in the log where the
-    wire is cut), or to the other end's own brake; None where nothing was to react.
-    ``recovery_s``: from the fault's end to the first drive command; None where none is due.
-    """
-
-    reaction_s: float | None = None
-    recovery_s: float | None = None
-    reason: str = ""
-    wrong: list[str] = field(default_factory=list)
-    """What was not as the row expects, beside the times."""
-    rejected: Mapping[str, int] = field(default_factory=dict)
-    figures: Mapping[str, float] = field(default_factory=dict)
-    """Further figures of the row, by name with unit."""
-
-
-DoFault = Callable[[Rig, int], Try]
-"""Called with a rig that drives and the number of the try, which is its seed, too."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of the table."""
-
-    name: str
-    done: str
-    expected: str
-    measured: str
-    run: DoFault
-    reaction_limit_s: float | None = REACTION_LIMIT_S
-    recovery_limit_s: float | None = RECOVERY_LIMIT_S
-    rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
-    policy: str = "given"  # ``given``, or one of `run.POLICIES`.
-    flows: bool = False
-    """Whether the simulator's states go on through the fault: where they do not, the machine stood
-    still, and the try is done again (and counted as disturbed)."""
-    alone: bool = False  # Whether it needs the machine for itself
-    goes_on: bool = False  # Whether the drive goes on through the fault
-    counted: Literal["", "edge", "simulator"] = ""
-    """Who must have counted just the messages that a try sent to be rejected. The simulator tells
-    when the drive has ended: each try then has a rig of its own."""
-
-
-ROWS: list[Row] = []
-
-
-def fault(
-    expected: str, measured: str, name: str = "", done: str = "", **options: Any
-) -> Callable[[DoFault], DoFault]:
-    """Put a function into the table.
-
-    Its own name and its docstring stand there, or ``name`` and ``done`` where several rows share
-    it; ``options`` are those of `Row`.
-    """
-
-    def add(run: DoFault) -> DoFault:
-        said = done or " ".join((run.__doc__ or "").split()).rstrip(".")
-        ROWS.append(Row(name or run.__name__, said, expected, measured, run, **options))
-        return run
-
-    return add
-
-
-def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
-    """As `fault`, for one through which the drive goes on.
-
-    The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
-    rejected.
-    """
-    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True, **options}
-    return fault(expected, GAP, **through)
-
-
-def do_fault(row: Row, rig: Rig, number: int) -> Try:
-    """Do the fault of a row once, and judge it where the drive was to go on."""
-    before = rig.edge_counts() if row.counted == "edge" else Counter()
-    begin_s = time.monotonic()
-    done = row.run(rig, number)
-    if not row.goes_on:
-        return done
-    end_s = time.monotonic()
-    wanted = counted = Counter(done.rejected)
-    if row.counted == "edge":
-        counted = rig.edge_counts() - before
-    if row.counted == "simulator":
-        rig.end_drive()  # It writes its counts at its end.
-        counted = rig.simulator_counts()
-    wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
-    # Safe stops come as steadily as drives: the gaps alone would not tell.
-    wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *done.wrong]
-    gap_s = rig.longest_gap(begin_s, end_s)
-    return replace(done, reaction_s=gap_s, rejected=dict(counted), wrong=wrong)
-
-
-def at_any_phase(number: int) -> None:
-    """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
-
-
-def sleep_until(time_s: float) -> None:
-    """Sleep until a moment of the monotonic clock."""
-    time.sleep(max(0.0, time_s - time.monotonic()))
-
 
 LASTS_S = 1.0
 STALLED_S = 0.6
@@ -168,6 +51,15 @@ _EXPECT_OWN = "simulator brakes by itself: no_command"
 _EXPECT_BOTH = "both ends stop, each by itself"
 _TO_BRAKE = "last drive command to the simulator's brake"
 _THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
+
+
+def at_any_phase(number: int) -> None:
+    """Wait a part of the control period, so that faults do not all come at the same moment."""
+    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
+
+
+def sleep_until(time_s: float) -> None:
+    time.sleep(max(0.0, time_s - time.monotonic()))
 
 
 @fault(_EXPECT_OWN, _TO_BRAKE)
@@ -209,32 +101,32 @@ def simulator_killed(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
 def link_cut(rig: Rig, number: int) -> Try:
     """TCP cut for 1 s and restored."""
     begin_s, drive_s = time.monotonic(), rig.last_drive_s()
-    rig.link.cut()
-    last_s = rig.link.last_state_s
+    rig.relay.cut()
+    last_s = rig.relay.last_state_s
     stop = rig.logged_stop(begin_s)
     brake_s = rig.own_brake_s(begin_s) - max(drive_s, rig.last_drive_s())
     sleep_until(begin_s + LASTS_S)
     ended_s = time.monotonic()
-    rig.link.restore()
+    rig.relay.restore()
     recovered_s = rig.recovered_after_s(ended_s)
     figures = {"simulator brakes, ms": brake_s * 1e3}
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, figures=figures)
 
 
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
 def link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.6 s, then all at once."""
     begin_s = time.monotonic()
-    rig.link.stall()
+    rig.relay.stall()
     stop = rig.logged_stop(begin_s)
-    last_s = rig.link.last_state_s
+    last_s = rig.relay.last_state_s
     sleep_until(begin_s + max(STALLED_S, 2.5 * rig.period_s))  # longer than silence
     ended_s = time.monotonic()
-    rig.link.restore()
+    rig.relay.restore()
     recovered_s = rig.recovered_after_s(ended_s)
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=rig.must_stop_first(ended_s))
 
@@ -309,7 +201,7 @@ def cpu_starved(rig: Rig, number: int) -> Try:
 
 
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
-    """Stops for the fault, stays stopped when it is over, and drives again once re-armed."""
+    """Judge that it stops for the fault, stays stopped after it, and drives once re-armed."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.switch(VEHICLE, word)
@@ -379,8 +271,7 @@ def vehicle_not_enabled(rig: Rig, number: int) -> Try:
 @drives_on("recorder says so and ends; the recording is readable; drives on")
 def disk_full(rig: Rig, number: int) -> Try:
     """Disk full while recording."""
-    path = rig.directory / f"{number}.mcap"
-    recorder = rig.start_recorder(path)
+    recorder, path = rig.start_recorder()
     # No file may grow beyond a limit: the same failing write as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
     status = recorder.wait()
@@ -395,8 +286,7 @@ def disk_full(rig: Rig, number: int) -> Try:
 @drives_on("at most 1 s of the recording is lost; drives on")
 def recorder_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the recorder."""
-    path = rig.directory / f"{number}.mcap"
-    recorder = rig.start_recorder(path)
+    recorder, path = rig.start_recorder()
     time.sleep(RECORDED_S)
     sent = len(rig.timeline.states)
     recorder.kill()
@@ -410,7 +300,7 @@ def recorder_killed(rig: Rig, number: int) -> Try:
 
 
 def states_in(path: Path) -> list[State]:
-    """The states that can be read from a recording, whole or torn."""
+    """Return the states that can be read from a recording, whole or torn."""
     wire = heard_of(Recording(path), VEHICLE_ID)
     states = (decode_state(heard.payload) for heard in wire if heard.topic == "state")
     return [state for state in states if isinstance(state, State)]
@@ -427,16 +317,16 @@ _VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
 
 
 def _link_slows(periods: float, rig: Rig, number: int) -> Try:
-    """It stops though states go on coming, each a little later, and none too late is driven on."""
+    """Judge that it stops though states go on coming, and that no late one is driven on."""
     time.sleep(SETTLED_S)
     begin_s, task = time.monotonic(), rig.task
     entries = task.observation.values()
     state_bytes = sum(math.prod(e.shape) * np.dtype(e.dtype).itemsize for e in entries)
-    rig.link.throttle(state_bytes / (periods * rig.period_s))
+    rig.relay.throttle(state_bytes / (periods * rig.period_s))
     stop = rig.logged_stop(begin_s)
     time.sleep(LASTS_S)
     late = drives_between(rig.timeline.commands, stop.seen_s)
-    rig.link.restore()
+    rig.relay.restore()
     ended_s = time.monotonic()
     recovered_s = rig.drive_again() if rig.has_vehicle else rig.recovered_after_s(ended_s)
     return Try(None, recovered_s, stop.reason, wrong=late)
@@ -448,7 +338,7 @@ for _name, _periods, _rig in (
     fault("edge sends safe_stop: no_fresh_state", "none", _name,
           f"TCP slower than the states: one comes each {_periods:g} T, ever later",
           reaction_limit_s=None, policy="steady",
-          rig={**_rig, "between": "link"})(partial(_link_slows, _periods))  # fmt: skip
+          rig={**_rig, "between": "relay"})(partial(_link_slows, _periods))  # fmt: skip
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
@@ -463,19 +353,19 @@ def ride_states_lost(rig: Rig, number: int) -> Try:
 
 
 @fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, policy="steady",
-       rig={**_VEHICLE, "between": "link"})  # fmt: skip
+       rig={**_VEHICLE, "between": "relay"})  # fmt: skip
 def ride_link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.4 s, both ways, then all at once."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
-    rig.link.stall()
+    rig.relay.stall()
     sleep_until(begin_s + SHORT_S)
-    rig.link.restore()
+    rig.relay.restore()
     return _rode(rig, begin_s)
 
 
 def _rode(rig: Rig, begin_s: float) -> Try:
-    """Nobody braked since a moment, and from now on it drives."""
+    """Judge that nobody braked since a moment and that it drives on."""
     recovered_s = rig.recovered_after_s(time.monotonic())
     end_s = time.monotonic() + SETTLED_S
     sleep_until(end_s)
@@ -501,7 +391,7 @@ def _is_ended(rig: Rig) -> float:
 
 
 def _stops(reason: str, do: Callable[[Rig], float], rig: Rig, number: int) -> Try:
-    """It stops after what is done while it rides, and stays stopped."""
+    """Judge that it stops for what is done while it rides, and stays stopped."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.simulator.send(signal.SIGSTOP)

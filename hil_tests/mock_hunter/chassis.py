@@ -79,7 +79,7 @@ class Control(StrEnum):
     REMOTE_OVER_CAN = "remote_over_can"
 
 
-class Condition(StrEnum):
+class ChassisCondition(StrEnum):
     """Whether anybody may drive."""
 
     OK = "ok"
@@ -88,7 +88,7 @@ class Condition(StrEnum):
     ESTOP_AND_EXCEPTION = "estop_and_exception"
 
 
-class Event(StrEnum):
+class ChassisEvent(StrEnum):
     """What can happen. The first three are frames of the bus."""
 
     CAN_MODE = "0x421 = 1"
@@ -104,24 +104,24 @@ class Event(StrEnum):
 
 
 _S, _C, _L, _R, _O = Control
-CONTROL: dict[Event, tuple[Control, ...]] = {
+CONTROL: dict[ChassisEvent, tuple[Control, ...]] = {
     # in:               standby, can, link_lost, remote, remote_over_can
-    Event.CAN_MODE:     (_C, _C, _C, _R, _O),  # the remote control always outranks the bus
-    Event.STANDBY_MODE: (_S, _S, _S, _R, _R),
-    Event.COMMAND:      (_S, _C, _C, _R, _O),  # the trap: from link_lost, nobody having asked
-    Event.TIMEOUT:      (_S, _L, _L, _R, _O),
-    Event.REMOTE_ON:    (_R, _O, _O, _R, _O),
-    Event.REMOTE_OFF:   (_S, _C, _L, _S, _C),
+    ChassisEvent.CAN_MODE:     (_C, _C, _C, _R, _O),  # the remote control always outranks the bus
+    ChassisEvent.STANDBY_MODE: (_S, _S, _S, _R, _R),
+    ChassisEvent.COMMAND:      (_S, _C, _C, _R, _O),  # the trap: link_lost, and nobody asked
+    ChassisEvent.TIMEOUT:      (_S, _L, _L, _R, _O),
+    ChassisEvent.REMOTE_ON:    (_R, _O, _O, _R, _O),
+    ChassisEvent.REMOTE_OFF:   (_S, _C, _L, _S, _C),
 }  # fmt: skip
-"""Event -> the state after it, for each state before it in the order of `Control`."""
+"""ChassisEvent -> the state after it, for each state before it in the order of `Control`."""
 
-_K, _E, _X, _B = Condition
-CONDITION: dict[Event, tuple[Condition, ...]] = {
+_K, _E, _X, _B = ChassisCondition
+CONDITION: dict[ChassisEvent, tuple[ChassisCondition, ...]] = {
     # in:               ok, estop, exception, estop_and_exception
-    Event.ESTOP_ON:     (_E, _E, _B, _B),
-    Event.ESTOP_OFF:    (_K, _K, _X, _X),
-    Event.ERRORS:       (_X, _B, _X, _B),
-    Event.ERRORS_OVER:  (_K, _E, _K, _E),
+    ChassisEvent.ESTOP_ON:     (_E, _E, _B, _B),
+    ChassisEvent.ESTOP_OFF:    (_K, _K, _X, _X),
+    ChassisEvent.ERRORS:       (_X, _B, _X, _B),
+    ChassisEvent.ERRORS_OVER:  (_K, _E, _K, _E),
 }  # fmt: skip
 
 
@@ -133,60 +133,59 @@ class Chassis(NamedTuple):
     """
 
     control: Control = Control.STANDBY
-    condition: Condition = Condition.OK
+    condition: ChassisCondition = ChassisCondition.OK
     brake_locked: bool = True
     commanded_s: float = float("-inf")  # When the newest 0x111 came, or CAN control was taken
     causes: frozenset[str] = frozenset()
     errors: frozenset[str] = frozenset()
 
 
-def advance(chassis: Chassis, event: Event) -> Chassis:
-    """The state after an event."""
+def advance(chassis: Chassis, event: ChassisEvent) -> Chassis:
     if event in CONTROL:
         return chassis._replace(control=CONTROL[event][list(Control).index(chassis.control)])
-    place = list(Condition).index(chassis.condition)
+    place = list(ChassisCondition).index(chassis.condition)
     return chassis._replace(condition=CONDITION[event][place])
 
 
 def take_can_mode(chassis: Chassis, now_s: float) -> Chassis:
-    """0x421 = 1. The time-out counts from the moment in which control changes hands."""
-    after = advance(chassis, Event.CAN_MODE)
+    """Take 0x421 = 1: the time-out counts from the moment in which control changes hands."""
+    after = advance(chassis, ChassisEvent.CAN_MODE)
     taken = after.control is Control.CAN and chassis.control is not Control.CAN
     return after._replace(commanded_s=now_s) if taken else after
 
 
 def take_command(chassis: Chassis, now_s: float) -> Chassis:
-    """0x111: noted whoever drives, obeyed where `obeys` says so."""
-    return advance(chassis, Event.COMMAND)._replace(commanded_s=now_s)
+    """Take 0x111: note it whoever drives; it is obeyed where `obeys` says so."""
+    return advance(chassis, ChassisEvent.COMMAND)._replace(commanded_s=now_s)
 
 
 def take_time(chassis: Chassis, now_s: float, timeout_s: float) -> Chassis:
-    """What time alone does: the link counts as lost after ``timeout_s`` without a command."""
+    """Let time pass: the link counts as lost after ``timeout_s`` without a command."""
     late = now_s - chassis.commanded_s > timeout_s
-    return advance(chassis, Event.TIMEOUT) if late else chassis
+    return advance(chassis, ChassisEvent.TIMEOUT) if late else chassis
 
 
 def take_cause(chassis: Chassis, name: str, present: bool) -> Chassis:
-    """The cause of an error comes or goes; an error that does not latch goes with it."""
+    """Let the cause of an error come or go; an error that does not latch goes with it."""
     causes = chassis.causes | {name} if present else chassis.causes - {name}
     kept = {error for error in chassis.errors if BITS[error].latches or error in causes}
     return _settle(chassis._replace(causes=causes, errors=causes | kept))
 
 
 def take_clear(chassis: Chassis) -> Chassis:
-    """0x441: forget every error whose cause is gone."""
+    """Take 0x441: forget every error whose cause is gone."""
     return _settle(chassis._replace(errors=chassis.causes))
 
 
 def obeys(chassis: Chassis) -> bool:
-    """Whether the body follows the set-point of the bus."""
+    """Return whether the body follows the set-point of the bus."""
     return (
         chassis.control is Control.CAN
-        and chassis.condition is Condition.OK
+        and chassis.condition is ChassisCondition.OK
         and not chassis.brake_locked
     )
 
 
 def _settle(chassis: Chassis) -> Chassis:
     stopped = any(BITS[error].stops for error in chassis.errors)
-    return advance(chassis, Event.ERRORS if stopped else Event.ERRORS_OVER)
+    return advance(chassis, ChassisEvent.ERRORS if stopped else ChassisEvent.ERRORS_OVER)

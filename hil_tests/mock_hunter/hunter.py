@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as codec
-from edge_runtime.vehicles.hunter.protocol import LINK_LOST, fault_bits
+from edge_runtime.vehicles.hunter.protocol import LINK_LOST, MotionCommand, Sent, fault_bits
 from edge_runtime.vehicles.mapping import clamp
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import (
@@ -24,9 +24,9 @@ from hil_tests.mock_hunter.chassis import (
     LIE_MPS,
     STEERING,
     Chassis,
-    Condition,
+    ChassisCondition,
+    ChassisEvent,
     Control,
-    Event,
 )
 
 STANDS_MPS = 0.005
@@ -43,14 +43,14 @@ _MODES = {
     Control.REMOTE_OVER_CAN: codec.REMOTE_CONTROL,
 }
 _STATES = {
-    Condition.OK: codec.STATE_OK,
-    Condition.ESTOP: codec.STATE_ESTOP,
-    Condition.EXCEPTION: codec.STATE_EXCEPTION,
-    Condition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
+    ChassisCondition.OK: codec.STATE_OK,
+    ChassisCondition.ESTOP: codec.STATE_ESTOP,
+    ChassisCondition.EXCEPTION: codec.STATE_EXCEPTION,
+    ChassisCondition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
 }
 _OF_A_PERSON = {
-    "remote": (Event.REMOTE_ON, Event.REMOTE_OFF),
-    "estop": (Event.ESTOP_ON, Event.ESTOP_OFF),
+    "remote": (ChassisEvent.REMOTE_ON, ChassisEvent.REMOTE_OFF),
+    "estop": (ChassisEvent.ESTOP_ON, ChassisEvent.ESTOP_OFF),
 }
 _SLOW = (codec.STEER_MOTOR_SLOW, codec.REAR_RIGHT_SLOW, codec.REAR_LEFT_SLOW)
 _ENABLED = 1 << 6
@@ -97,7 +97,7 @@ TUNABLE = [field.name for field in fields(Parameters)]
 
 
 def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
-    """A model's row with some numbers replaced; UserError for a number that cannot be."""
+    """Return a model's row with some numbers replaced. Raises UserError for bad numbers."""
     for name, value in changes.items():
         if name not in TUNABLE:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(TUNABLE)}")
@@ -106,13 +106,6 @@ def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
             least = "at least" if may_be_zero else "above"
             raise UserError(f"parameter {name} must be {least} 0 and finite, not {value}")
     return replace(MODELS[model], **changes)
-
-
-class Setpoint(NamedTuple):
-    """What is asked of the body: speed, and the angle of the inner front wheel."""
-
-    speed_mps: float = 0.0
-    inner_rad: float = 0.0
 
 
 class Body(NamedTuple):
@@ -126,12 +119,13 @@ class Body(NamedTuple):
 
     @property
     def stands(self) -> bool:
-        """Whether it does not move."""
         return abs(self.speed_mps) < STANDS_MPS
 
 
-def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Parameters) -> Body:
-    """One integration step towards the set-point; None: the brake, with the steering held."""
+def advance(
+    body: Body, setpoint: MotionCommand | None, step_s: float, parameters: Parameters
+) -> Body:
+    """Integrate one step towards the set-point; None: brake, with the steering held."""
     p, inner_rad = parameters, body.inner_rad
     if setpoint is None:
         change_mps, rate_mps2 = -body.speed_mps, p.braking_mps2
@@ -139,7 +133,7 @@ def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Pa
         gap_mps = clamp(setpoint.speed_mps, p.max_speed_mps) - body.speed_mps
         change_mps = gap_mps * (1 - math.exp(-step_s / p.speed_time_constant_s))
         rate_mps2 = p.braking_mps2 if body.speed_mps * change_mps < 0 else p.acceleration_mps2
-        turn_rad = clamp(setpoint.inner_rad, p.max_inner_rad) - body.inner_rad
+        turn_rad = clamp(setpoint.inner_steering_rad, p.max_inner_rad) - body.inner_rad
         inner_rad += clamp(turn_rad, p.steering_rate_radps * step_s)
     speed_mps = body.speed_mps + clamp(change_mps, rate_mps2 * step_s)
     steering_radps = (inner_rad - body.inner_rad) / step_s
@@ -148,7 +142,7 @@ def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Pa
 
 
 def roll(body: Body, step_s: float, parameters: Parameters) -> Body:
-    """The way of the rear wheels at the present speed; in a turn the outer one covers more."""
+    """Roll at the present speed; in a turn the outer rear wheel covers more."""
     half = curvature(body.inner_rad, parameters) * parameters.track_m / 2
     way_m = body.speed_mps * step_s
     return body._replace(
@@ -157,20 +151,13 @@ def roll(body: Body, step_s: float, parameters: Parameters) -> Body:
 
 
 def curvature(inner_rad: float, parameters: Parameters) -> float:
-    """Of the rear axle's middle, 1/m: the inner wheel's radius is half a track shorter (Ackermann).
+    """Return the curvature of the rear axle's middle, 1/m, for an inner wheel's angle (Ackermann).
 
     radius = wheelbase / tan(inner) + track / 2
     """
     slope = math.tan(abs(inner_rad))
     amount = slope / (parameters.wheelbase_m + slope * parameters.track_m / 2)
     return math.copysign(amount, inner_rad)
-
-
-class Wire(NamedTuple):
-    """A frame on the bus."""
-
-    can_id: int
-    data: bytes
 
 
 class MockHunter:
@@ -183,15 +170,15 @@ class MockHunter:
         self.next_s = now_s  # When `due` must be called next
         self._parameters, self._profile = parameters, profile
         self._now_s = now_s
-        self._under_way: deque[tuple[float, Setpoint]] = deque()
-        self._setpoint = Setpoint()
+        self._under_way: deque[tuple[float, MotionCommand]] = deque()
+        self._setpoint = MotionCommand(0.0, 0.0)
         self._tick = 0
-        self._fast: list[Wire] = []
-        self._slow: list[Wire] = []
-        self._outgoing: deque[tuple[float, Wire]] = deque()
+        self._fast: list[Sent] = []
+        self._slow: list[Sent] = []
+        self._outgoing: deque[tuple[float, Sent]] = deque()
 
     def describe(self) -> str:
-        """Where it stands in one line that only changes when something happens."""
+        """Describe its state in a line that only changes when something happens."""
         return (
             f"control={self.chassis.control.value} condition={self.chassis.condition.value}"
             f" brake={'locked' if self.chassis.brake_locked else 'released'}"
@@ -200,29 +187,28 @@ class MockHunter:
         )
 
     def receive(self, can_id: int, data: bytes, now_s: float) -> None:
-        """A frame of the bus; one that the chassis does not know, or of a wrong length, is none."""
+        """Take a frame of the bus; ignore unknown ones, and those of a wrong length."""
         self.advance(now_s)
         message = codec.decode(can_id, data)
         if message is None or "bus_off" in self.faults:
             return
-        if isinstance(message, codec.MotionCommand):
+        if isinstance(message, MotionCommand):
             right_rad = -self._parameters.max_inner_rad
             inner_rad = right_rad if "full_lock" in self.faults else message.inner_steering_rad
-            asked = Setpoint(message.speed_mps, inner_rad)
+            asked = MotionCommand(message.speed_mps, inner_rad)
             self.chassis = rules.take_command(self.chassis, now_s)
             self._under_way.append((now_s + self._parameters.dead_time_s, asked))
         elif isinstance(message, codec.ModeCommand):
             if message.mode == codec.CAN_CONTROL:
                 self.chassis = rules.take_can_mode(self.chassis, now_s)
             elif message.mode == codec.STANDBY:
-                self.chassis = rules.advance(self.chassis, Event.STANDBY_MODE)
+                self.chassis = rules.advance(self.chassis, ChassisEvent.STANDBY_MODE)
         elif isinstance(message, codec.BrakeCommand) and message.locked in (0, 1):
             self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
         elif isinstance(message, codec.ClearCommand):
             self.chassis = rules.take_clear(self.chassis)
 
     def switch(self, name: str, on: bool, now_s: float) -> None:
-        """Switch one of FAULTS on or off."""
         self.advance(now_s)
         (self.faults.add if on else self.faults.discard)(name)
         if name in BITS:
@@ -231,8 +217,8 @@ class MockHunter:
             event = _OF_A_PERSON[name][0 if on else 1]
             self.chassis = rules.advance(self.chassis, event)
 
-    def due(self, now_s: float) -> list[Wire]:
-        """The frames to send now. After a pause one report, not one for each missed period."""
+    def due(self, now_s: float) -> list[Sent]:
+        """Return the frames to send now; after a pause one report, not one a missed period."""
         self.advance(now_s)
         if now_s >= self.next_s:
             self._report(now_s)
@@ -245,7 +231,6 @@ class MockHunter:
         return found
 
     def advance(self, now_s: float) -> None:
-        """Integrate up to this time."""
         p = self._parameters
         self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
         while now_s - self._now_s > 1e-9:
@@ -256,7 +241,7 @@ class MockHunter:
                 self._setpoint = self._under_way.popleft()[1]
             if not rules.obeys(self.chassis):
                 # Where control comes back, it does so from a stand, not with what was asked before.
-                self._setpoint = Setpoint(0.0, self.body.inner_rad)
+                self._setpoint = MotionCommand(0.0, self.body.inner_rad)
                 self.body = advance(self.body, None, step_s, p)
             elif "stuck" in self.faults:
                 self.body = roll(self.body, step_s, p)
@@ -276,11 +261,11 @@ class MockHunter:
         frames = self._fast + (self._slow if with_slow else [])
         self._outgoing.extend((release_s, frame) for frame in frames)
 
-    def _fast_frames(self) -> list[Wire]:
-        """0x221 and 0x251 to 0x253: every 20 ms."""
+    def _fast_frames(self) -> list[Sent]:
+        """Make 0x221 and 0x251 to 0x253: every 20 ms."""
         body, p = self.body, self._parameters
         speed_mps = body.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        found = [_frame(codec.MOTION_STATUS, codec.MotionStatus(speed_mps, body.inner_rad))]
+        found = [codec.MOTION_STATUS.sent(codec.MotionStatus(speed_mps, body.inner_rad))]
         half = curvature(body.inner_rad, p) * p.track_m / 2
         drive, steer = p.motor_revolutions_per_m, p.steer_revolutions_per_rad
         for row, turns, speed, way in (
@@ -291,11 +276,11 @@ class MockHunter:
             # As a 32-bit counter shows it after it has run over.
             pulses = round(way * turns * p.pulses_per_revolution)
             shown = (pulses + _INT32 // 2) % _INT32 - _INT32 // 2
-            found.append(_frame(row, codec.MotorFast(round(speed * turns * 60), _IDLE_A, shown)))
+            found.append(row.sent(codec.MotorFast(round(speed * turns * 60), _IDLE_A, shown)))
         return found
 
-    def _slow_frames(self) -> list[Wire]:
-        """0x211 and 0x261 to 0x263: every 100 ms."""
+    def _slow_frames(self) -> list[Sent]:
+        """Make 0x211 and 0x261 to 0x263: every 100 ms."""
         chassis, errors = self.chassis, self.chassis.errors
         words = [BITS[error].words for error in errors]
         words += [LINK_LOST] if chassis.control is Control.LINK_LOST else []
@@ -308,15 +293,11 @@ class MockHunter:
             brake=int(chassis.brake_locked),
             counter=self._tick // SLOW_EVERY % 256,
         )
-        found = [_frame(codec.SYSTEM_STATUS, status)]
+        found = [codec.SYSTEM_STATUS.sent(status)]
         for motor, row in enumerate(_SLOW):
             shown = (BITS[error].motor_bits for error in errors if motor in BITS[error].motors)
             hot = "overtemperature" in errors and motor != STEERING
             celsius = _HOT_C if hot else _COOL_C
             slow = codec.MotorSlow(volts, celsius, celsius, _ENABLED | sum(shown))
-            found.append(_frame(row, slow))
+            found.append(row.sent(slow))
         return found
-
-
-def _frame(row: codec.Frame, message: object) -> Wire:
-    return Wire(row.can_id, codec.encode(row, message))

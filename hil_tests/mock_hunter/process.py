@@ -58,14 +58,13 @@ class Server:
         self._ending.set()
 
     def run(self) -> None:
-        """Obey and report."""
         while not self._ending.is_set():
             while not self.orders.empty():
                 (name, on), now_s = self.orders.get(), time.monotonic()
                 self._hunter.switch(name, on, now_s)
                 self._tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
-            for frame in self._hunter.due(time.monotonic()):
-                self._send(frame.can_id, frame.data)
+            for frame, data in self._hunter.due(time.monotonic()):
+                self._send(frame.can_id, data)
             words = self._hunter.describe()
             if words != self._said:
                 self._said = words
@@ -104,7 +103,6 @@ EXAMPLE = examples(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     parser.description = (
         f"{parser.description} "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
@@ -132,13 +130,9 @@ def run(arguments: argparse.Namespace) -> int:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
         server = Server(hunter, bus, tell)
         for after_s, fault in arguments.fault:
-            switch = partial(server.orders.put, (fault, True))
-            if after_s:
-                later = threading.Timer(after_s, switch)
-                later.daemon = True
-                later.start()
-            else:
-                switch()
+            timer = threading.Timer(after_s, server.orders.put, ((fault, True),))
+            timer.daemon = True
+            timer.start()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
         if isinstance(sys.stdin, io.TextIOWrapper):

@@ -1,13 +1,7 @@
-"""The cockpit's pages for tests: a WebSocket that talks as a page does, and a real Chromium.
-
-``python -m hil_tests.testing.browser --picture docs/cockpit.png`` takes that picture.
-"""
+"""The cockpit's pages for tests: a WebSocket that talks as a page does, and a real Chromium."""
 
 import asyncio
 import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -19,7 +13,6 @@ from trainer.environments import make_environment
 from trainer.person.interface import View
 
 WAIT_S, PATIENCE_S = 5.0, 20.0
-TAKE_OVERS = 12  # Before the picture
 DESKTOP = {"width": 1280, "height": 740}
 LIVE = "document.body.dataset.link === 'live'"
 READY = f"{LIVE} && document.getElementById('scenario').textContent"
@@ -170,39 +163,3 @@ def address(process):
         if line.startswith("cockpit: open "):
             return line.split()[-1]
     raise RuntimeError(f"it ended before it served the cockpit, with status {process.wait()}")
-
-
-async def take_picture(url, path):
-    async with open_browser() as page:
-        await page.goto(url)
-        for _ in range(TAKE_OVERS):  # The coach needs something to say.
-            await until(page, POLICY_DRIVES)
-            await asyncio.sleep(2.5)
-            await page.keyboard.down("ArrowUp")
-            await asyncio.sleep(1.5)
-            await page.keyboard.up("ArrowUp")
-        await until(page, POLICY_DRIVES)
-        await asyncio.sleep(1.5)
-        await page.keyboard.down("ArrowDown")
-        await until(page, PERSON_DRIVES)
-        await asyncio.sleep(0.5)
-        await page.screenshot(path=path, full_page=True)
-        await page.keyboard.up("ArrowDown")
-        await quit_sitting(page)
-
-
-def main(path):
-    with tempfile.TemporaryDirectory() as directory:
-        words = ["trainer", "train", "--human", "web", "--seed", "1"]
-        often = ["--set", "evaluate_every_steps=60", "--set", "evaluation_runs=10"]
-        command = [sys.executable, "-m", *words, *often, "--out", directory]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            try:
-                asyncio.run(take_picture(address(process), path))
-                process.wait(30.0)
-            finally:
-                process.kill()
-
-
-if __name__ == "__main__":
-    main(sys.argv[sys.argv.index("--picture") + 1])

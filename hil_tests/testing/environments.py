@@ -85,7 +85,7 @@ for name, options in VARIANTS.items():
         gymnasium.register(name, **made, disable_env_checker=True, order_enforce=False)
 SHORT_PARKING = "BridgeParking-v0"  # One of highway-env's, which alone has 100 s
 if SHORT_PARKING not in gymnasium.registry:
-    parking, less = "highway_env.envs.parking_env:ParkingEnv", {"config": {"duration": 15}}
+    parking, less = "highway_env.envs.parking_env:ParkingEnv", {"config": {"duration": 6}}
     gymnasium.register(SHORT_PARKING, parking, kwargs=less)
 
 

@@ -1,12 +1,16 @@
-"""The core of a streamed vehicle in made-up time, and a vehicle that obeys it at once, or not."""
+"""A driver that fails where it is told to; the core of a streamed vehicle in made-up time, and a
+vehicle that obeys it at once, or not.
+"""
 
 import math
+import threading
 
 from edge_runtime.manifest import Car, Manifest
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
+from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 from edge_runtime.vehicles.ros2 import STEERING as ANGLE
 from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
 from hil_tests.testing.policies import FRAMES, STEERING, T
@@ -35,6 +39,60 @@ def a_manifest(car=CARS["left_turn"], **changes):
         "control_period_s": T, "algorithm": "", "training": {}, "created": "",
     }  # fmt: skip
     return Manifest(car=car, **{**fields, **changes})
+
+
+class BrokenVehicle(MockVehicle):
+    """Notes what it is asked, raises what `raises` holds for a call, hangs in what `hangs` names.
+
+    `odd` are fields of its reports that are replaced.
+    """
+
+    control_period_s = T
+
+    def __init__(self):
+        super().__init__()
+        self.asked: list = []
+        self.raises: dict = {}
+        self.odd: dict = {}
+        self.hangs = ""
+        self.hanging, self.released = threading.Event(), threading.Event()
+
+    def hang(self, call="feedback"):
+        self.hangs = call
+        assert self.hanging.wait(10.0)
+
+    def go_on(self):
+        self.hangs = ""
+        self.released.set()
+
+    def enable(self, now_s):
+        self._take("enable", "enable")
+        super().enable(now_s)
+
+    def command(self, action, now_s, scenario_speed_mps=None):
+        self._take("command", "command")
+        self.scenario_speed_mps = scenario_speed_mps
+        super().command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s, latch=True):
+        self._take("brake", "brake" if latch else "stand")
+        super().brake(now_s, latch)
+
+    def feedback(self, now_s):
+        self._take("feedback")
+        return super().feedback(now_s)._replace(**self.odd)
+
+    def close(self):
+        self._take("close", "close")
+        super().close()
+
+    def _take(self, call, *notes):
+        if self.hangs == call:
+            self.hanging.set()
+            self.released.wait()
+        self.asked.extend(notes)
+        if self.raises.get(call):
+            raise self.raises[call]
 
 
 class Rig:
@@ -71,7 +129,7 @@ class Rig:
     def enabled(self):
         self.core.enable(self.now_s)
         self.step(6)
-        assert self.core.state is State.ENABLED
+        assert self.core.state is VehicleState.ENABLED
         return self
 
     def driving(self, seconds=1.0):
@@ -138,7 +196,7 @@ class HunterRig(Rig):
 class Ros2Rig(Rig):
     """Odometry after each tick; `angular` is what it says of the wheels, None: what is true."""
 
-    silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.00 m/s", None
+    silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.0 m/s", None
 
     def __init__(self, scenario="left_turn", scale=None, **settings):
         self.settings = Ros2Settings(**settings)
@@ -164,3 +222,30 @@ class Ros2Rig(Rig):
                 angular = self.speed_mps * math.tan(self.centre_rad) / SPEC.wheelbase_m
             angular = angular if self.angular is None else self.angular
             self.core.hear(round(self.now_s * 1e9), self.speed_mps, angular, self.now_s)
+
+
+class MockRig(Rig):
+    """The mock in place of a core: it needs no ticks, and obeys by itself."""
+
+    def __init__(self, **parameters):
+        self.core, self.now_s, self.ticks = MockVehicle(MockParameters(**parameters)), 100.0, 0
+        self.core.control_period_s = T
+
+    def step(self, count=1, action=None, scenario_speed_mps=None):
+        for _ in range(count):
+            if action is not None and self.ticks % 5 == 0:
+                self.core.command(action, self.now_s, scenario_speed_mps)
+            self.ticks += 1
+            self.now_s = 100.0 + self.ticks * STREAM_S
+        return self
+
+    def enabled(self):
+        self.core.enable(self.now_s)
+        return self.step(6)
+
+    def driving(self, seconds=1.0):
+        return self.enabled().step(round(seconds / STREAM_S), PEDAL)
+
+    @property
+    def report(self):
+        return self.core.feedback(self.now_s)

@@ -17,7 +17,6 @@ KINDS = {
     "is killed": f'exec timeout --foreground -s KILL 0.7 {PROGRAM} "$@"',
     "hangs": f'exec timeout --foreground -s STOP 0.7 {PROGRAM} "$@"',
     "never listens": "exec sleep 60",
-    "starts slowly": f'sleep 1.5; exec {PROGRAM} "$@"',
     "works": f'exec {PROGRAM} "$@"',
 }
 WINDOWLESS = 'case "$*" in *--serve-web*) ;; *) set -- "$@" --serve-grpc ;; esac'

@@ -2,18 +2,12 @@
 
 import argparse
 import json
-import os
-import signal
-import subprocess
-import sys
 
 import pytest
 
-from edge_runtime.util import UserError
 from hil_tests import demo
 from hil_tests.__main__ import main
 from hil_tests.demo import Demo
-from hil_tests.processes import Process, wait_until
 
 SMALL = (
     "--steps", "100", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
@@ -23,11 +17,13 @@ SMALL = (
 
 @pytest.mark.timeout(400)
 def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "SETTINGS", ("batch_size=8", "evaluation_runs=1"))
+    monkeypatch.setattr(demo, "REFINING_UPDATES", 10)
     words = ["demo", "--out", str(tmp_path / "demo"), *SMALL]
-    line = [sys.executable, "-m", "hil_tests", *words]  # as a person would, without a terminal
-    first = subprocess.run(line, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    first = main(words)
     # A policy of a hundred steps may well drive badly (status 1); anything else is a fault.
-    assert first.returncode in (0, 1), first.stderr
+    assert first in (0, 1)
+    shown = capsys.readouterr().out
     made = {path.name for path in (tmp_path / "demo").iterdir()}
     assert made >= {
         "left_turn.onnx", "left_turn.onnx.sig", "learning_curve.png", "drive.rrd",
@@ -38,24 +34,22 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     assert len({report["policy_id"] for report in reports}) == 1
     assert reports[2]["latency_ms"]["p50"] > 80
     for text in ("in process", "over Zenoh", "each way", "safe stops"):
-        assert text in first.stdout
+        assert text in shown
     policy = (tmp_path / "demo" / "left_turn.onnx").read_bytes()
     # What the second one does with its policy is what the first one did: only its commands count.
     commands = []
     monkeypatch.setattr(demo, "run_command", lambda *words: commands.append(words[:2]))
     monkeypatch.setattr(demo.Demo, "_simulate", lambda *_: commands.append(("simulate",)))
-    assert main(words) == first.returncode
+    assert main(words) == first
     assert "is kept" in capsys.readouterr().out
     assert commands == [("trainer", "evaluate"), *[("simulate",)] * 3]
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
 
 
-def test_a_policy_without_signature_is_not_offered_and_a_failing_command_says_why(tmp_path):
+def test_a_policy_without_signature_is_not_offered(tmp_path):
     kept = Demo(tmp_path, runs=1)
     kept.policy.write_bytes(b"x")
     assert not kept.has_kept()
-    with pytest.raises(UserError, match="does not exist"):
-        Process("edge_runtime", "run", "--policy", str(tmp_path / "none.onnx"), ready="ready")
 
 
 def test_a_demo_cut_off_in_its_export_does_not_keep_the_policy_of_an_earlier_key(
@@ -76,32 +70,3 @@ def test_a_demo_cut_off_in_its_export_does_not_keep_the_policy_of_an_earlier_key
     cut.public_key.parent.mkdir(exist_ok=True)
     cut.public_key.touch()
     assert not cut.has_kept()
-
-
-CHILD = """
-import signal, sys, time
-from pathlib import Path
-
-def keep(number, frame):
-    time.sleep(1.0)
-    Path("kept").touch()
-    sys.exit(130)
-
-signal.signal(signal.SIGINT, keep)
-Path("ready").touch()
-time.sleep(60)
-"""
-
-
-def test_what_an_interrupted_command_keeps_is_waited_for(tmp_path):
-    (tmp_path / "child.py").write_text(CHILD)
-    code = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        "from hil_tests.processes import run_command; run_command('child')"
-    )
-    line = [sys.executable, "-c", code]
-    parent = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
-    wait_until((tmp_path / "ready").exists, "the child")
-    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
-    assert parent.wait(30) != 0
-    assert (tmp_path / "kept").exists()

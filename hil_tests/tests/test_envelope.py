@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, TRUNCATED, UNKNOWN
+from bridge.outcomes import GOAL
 from edge_runtime.policy import policy_id_of
 from edge_runtime.util import UserError
 from hil_tests.__main__ import main
@@ -22,7 +21,6 @@ from hil_tests.envelope import (
     FRESH,
     HOLDS,
     TRIES,
-    Drivers,
     Search,
     SequentialTest,
     find_region,
@@ -137,18 +135,6 @@ def test_what_fails_without_a_network_has_no_envelope():
         find_region(Search(lambda spec, seeds: [seed % 5 > 0 for seed in seeds], 0.95, 0.95))
 
 
-def test_a_limit_of_steps_is_a_failure_where_another_drive_tells():
-    drivers: Any = Drivers.__new__(Drivers)
-    drivers.driven, drivers._ended, ends = [], {TRUNCATED}, [[TRUNCATED], [UNKNOWN, GOAL]]
-    drivers.map = lambda *_, **__: ends.pop()
-    for _ in range(2):  # None, or not all, tell how they ended.
-        drivers._ended = {TRUNCATED}
-        with pytest.raises(UserError, match="whether it succeeded"):
-            drivers.drive(network({}), [0])
-    ends[:] = [[TRUNCATED, TRUNCATED], [GOAL, TRUNCATED]]
-    assert [drivers.drive(network({}), [0, 1]) for _ in range(2)] == [[True, False], [False] * 2]
-
-
 def test_bursts_come_on_top_of_the_loss():
     way = network({"loss_percent": 10.0, "burst_messages": 3.0}).up
     assert way.bad_share == pytest.approx(BURST_PERCENT / 100)
@@ -174,15 +160,15 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(monkeypa
     kept["edges"] = {"loss_percent": kept["edges"]["loss_percent"]}
     given_, out = tmp_path / "given.json", tmp_path / "out.json"
     given_.write_text(json.dumps(kept))
-    words = ["envelope", "--confirm", str(given_), "--runs", "12", "--jobs", "1", "--out"]
+    words = ["envelope", "--confirm", str(given_), "--runs", "4", "--jobs", "1", "--out"]
     status = exit_status(main, [*words, str(out)])
     found = json.loads(out.read_text())
     assert (status == 0) == found["confirmed"] == all(row["as_told"] for row in found["rows"])
     for row in found["rows"]:
-        spec, seeds = parse_spec(row["network"]), range(FRESH, FRESH + 12)
+        spec, seeds = parse_spec(row["network"]), range(FRESH, FRESH + 4)
         drives = drive_episodes(env, driver, seeds, latency=spec)
-        assert row["share"] == sum(drive.outcome == GOAL for drive in drives) / 12
-    assert found["drives"] == 24
+        assert row["share"] == sum(drive.outcome == GOAL for drive in drives) / 4
+    assert found["drives"] == 8
     given_.write_text(json.dumps({**kept, "policy_id": "another"}))
     assert exit_status(main, [*words, str(tmp_path / "none.json")]) == 2
     assert not (tmp_path / "none.json").exists()
@@ -196,7 +182,6 @@ def test_an_envelope_is_confirmed_by_seeds_that_the_search_has_not_seen(monkeypa
         ({"edges": {}}, "of length >= 1 - at `$.edges`"),
         ({"edges": {"delay_ms": {"inside": "none"}}}, "missing required field `outside`"),
         ({"edges": {"delay_ms": {"inside": "none", "outside": "x"}}}, "'x' is not understood"),
-        ({"condition": "windy"}, "no condition 'windy'"),
         ({"env": "planted:Env-v0"}, "is typed: give --env planted:Env-v0"),
         ({"policy": "planted:Expert"}, "is typed: give --policy planted:Expert"),
         ({"promised_success": "most"}, "`float`, got `str` - at `$.promised_success`"),
@@ -209,8 +194,6 @@ def test_a_damaged_envelope_cannot_be_confirmed_and_is_one_line(tmp_path, capsys
     words = ["envelope", "--confirm", str(given_), "--out", str(out)]
     assert exit_status(main, words) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    what = "given.json is no envelope of hil_tests envelope, with edges to confirm: "
-    assert (what in line) == (isinstance(damage, dict) and "planted" not in says)
     assert says in line
     assert not out.exists()
 

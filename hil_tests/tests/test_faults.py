@@ -1,9 +1,9 @@
 """Two real faults (all: `hil_tests campaign --only faults`), and what the verdicts rest on."""
 
-import fnmatch
 import threading
 from pathlib import Path
-from unittest.mock import MagicMock, Mock
+from tempfile import TemporaryDirectory
+from unittest.mock import MagicMock, Mock, patch
 
 import msgspec
 import numpy as np
@@ -16,10 +16,9 @@ from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.messages import mutated
 from hil_tests.faults.rig import ChassisProcess, Rig, Truth, noisy_state
-from hil_tests.faults.rows import ROWS, Row, Try
-from hil_tests.faults.run import Outcome, _try, report_row, run_faults, run_row
+from hil_tests.faults.run import Outcome, report_row, run_faults, run_row
+from hil_tests.faults.table import ROWS, Row, Try
 from hil_tests.mock_hunter.chassis import FAULTS
-from hil_tests.processes import in_parallel
 from hil_tests.testing.policies import TASK
 
 PLACE = ("session", 0, 7)
@@ -68,7 +67,7 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     payloads = list(mutated(valid, 3000, seed=1))
     assert payloads == list(mutated(valid, 3000, seed=1))
     assert payloads != list(mutated(valid, 3000, seed=2))
-    read = [wire.decode_state(payload, Layout(TASK)) for payload in payloads]
+    read = [Layout(TASK).decode(payload) for payload in payloads]
     reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
     assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
@@ -89,53 +88,43 @@ def test_a_rig_that_cannot_start_leaves_no_process(tmp_path, monkeypatch):
     assert [process.has_ended for process in started] == [True]
 
 
-def test_a_process_that_is_gone_is_a_failed_try_and_ends_no_campaign():
-    gone = Mock(wait_until_driving=Mock(side_effect=BrokenPipeError("the chassis is gone")))
-    outcome = Outcome()
-    assert not _try(ROW, gone, 3, outcome)
-    assert outcome.failures == ["try 3: the chassis is gone"]
+def run_with(rig, tries=1, ended=None):
+    """Run a row that does nothing, with a rig that is not real."""
+    with patch("hil_tests.faults.run.Rig", rig), TemporaryDirectory() as folder:
+        ended = ended or threading.Event()
+        return run_row(ROW, (), TASK, Path(folder), tries, lambda name: None, ended)
 
 
-def test_what_a_rig_saw_counts(tmp_path, monkeypatch):
-    seen = observe.Timeline(states=STATES, commands=[command(action=[1.01])], unreadable=1)
+def test_a_rig_that_fails_is_a_failed_try_and_ends_no_campaign():
+    assert run_with(Mock(side_effect=UserError("no multicast")), 3).failures == [
+        "try 0: no multicast"
+    ]
+    gone = MagicMock(crashes=[], timeline=observe.DriveTimeline())
+    gone.__enter__.return_value = gone
+    gone.wait_until_driving.side_effect = BrokenPipeError("the chassis is gone")
+    found = run_with(Mock(return_value=gone), 2)
+    assert found.failures == [f"try {number}: the chassis is gone" for number in range(2)]
+
+
+def test_what_a_rig_saw_counts():
+    seen = observe.DriveTimeline(states=STATES, commands=[command(action=[1.01])], unreadable=1)
     rig = MagicMock(timeline=seen, crashes=["edge"])
     rig.__enter__.return_value = rig
-    monkeypatch.setattr("hil_tests.faults.run.Rig", Mock(return_value=rig))
-    found = run_row(ROW, (), TASK, tmp_path, 1, lambda name: None, threading.Event())
+    found = run_with(Mock(return_value=rig))
     assert (len(found.unsafe), found.crashes) == (2, ["edge"])
 
 
-def test_a_slower_policy_has_more_time():
-    later_s = observe.later_s(msgspec.structs.replace(TASK, control_period_s=0.3))
-    assert later_s == pytest.approx(0.4)
-    for reaction_s, recovery_s, late in ((0.649, 1.999, 0), (0.651, 2.001, 1)):
-        found = report_row(ROW, Outcome(tries=[Try(reaction_s, recovery_s)]), later_s)
-        assert (found["reactions_late"], found["recoveries_late"]) == (late, late)
-
-
-def test_a_row_whose_rig_cannot_start_fails_and_ends_no_campaign(tmp_path, monkeypatch):
-    monkeypatch.setattr("hil_tests.faults.run.Rig", Mock(side_effect=UserError("no multicast")))
-    outcome = run_row(ROW, (), TASK, tmp_path, 3, lambda _: None, threading.Event())
-    assert outcome.failures == ["try 0: no multicast"]
-
-
-def test_a_campaign_that_has_ended_begins_no_try(tmp_path):
+def test_a_campaign_that_has_ended_begins_no_try():
     ended = threading.Event()
-
-    def fail(item):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        in_parallel(fail, [1], 1, lambda *_: None, ended)
-    outcome = run_row(ROW, (), TASK, tmp_path, 9, lambda name: None, ended)
-    assert outcome == Outcome()
+    ended.set()
+    assert run_with(Mock(side_effect=AssertionError), 9, ended) == Outcome()
 
 
 def judged(*tries, **outcome):
     return report_row(ROW, Outcome(tries=list(tries), **outcome))
 
 
-def test_a_row_passes_only_within_its_limits():
+def test_a_row_passes_only_within_its_limits_and_a_slower_policy_has_more_time():
     assert judged(Try(0.25, 1.0))["passed"]
     slow, late = judged(Try(0.251, 0.5)), judged(Try(0.2, 1.001))
     assert (slow["reactions_late"], late["recoveries_late"]) == (1, 1)
@@ -145,6 +134,10 @@ def test_a_row_passes_only_within_its_limits():
         judged(failures=["try 0: nothing"]),
     ):  # fmt: skip
         assert not bad["passed"]
+    later_s = observe.later_s(msgspec.structs.replace(TASK, control_period_s=0.3))
+    for reaction_s, recovery_s, is_met in ((0.649, 1.999, True), (0.651, 2.001, False)):
+        found = report_row(ROW, Outcome(tries=[Try(reaction_s, recovery_s)]), later_s)
+        assert found["passed"] == is_met
 
 
 def test_the_table_says_what_was_missed():
@@ -153,24 +146,20 @@ def test_the_table_says_what_was_missed():
     table = render_faults({"rows": rows, "crashes": 0, "unsafe_commands": 1})
     assert "| 200 / 205 / 210 | 250 | 500 / 550 / 600 | 1000 | met, 1,200 rejected" in table
     assert "MISSED: 1 reactions late, 1 unsafe" in table
-    assert "0 crashes and 1 unsafe commands" in table
 
 
 def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
     names = [row.name for row in ROWS]
     assert len(set(names)) == len(names)
     assert f"{len(names)} faults" in (Path(__file__).parents[2] / "README.md").read_text()
-    said = r"no latency axis or fault 'meteor.*'; choose from .*edge_killed"
-    for other in ("meteor", "meteor_*"):
-        with pytest.raises(UserError, match=said):
-            choose(other, None)
-    hunters = {name for name in names if fnmatch.fnmatch(name, "hunter_*")}
+    with pytest.raises(UserError, match=r"'meteor_\*'; choose from .*edge_killed"):
+        choose("meteor_*", None)
+    hunters = {name for name in names if name.startswith("hunter_")}
     assert hunters == {f"hunter_{name}" for name in FAULTS}
-    axes, rows = choose("vehicle_*,vehicle_stuck,edge_killed,delay", None)
+    axes, rows = choose("vehicle_s*,vehicle_stuck,edge_killed,delay", None)
     assert [axis.name for axis in axes] == ["delay"]
-    chosen = [row.name for row in rows]
-    assert chosen[:3] == ["edge_killed", "vehicle_silent", "vehicle_stuck"]
-    assert all(name.startswith("vehicle_") for name in chosen[1:])
+    wanted = ["edge_killed", "vehicle_silent", "vehicle_stuck", "vehicle_self_braking"]
+    assert [row.name for row in rows] == wanted
 
 
 @pytest.mark.parametrize(
@@ -204,7 +193,7 @@ def monitor(request):
 
 
 def asked(*frames):
-    return [observe.Heard(seen_s, 0x111, data) for seen_s, data in frames]
+    return [observe.BusFrame(seen_s, 0x111, data) for seen_s, data in frames]
 
 
 def test_the_set_point_counts_from_where_it_stays_zero(monitor):
@@ -220,10 +209,10 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
     monitor.heard += asked((1.0, FAST))
     assert hunter._kept_to_its_own(monitor) == []
     monitor.heard += asked((1.0, bytes.fromhex("06 40 00 00 00 00 00 00")))  # 1.6 m/s
-    monitor.strange.append(observe.Heard(1.0, 0x7DF, b""))
+    monitor.strange.append(observe.BusFrame(1.0, 0x7DF, b""))
     assert hunter._kept_to_its_own(monitor) == ["0x7df was on the bus", "asked for 1.60 m/s"]
     backwards = bytes.fromhex("FF 6A 00 00 00 00 00 00")
-    speeds = [hunter.speed_mps(observe.Heard(0.0, 0x221, data)) for data in (FAST, backwards)]
+    speeds = [hunter.speed_mps(observe.BusFrame(0.0, 0x221, data)) for data in (FAST, backwards)]
     assert speeds == pytest.approx([1.0, -0.15])
 
 

@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.statistics import NOTHING, Estimate, bootstrap, mean_estimate
 from trainer.environments import CONDITIONS
 from trainer.experiments import data, plan
-from trainer.experiments.data import Estimate, Holds, Line, Numbers, Place, Result, Results
+from trainer.experiments.data import Holds, Line, Numbers, Place, Result, Results
 from trainer.training.metrics import LEARNED
 
 UNITS = {
@@ -108,7 +109,7 @@ def ahead(results: Results, kind: str, claim: Claim, sign: float = 1.0) -> Itera
         one, over = own, ""
         if second:
             found = results.differences(place, first, second, quantity, kind)
-            one, over = data.mean_estimate(found.values()), f" minus {second.name}"
+            one, over = mean_estimate(found.values()), f" minus {second.name}"
             complete = complete and results.complete(place, second, quantity)
         bar, (factor, digits, unit) = claim.bar, UNITS[quantity]
         if sign:
@@ -187,7 +188,7 @@ def sooner_by(
     same seeds for both, reaches from the lower bounds to the upper.
     """
     if not own or not other:
-        return data.NOTHING, ""
+        return NOTHING, ""
     grid = own[0].grid
     curves = [np.stack([r.curve(kind, quantity) for r in each]) for each in (own, other)]
     ends = [np.array([r.end(kind, quantity) for r in each]) for each in (own, other)]
@@ -206,9 +207,9 @@ def sooner_by(
     first, second = reached([np.arange(len(curve)) for curve in curves])
     exact = first.low == first.high and second.low == second.high
     point = second.low / first.low if exact else float("nan")
-    lowest = data.bootstrap([its.low / ours.high for ours, its in drawn], point, seeds)
+    lowest = bootstrap([its.low / ours.high for ours, its in drawn], point, seeds)
     ratios = [its.high / ours.low if ours.low else np.inf for ours, its in drawn]
-    highest = data.bootstrap(ratios, point, seeds)
+    highest = bootstrap(ratios, point, seeds)
     return lowest._replace(high=highest.high), f"{first.said()} against {second.said()} steps"
 
 
@@ -250,7 +251,7 @@ def same_ranking(results: Results, kind: str, claim: Claim) -> Iterator[Comparis
 
         def is_ahead(first: Line, second: Line, place: Place = place) -> Holds:
             found = results.differences(place, first, second, data.DISTANCE, kind)
-            return data.above(data.mean_estimate(found.values()))
+            return data.above(mean_estimate(found.values()))
 
         means = [
             [results.estimate(place, x, data.DISTANCE, kind).value for x in s] for s in settings

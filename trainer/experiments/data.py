@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -10,9 +10,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from bridge.report import GOAL, failed
+from bridge.outcomes import GOAL, failed
+from bridge.statistics import Estimate, mean_estimate
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
 from trainer.experiments.plan import NORMAL, ONE_FRAME, RANDOM, SCENARIOS, TESTED_ONLY, Unit
@@ -21,63 +21,6 @@ from trainer.training.metrics import is_reached
 
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
-CONFIDENCE = 0.95
-TAIL = 0.5 * (1.0 - CONFIDENCE)  # Outside each end of an interval
-
-
-class Estimate(NamedTuple):
-    """A number with its interval; the interval is infinite where there is too little to say."""
-
-    value: float
-    low: float
-    high: float
-    size: int  # Values behind it
-
-    def times(self, factor: float) -> Estimate:
-        """The number and its interval multiplied."""
-        low, high = sorted((factor * self.low, factor * self.high))
-        return Estimate(factor * self.value, low, high, self.size)
-
-    def as_share(self) -> str:
-        """A share in percent, whose interval ends at 0 and 100."""
-        if self.size < 2:
-            return self.times(100.0).text(1)
-        held = self._replace(low=max(self.low, 0.0), high=min(self.high, 1.0))
-        return held.times(100.0).text(1)
-
-    def text(self, digits: int = 2) -> str:
-        """As in "0.97 [0.93, 0.99]"; a dash for nothing, the interval alone where no number is."""
-        bounded = np.isfinite([self.low, self.high]).any()
-        if not self.size or (np.isnan(self.value) and not bounded):
-            return "–"
-        shown, low, high = (f"{number:.{digits}f}" for number in self[:3])
-        if not bounded:
-            return shown
-        return f"{shown} [{low}, {high}]".replace("nan ", "").replace("inf", "∞")
-
-
-NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
-
-
-def mean_estimate(values: Iterable[float]) -> Estimate:
-    """Mean and Student's 95 % interval; no interval for fewer than two values."""
-    numbers = np.fromiter(values, float)
-    numbers = numbers[~np.isnan(numbers)]
-    if len(numbers) == 0:
-        return NOTHING
-    mean = float(numbers.mean())
-    if len(numbers) == 1:
-        return Estimate(mean, float("-inf"), float("inf"), 1)
-    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1) * stats.sem(numbers))
-    return Estimate(mean, mean - reach, mean + reach, len(numbers))
-
-
-def success_estimate(successes: int, count: int) -> Estimate:
-    """Share of successes and Wilson's 95 % interval."""
-    if count == 0:
-        return NOTHING
-    interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / count, float(interval.low), float(interval.high), count)
 
 
 def above(difference: Estimate, least: float = 0.0) -> Holds:
@@ -100,14 +43,6 @@ def enough_of(answers: Sequence[Holds], count: int = 0) -> Holds:
     if len(answers) - answers.count("no") < least:
         return "no"
     return "yes" if answers and answers.count("yes") >= least else "undecided"
-
-
-def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
-    """A number with the 95 % interval of its resampled values, some of which may be infinite."""
-    if size < 2:
-        return Estimate(point, float("-inf"), float("inf"), size)
-    ends = np.quantile(values, (TAIL, 1.0 - TAIL), method="inverted_cdf")
-    return Estimate(point, float(ends[0]), float(ends[1]), size)
 
 
 BySeed = dict[int, float]  # Training seed -> a number of that training

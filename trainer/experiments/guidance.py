@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bridge.report import markdown_table
+from bridge.statistics import mean_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
@@ -333,7 +334,7 @@ def best_by_rule(results: Results, rivals: Sequence[str]) -> str:
 def _takes_its_place(results: Results, row: str) -> bool:
     lines = Line(row, plan.GOOD), Line(PHIL, plan.GOOD)
     over = (results.differences(scene, *lines, data.SUCCESS) for scene in data.PAPER_SCENES)
-    behind = any(data.mean_estimate(points.values()).high < 0.0 for points in over)
+    behind = any(mean_estimate(points.values()).high < 0.0 for points in over)
     return _fewer(_both_scenes(results, row)) >= ENOUGH and not behind
 
 
@@ -376,7 +377,7 @@ def _over(
         task, *line, _ = found[0].unit
         nominal = data.Scene(task, "nominal")
         over = results.differences(nominal, Line(*line), other, quantity).values()
-        return data.mean_estimate(over).times(factor).text(digits)
+        return mean_estimate(over).times(factor).text(digits)
 
     return cell
 
@@ -384,7 +385,7 @@ def _over(
 def _success(condition: str) -> Cell:
     def cell(found: Sequence[Result]) -> str:
         tested = [one for one in found if condition in one.record["tests"]]
-        return data.mean_estimate(one.mean(condition, data.SUCCESS) for one in tested).as_share()
+        return mean_estimate(one.mean(condition, data.SUCCESS) for one in tested).as_share()
 
     return cell
 
@@ -393,7 +394,7 @@ def _estimate(number: Callable[[Result], float], digits: int = 0) -> Cell:
     """The mean of what is never below 0, and so is its interval."""
 
     def cell(found: Sequence[Result]) -> str:
-        its = data.mean_estimate(number(one) for one in found if one.unit.trained)
+        its = mean_estimate(number(one) for one in found if one.unit.trained)
         return its._replace(low=max(its.low, 0.0) if its.size > 1 else its.low).text(digits)
 
     return cell

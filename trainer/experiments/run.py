@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from bridge.outcomes import GOAL
 from bridge.progress import ProgressBar
-from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes, read_json
 from trainer import drivers, util

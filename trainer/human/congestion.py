@@ -1,4 +1,4 @@
-"""The human in the congestion: the scripted expert, and when a person would take the wheel."""
+"""The human in the congestion: the scripted expert, and when a person would take over."""
 
 import math
 
@@ -13,27 +13,26 @@ from trainer.scenarios.traffic import footprint
 
 
 class CongestionHuman(Expert):
-    """Heading control towards the middle between the neighbours; and judges the policy's action.
+    """Steers to the middle between the neighbours, and judges the policy's action.
 
-    A cascade: the offset from the middle asks for a heading, the heading error for a steering
-    angle. At 5 m/s (a wheelbase of 5 m turns by v x angle / 5 m) the offset dies out with a time
-    constant of 1.3 s without overshoot.
+    A cascade: the offset from the middle demands a heading, the heading error a steering angle. At
+    5 m/s (a wheelbase of 5 m turns by v x angle / 5 m) the offset dies out with a time constant of
+    1.3 s, without overshoot.
     """
 
     AHEAD_M = 12.0  # How far ahead a car counts as a neighbour, centre to centre ...
     BEHIND_M = 6.0  # ... and how far behind
     MIDDLE_LIMIT_M = 0.4
-    """The middle is sought no further than this from the lane's: a gap in a neighbouring lane is
-    no invitation."""
+    """Maximum distance from the lane's middle: a gap in a neighbouring lane is no invitation."""
     HEADING_RAD_PER_M = 0.15
     HEADING_LIMIT_RAD = 0.12
     STEERING_GAIN = 3.0
 
     HORIZON_S = 0.6
-    """How far the judged steering is followed. Long enough that the human always gets out of it,
-    and no longer: a human who takes over from the first drift keeps the policy from all that it
-    could learn by. Without imitation (HI-TD3) it then learns hardly anything."""
-    MARGIN_M = 0.25  # Room to other cars within which one counts as hit
+    """How far ahead the judged steering is followed: long enough that the human can always rescue
+    the car, and no longer. A human who takes over at the first drift keeps the policy from all
+    experience; without imitation (HI-TD3) it then learns hardly anything."""
+    MARGIN_M = 0.25  # A car that comes nearer than this counts as hit
     HEADING_RAD = 0.2
     OFFSET_M = 1.1  # From the lane's middle
 
@@ -41,7 +40,7 @@ class CongestionHuman(Expert):
         self.env = env
 
     def act(self, observation: Observation | None = None) -> NDArray[np.float32]:
-        """The expert's steering, float32 [1]: from the true state, whatever the picture shows."""
+        """Return the expert's steering, float32 [1], from the true state, not the picture."""
         ego = self.env.ego
         limit = self.HEADING_LIMIT_RAD
         offset_m = float(ego.position[1]) - self.middle_m()
@@ -51,7 +50,7 @@ class CongestionHuman(Expert):
         return np.array([min(max(share, -1.0), 1.0)], dtype=np.float32)
 
     def middle_m(self) -> float:
-        """Where to drive: y of the middle of the gap; without a neighbour its lane's inner edge."""
+        """Return y of the gap's middle; a missing neighbour counts as its lane's inner edge."""
         edge_m = 1.5 * self.env.config.lane_width_m - 0.5 * self.env.ego.WIDTH
         left_m, right_m = -edge_m, edge_m
         x = self.env.ego.position[0]
@@ -67,7 +66,7 @@ class CongestionHuman(Expert):
         return min(max(0.5 * (left_m + right_m), -limit), limit)
 
     def wants_control(self, action: NDArray) -> Reason | None:
-        """Why a person would take over from ``action`` now, or None. Once a control period."""
+        """Return why a person would take over from ``action`` now, or None; call it once a step."""
         env = self.env
         steps = round(self.HORIZON_S / env.config.control_period_s)
         angle_rad = float(action[0]) * env.config.lambda_rad
@@ -80,7 +79,7 @@ class CongestionHuman(Expert):
         return "offset" if abs(motion[-1].y) > self.OFFSET_M else None
 
     def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
-        """The ego car's footprints under a held steering angle, at its present speed."""
+        """Predict the ego car's footprints under a held steering angle, at its present speed."""
         env = self.env
         shape, dt_s = footprint(env.ego), env.config.control_period_s
         slip_rad = math.atan(0.5 * math.tan(angle_rad))
@@ -97,9 +96,9 @@ class CongestionHuman(Expert):
         return shapes
 
     def _hits(self, ego: Rectangle, ahead_s: float) -> bool:
-        """Whether a car beside, at its present speed, is then nearer than the margin.
+        """Whether a car beside it is then, at its present speed, nearer than the margin.
 
-        Only sideways: room ahead is the pedals' matter.
+        Only sideways: the pedals see to the room ahead.
         """
         wider = ego._replace(width=ego.width + 2.0 * self.MARGIN_M)
         for car in self.env.traffic:

@@ -24,7 +24,7 @@ from trainer.util import Purpose, claimed, episode_seed
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train the model, showing progress; returns the exit status."""
+    """Train the model, showing progress; return the exit status."""
     options.set_threads(arguments.threads)
     if arguments.recordings is not None and arguments.label_every_step:
         raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
@@ -49,7 +49,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         recordings = find_recordings([Path(place) for place in arguments.recordings])
         taken_over = demonstrate(model, recordings, env.scenario)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
-        # As many gradient steps as with the expert: in place of an episode, those that follow one.
+        # As many gradient steps as with the expert, without the episodes between them.
         episodes = (
             HumanEpisode(model.learn(config.updates_per_episode), model.demonstrations)
             for _ in range(config.episodes)
@@ -64,7 +64,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
                 break
     if bar.done < config.episodes:
         print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
-    # In proportion: a part of the episodes has shown a part of the examples, in a part of the time.
+    # In proportion: part of the episodes have shown part of the examples, in part of the time.
     updates = config.refining_updates * bar.done // config.episodes
     if updates:
         with ProgressBar("refining", min(updates, REFINING_PARTS)) as refining:
@@ -87,13 +87,12 @@ class HumanEpisode(NamedTuple):
 
 
 def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
-    """Online, incremental imitation of the scripted expert, which takes over while it drives."""
+    """Imitate the scripted expert, which takes over while the model drives; yield each episode."""
     config = model.config
-    # Each with a memory of its own: a person who takes over looks at the scene afresh.
+    # Three, as each has a memory: a person who takes over looks at the scene afresh.
     expert, adviser = expert_of(env), expert_of(env)
     guide = HumanGuide(expert, expert_of(env), steps_held(env.control_period_s))
     for episode in range(config.episodes):
-        # One episode in so many; with 0 none is.
         every = config.demonstrate_every
         demonstrated = every and episode % every == every - 1
         observation, info = env.reset(seed=episode_seed(seed, Purpose.HUMAN_EPISODES, episode))

@@ -1,6 +1,6 @@
 """The human in the left turn: foresight, the scripted expert, and when a person would take over.
 
-All three know the true state. The activation conditions are those that section V leaves open.
+All three know the true state. Section V leaves these activation conditions open.
 """
 
 import math
@@ -19,7 +19,7 @@ TABLE_STEP_M = 0.1
 
 @dataclass(frozen=True)
 class PedalPlan:
-    """What the ego car is supposed to do: a pedal for a while, then a speed."""
+    """A plan for the ego car: a pedal for a while, then a speed."""
 
     pedal: float = 1.0
     hold_s: float = 0.0
@@ -29,7 +29,7 @@ class PedalPlan:
 
 
 class Crossing:
-    """Foresight for one left-turn environment, with so much room to the sides of passing cars."""
+    """Foresight for one left-turn environment, with ``side_clearance_m`` beside passing cars."""
 
     def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
         self.env = env
@@ -47,14 +47,14 @@ class Crossing:
         time_s = np.linspace(0.0, (len(s_m) - 1) * self.env.config.control_period_s, len(s_m))
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
         rear_x, front_x = self._covered_x[cells].T
-        # All cars at once; the shape holds without any, too.
+        # All cars at once; the shape also holds without cars.
         cars = [(car.position[0], car.speed, car.LENGTH) for car in self.env.traffic]
         x, speed_mps, length_m = np.array(cars).reshape(-1, 3).T[:, :, None]
         car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
         return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
 
     def state_after(self, horizon_s: float, plan: PedalPlan) -> tuple[float, float]:
-        """How far along the path the ego car is after ``horizon_s`` (m), and its speed (m/s)."""
+        """Return the path length (m) and the speed (m/s) after ``horizon_s``."""
         s_m, speed_mps = self._ego_motion(horizon_s, plan)
         return float(s_m[-1]), speed_mps
 
@@ -64,14 +64,14 @@ class Crossing:
         return bool(np.isfinite(self._covered_x[cell, 0]))
 
     def _ego_motion(self, horizon_s: float, plan: PedalPlan) -> tuple[NDArray[np.float64], float]:
-        """Arc lengths reached (m), an entry a control period from now; and the last speed."""
+        """Return the arc lengths reached (m), from now on at every step, and the last speed."""
         c, dt_s = self.env.config, self.env.config.control_period_s
         steps, held = round(horizon_s / dt_s), round(plan.hold_s / dt_s)
         held_mps2 = plan.pedal * (c.throttle_mps2 if plan.pedal > 0 else c.brake_mps2)
         speed_mps, s_m = self.env.ego.speed, self.env.distance_m
         positions = [s_m]
         for step in range(steps):
-            # As the car itself: the position takes the speed at the start of the interval.
+            # As the car itself: the position uses the speed at the start of the step.
             s_m += speed_mps * dt_s
             if step < held:
                 speed_mps = min(max(speed_mps + held_mps2 * dt_s, 0.0), c.max_speed_mps)
@@ -91,7 +91,7 @@ class Crossing:
 
 
 def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[float, float]:
-    """The x range that a rectangle covers between two y values; empty is (inf, -inf)."""
+    """Return the x range that a rectangle covers between two y values; (inf, -inf): none."""
     points = corners(shape)
     xs: list[float] = []
     for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0), strict=True):
@@ -106,18 +106,17 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
 class LeftTurnHuman(Expert):
     """Waits at the stop line, picks a gap, and then commits; and judges the policy's action.
 
-    A driver who changes their mind with the nose in the lane is hit; one who needs a wide gap to
-    start and a narrow one to go on is not, and is easier to imitate.
+    A driver who changes their mind with the nose in the lane is hit. A driver who needs a wide gap
+    to start and a narrow one to go on is not, and is easier to imitate.
 
-    Beside the policy, before its action is carried out, a person lets an action pass that leaves a
-    way out and does not stop in the lane. A judge that asked only where the present pedal leads
-    would object to each brisk approach to the stop line, the expert's own, too; but theorem 1 holds
-    only where no optimal policy goes where the human takes over.
+    As a judge it accepts an action that leaves a way out and does not stop in the lane. A judge
+    that only followed the present pedal would object to each brisk approach to the stop line, the
+    expert's own included; but theorem 1 holds only where no optimal policy is taken over from.
     """
 
     HORIZON_S = 6.0
     START_MARGIN_M = 2.5
-    """Room to every car while turning. With 1.5 m the expert is as safe; but its imitators start
+    """Room to every car while turning. With 1.5 m the expert is as safe, but its imitators start
     some tenths of a second early or late, and one in ten touches the car that just passed."""
     KEEP_MARGIN_M = 0.3
     POINT_OF_NO_RETURN_M = 8.0
@@ -128,25 +127,25 @@ class LeftTurnHuman(Expert):
     SIDE_CLEARANCE_M = 0.3  # Room to the sides of a passing car
     GO = PedalPlan(then_mps=CRUISE_MPS)
 
-    HOLD_S = 0.5  # How long the judged pedal is taken to be held: a person's reaction time
+    HOLD_S = 0.5  # Time for which the judged pedal is held: a person's reaction time
     RESCUE_BRAKE = 0.85
-    """Share of the full brake with which the car could then still be stopped in time; the rest is
-    room for a human model."""
+    """Share of the full brake that must then still stop the car in time; the rest is a reserve for
+    a human model."""
     STOP_BY_M = POINT_OF_NO_RETURN_M - 0.5
-    """Path length by which it must then stand; past the point of no return a car can only be driven
-    on, and creeping up to it is not waiting."""
+    """Path length by which the car must then stand; creeping up to the point of no return, past
+    which a car can only drive on, is not waiting."""
     RESCUE_MARGIN_M = 1.0
-    """Room along the lane with which it could then still drive on, at full throttle."""
+    """Room along the lane that must then be left for driving on at full throttle."""
     HESITATION_S = 1.0
-    """How long the judged pedal is taken to be held by a car that would then be in the lane."""
+    """Time for which a car that would then be in the lane holds the judged pedal."""
     CRAWL_MPS = 1.5
-    """A car that would then be slower than this within the lane is stopping there: nobody's plan,
-    since the traffic does not yield."""
+    """A car that would then be slower than this in the lane is stopping there: a fault, since the
+    traffic does not yield."""
     STANDING_MPS = 0.3
-    STANDING_STEPS = 15  # Steps that a car stands before anybody thinks of it as stuck
+    STANDING_STEPS = 15  # Steps after which a standing car counts as waiting
     OPEN_STEPS = 5
-    """Steps that the way must then have been free: a person's reaction time once more."""
-    START_PEDAL = 0.2  # Least throttle that counts as driving on by oneself
+    """Steps for which a waiting car's way must be free before it is stuck: a reaction time."""
+    START_PEDAL = 0.2  # Least throttle that counts as starting by itself
 
     def __init__(self, env: LeftTurnEnv) -> None:
         self.env = env
@@ -154,16 +153,15 @@ class LeftTurnHuman(Expert):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last episode."""
         self.going = False
         self.standing_steps = self.open_steps = 0
 
     def would_go(self) -> bool:
-        """Whether a driver standing here would start now."""
+        """Whether a driver who stands here would start now."""
         return self.crossing.clear(self.HORIZON_S, self.START_MARGIN_M, self.GO)
 
     def act(self, observation: Observation | None = None) -> NDArray[np.float32]:
-        """The expert's pedal, float32 [1]: from the true state, whatever the picture shows."""
+        """Return the expert's pedal, float32 [1], from the true state, not the picture."""
         if self._beyond_return():
             self.going = True
         else:
@@ -181,7 +179,7 @@ class LeftTurnHuman(Expert):
         return min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
 
     def _wait(self) -> float:
-        """Slow down on a speed that falls with the distance to the line, and stand there."""
+        """Slow down with the distance to the line, and stand there."""
         to_line_m = self.env.config.stop_line_m - self.env.distance_m
         wanted_mps = math.sqrt(2.0 * self.APPROACH_MPS2 * max(to_line_m - 0.5, 0.0))
         if wanted_mps == 0.0:
@@ -189,7 +187,7 @@ class LeftTurnHuman(Expert):
         return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)
 
     def wants_control(self, action: NDArray) -> Reason | None:
-        """Why a person would take over from ``action`` now, or None. Once a control period."""
+        """Return why a person would take over from ``action`` now, or None; call it once a step."""
         pedal = float(action[0])
         standing = self.env.ego.speed < self.STANDING_MPS
         self.standing_steps = self.standing_steps + 1 if standing else 0
@@ -204,7 +202,7 @@ class LeftTurnHuman(Expert):
     def may_return(self) -> bool:
         """Whether control can be handed back: not while driving through the lane.
 
-        A human that stands there gives up: a human model might stand there for ever.
+        A human who stands in it hands back, as a human model might stand there for ever.
         """
         standing = self.env.ego.speed < self.STANDING_MPS
         return standing or not self.crossing.in_lane(self.env.distance_m)
@@ -233,9 +231,9 @@ class LeftTurnHuman(Expert):
 
 
 class SlowHuman(LeftTurnHuman):
-    """One who drives slower than the reward asks for.
+    """A human who drives slower than the reward asks for.
 
-    All of its drives arrive, too (40 of 40), after 10.4 s instead of 7.9, with a return of 3.8
+    All of its drives arrive, too (40 of 40), after 10.4 s instead of 7.9 s, with a return of 3.8
     instead of 6.2.
     """
 

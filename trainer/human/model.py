@@ -1,4 +1,4 @@
-"""The DAgger human model of section V: imitates the human from what the human did so far."""
+"""The DAgger human model of section V, which imitates the human's actions so far."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,10 +22,9 @@ REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is r
 class HumanModel(Driver):
     """A regression of the human's action on the picture (eq. 24 to 27).
 
-    Until the first intervention it is what eq. 25 starts from, an untrained policy network (with
-    table A4's one frame); ``learn`` does nothing before there is something to imitate. Then it
-    learns a little after each episode (eq. 27) from all that the human has done so far: data
-    aggregation.
+    Until the first intervention it is an untrained policy network (eq. 25, with table A4's one
+    frame), and ``learn`` does nothing. Then it learns a little after each episode (eq. 27) from all
+    of the human's steps so far: data aggregation.
     """
 
     def __init__(
@@ -46,21 +45,21 @@ class HumanModel(Driver):
 
     @property
     def demonstrations(self) -> int:
-        """How many of the human's steps it has seen."""
+        """Number of the human's steps that it has seen."""
         return len(self._actions)
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
-        """What the human would do, float32 [action size]."""
+        """Predict the human's action, float32 [action size]."""
         return self.actor.act(observation[None])[0]
 
     def add(self, observation: NDArray[Any], action: NDArray[np.float32]) -> None:
-        """Aggregate one step of the human's."""
+        """Add one step of the human's to the data."""
         seen = observation[-self.config.frames :] if self._pictures else observation
         self._observations.append(seen.copy())
         self._actions.append(np.asarray(action, dtype=np.float32))
 
     def learn(self, updates: int) -> float:
-        """Take gradient steps on eq. 26; returns the last loss (nan without demonstrations)."""
+        """Take gradient steps on eq. 26; return the last loss (nan without demonstrations)."""
         if not self._actions:
             return float("nan")
         observations, actions = np.stack(self._observations), np.stack(self._actions)
@@ -75,9 +74,9 @@ class HumanModel(Driver):
         return loss.item()
 
     def refine(self, updates: int) -> Iterator[float]:
-        """Learn on after the last episode, part by part, each at a lower rate; yields the loss.
+        """Learn on after the last episode, part by part; yield each part's loss.
 
-        The rate falls linearly, so that what was learned settles.
+        The learning rate falls linearly from part to part, so that the model settles.
         """
         parts = min(updates, REFINING_PARTS)
         for part in range(parts):
@@ -87,7 +86,7 @@ class HumanModel(Driver):
             yield self.learn(each + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
-        """Write the model to ``directory`` with what it was trained on."""
+        """Write the model to ``directory``, with ``about``, which says on what it was trained."""
         state = {
             "actor": self.actor.state_dict(),
             "frames": self.config.frames,
@@ -99,7 +98,10 @@ class HumanModel(Driver):
 
 
 def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
-    """The network of a HUMAN_DIR and what is known of it; UserError: no human model of ``env``."""
+    """Load a HUMAN_DIR: its network and all else that it holds.
+
+    Raises UserError: it holds no human model of ``env``.
+    """
     path = directory / MODEL_FILE
     state = load_torch(path)
     with util.fitting(f"{path} is not a human model of this project"):

@@ -16,7 +16,7 @@ from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, SHARE, check_ranges
 
 @dataclass(frozen=True)
 class Algorithm:
-    """What one algorithm does with the human. All rows share one training loop and learner."""
+    """How an algorithm uses the human. All rows share one training loop and learner."""
 
     guided: bool = True
     """The human takes over when the trigger says so."""
@@ -29,35 +29,34 @@ class Algorithm:
     human_td_weight: float = 1.0
     """Weight of |delta| in the priority of the human's transitions."""
     separate_buffers: bool = False
-    """The human's transitions and the policy's lie in a buffer each (section VII-A: RD2); from
-    which one is drawn goes by how much there is in each."""
+    """The human's transitions and the policy's lie in a buffer each (section VII-A: RD2); each is
+    drawn from as often as its share of all transitions."""
     advantage_weight: float = 1.0
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
     q_term: bool = True  # The actor climbs the critic (eq. 23, first term)
     rewarded: bool = True
-    """The environment's reward counts. Without it only take-overs count, and all do, even from a
-    car that waits too long."""
+    """The environment's reward counts. Without it only take-overs count, and every one does, even
+    from a car that waits too long."""
     proxy_values: bool = False
-    """The critics are told what the human's action and the overruled one are worth: 1 and -1."""
-    human_share: float = 0.0  # Of each minibatch; 0: what the priorities make of it
+    """The critics learn the values 1 for the human's action and -1 for the overruled one."""
+    human_share: float = 0.0  # Of each minibatch; 0: as the priorities have it
     updates_per_step: int = 1
     asks: float = 0.0
-    """Share of the control periods in which the robot asks for help, since its critics disagree
-    most; 0: the human watches, and takes over by itself."""
+    """Share of the steps, those in which its critics disagree most, in which the robot asks for
+    help; 0: the human watches, and takes over without being asked."""
     foresight: int = 0
-    """Control periods ahead in which the actor learns to prefer the human's action to the overruled
-    one, by a further loss; 0: none."""
+    """Steps ahead in which the actor learns to prefer the human's action to the overruled one, by a
+    further loss; 0: none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters that this row starts from instead of the common ones: its paper's, where
-    ours do not fit what it learns from."""
+    """Hyper-parameters of this row in place of the common ones: its paper's, where ours do not
+    fit."""
 
 
 PHIL = Algorithm()
 IA = replace(PHIL, advantage_weight=0.0)
 UNIFORM = {"alpha": 0.0}
 UNIT_VALUES = {"saturation_weight": 3e-3}
-"""Values lie between -1 and 1, a tenth of what our rewards make, and so does the price that the
-actor weighs against them."""
+"""Q values lie in [-1, 1], a tenth of ours, so the saturation penalty shrinks with them."""
 UNEXPLORED = {"exploration_initial": 0.0, "exploration_final": 0.0}
 FASTER = {"actor_learning_rate": 3e-4}  # Chosen by the tuning (results/choices/rows.csv)
 PVP = Algorithm(
@@ -73,7 +72,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ia_td3": IA,
     "hi_td3": replace(IA, behaviour_cloning=False),
     # The paper does not say whether RD2-TD3 clones; here it does, so that each row differs from
-    # PHIL-TD3 in what figure 13 is about.
+    # PHIL-TD3 only in the subject of figure 13.
     "rd2_td3": replace(IA, separate_buffers=True),
     "rd2_phil": replace(PHIL, separate_buffers=True),
     "per_td3": Algorithm(
@@ -88,8 +87,8 @@ ALGORITHMS: dict[str, Algorithm] = {
     # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning,
     # and so without exploration.
     "cloning_only": replace(IA, q_term=False, settings=UNEXPLORED),
-    # RLIF (2311.12996): -1 where an intervention begins, which here is charged to the action that
-    # the human overruled, and 0 elsewhere.
+    # RLIF (2311.12996): -1 where an intervention begins, here charged to the action that the human
+    # overruled, and 0 elsewhere.
     "rlif_td3": replace(
         IA, behaviour_cloning=False, rewarded=False,
         settings={**UNIT_VALUES, **FASTER, "intervention_penalty": -1.0},
@@ -99,25 +98,24 @@ ALGORITHMS: dict[str, Algorithm] = {
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
     # RLPD (2302.02948) with interventions, after HIL-SERL (2410.21845): no cloning, no penalty.
-    # Layer normalisation in the critics all rows have. Two critics, not ten. If the human prevents
-    # every failure, the critics see none, and rate every action good. One update of the actor a
-    # step.
+    # All rows have layer normalisation in the critics. Two critics, not ten; the actor is updated
+    # once a step. If the human prevents every failure, the critics rate every action good.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
         updates_per_step=2,
         settings={**UNIFORM, **FASTER, "return_steps": 1, "policy_delay": 2},
     ),
-    # Predictive preference learning (2510.01545): in the L = 4 states that the overruled action
-    # would have led to, the human's is the better one. Cloning counts as much. No Q term.
+    # Predictive preference learning (2510.01545): in the L = 4 states to which the overruled action
+    # would have led, the human's is preferred. Cloning counts as much. No Q term.
     "ppl_td3": replace(
         IA, penalty=False, q_term=False, rewarded=False, human_share=0.5, foresight=4,
         settings={
             **UNIFORM, **UNIT_VALUES, **UNEXPLORED, "cloning_weight": 1.0, "preference_beta": 1.0
         },
     ),
-    # The robot asks, with a budget, as in ThriftyDAgger (2109.08273), where the critics disagree;
-    # AIM (2506.09176) has a critic of its own for that. The human watches until 500 doubts are
-    # known, and only what it objected to then is penalised.
+    # The robot asks where its critics disagree, with a budget, as in ThriftyDAgger (2109.08273);
+    # AIM (2506.09176) trains a critic of its own for that. Until 500 doubts are known the human
+    # watches; only its objections of that time are penalised.
     "phil_gated": replace(PHIL, asks=0.05, settings={"cloning_weight": 10.0}),
 }  # fmt: skip
 """Command-line name -> switches. The first six are the paper's, the next six take PHIL-TD3 apart,
@@ -126,7 +124,7 @@ PLUGIN_GROUP = "phil.algorithms"  # Entry points that are rows of their own
 
 
 def find_algorithm(name: str) -> Algorithm:
-    """The row of this name: of the table, of an installed package, or ``module:ROW``.
+    """Return the row of this name: of the table, of an installed package, or ``module:ROW``.
 
     Raises UserError: no such row.
     """
@@ -157,18 +155,18 @@ class LearnerConfig:
     batch_size: int = 128
     """Transitions in a minibatch (table A5: N)."""
     actor_learning_rate: float = 1e-4
-    """Of the actor's optimiser (table A5: 5e-4). Adam's steps are as long for a small gradient as
-    for a large one, and where the actor has little left to learn, its gradient is the critics'
-    error. Five times as fast, it followed that error away from what it had learned."""
+    """Of the actor's optimiser (table A5: 5e-4). Adam takes equally long steps for small gradients
+    and large ones, and once the actor has little left to learn, its gradient is the critics' error.
+    Five times as fast, it followed that error away from what it had learned."""
     critic_learning_rate: float = 1e-3
     """Of the critics' (table A5: 2e-4). Normalised critics learn slower, and an actor should follow
     critics that are ahead of it."""
     learning_rate_decay: float = 1.0
-    """Factor on both learning rates, once an episode (table A5: 0.996). By steps is
+    """Factor on both learning rates, once an episode (table A5: 0.996). A decay by steps is
     fairer: a policy that fails early has many short episodes."""
     learning_rate_final: float = 0.0
-    """Share of both learning rates that is left at the end of the run; they fall to it linearly.
-    The paper's is 1. With rates that stay high, the late policy swings about what it learned."""
+    """Share of both learning rates at the end of the run, to which they fall linearly (the paper:
+    1). With rates that stay high, the late policy swings about what it learned."""
     gamma: float = 0.95
     """Discount factor of one control period (table A5)."""
     return_steps: int = 8
@@ -185,19 +183,18 @@ class LearnerConfig:
     """Bound of that noise; TD3's own value, the paper has none."""
     exploration_initial: float = 0.1
     """Standard deviation of the exploration noise at first (table A5: 1). With 0.3 the congestion
-    is not learned: the noise alone makes the car crash, a return of several steps holds what the
-    noise brought and not what the action was worth, and a human takes over for the noise's sake."""
+    is not learned: the noise alone makes the car crash, a return of several steps measures the
+    noise instead of the action, and a human takes over because of the noise."""
     exploration_correlation: float = 0.9
-    """Correlation of the noise in two control periods in a row; the paper's is 0. A tenth of a
-    second of steering moves the car by nothing that a critic could see, a second of it does: noise
-    that lasts shows what an action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al.,
-    2016)."""
+    """Correlation of the noise in two successive steps (the paper: 0). A critic cannot see what a
+    tenth of a second of steering does, but it sees a second of it: lasting noise shows what an
+    action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al., 2016)."""
     exploration_final: float = 0.05
     """Least standard deviation of the exploration noise (table A5)."""
     exploration_share: float = 0.5
-    """Share of the run in which the deviation falls linearly from the first to the least. By
-    steps, not by episodes: a policy that fails early has many short ones, and would stop exploring
-    before it has learned anything. The paper names no law."""
+    """Share of the run in which the deviation falls linearly from the first to the least, by steps:
+    by episodes, a policy that fails early would stop exploring before it has learned anything. The
+    paper names no law."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -207,8 +204,8 @@ class LearnerConfig:
     priority_offset: float = 1e-3
     """Constant that keeps every transition drawable (table A6: epsilon)."""
     advantage_bound: float = 4.0
-    """Bound of the exponent in the Q advantage. A critic that is off by more than float can take
-    the exponential of would otherwise make one priority infinite."""
+    """Bound of the exponent in the Q advantage. Without it a critic that is far off makes one
+    priority infinite."""
     importance_sampling: bool = False
     """Weigh the critic's losses by eq. 15 and 16, which the paper calls optional."""
     beta: float = 1.0
@@ -220,41 +217,40 @@ class LearnerConfig:
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
     cloning_weight: float = 40.0
-    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen
-    on single runs, in which a small weight let the policy forget the human before the critic knew
-    better."""
+    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen on
+    single runs: with a small weight the policy forgot the human before the critic knew better."""
     preference_beta: float = 0.1
     """How sharply a preference tells two actions apart, per squared distance; the lower, the less
     it minds that the better one is nearer already (2510.01545: beta)."""
     intervention_penalty: float = -10.0
     """What an intervention costs (eq. 17: r_pen = r_fail)."""
     penalty_on: str = "overruled"
-    """What an intervention's penalty is charged to: ``overruled``, the policy's action that made
-    the human take over, whose value it becomes; a return of several steps ends there, too. Or
-    ``human``, the reward of the human's own first action, as printed, which teaches the critic that
-    rescuing is as bad as crashing. The overruled action's error, where it is the larger one, also
-    stands for |delta| in the transition's priority (eq. 21)."""
+    """Which action an intervention's penalty is charged to. ``overruled``: the policy's action that
+    made the human take over; the penalty becomes its value, a return of several steps ends there,
+    and its error, where it is the larger one, stands for |delta| in the transition's priority (eq.
+    21). ``human``: the human's own first action, as printed, which teaches the critic that rescuing
+    is as bad as crashing."""
     action_bound: float = 0.25
-    """Bound of the initial weights with which the action joins the picture in the critics' first
-    connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
-    There the action hardly counts in the value at first, and the actor's gradient is noise."""
+    """Bound of the action's initial weights in the critics' first connected layer. 0: that of one
+    more feature among 1,792 (0.02), as in the paper's networks; the action then hardly counts at
+    first, and the actor's gradient is noise."""
     critic_norm: bool = True
-    """Layer normalisation in the critics (RLPD; Ball et al., 2023). Beside a good human there are
-    few failures to learn from, and without it the critics promise most for actions that nobody
-    has tried: the actor follows, and unlearns what it was shown."""
+    """Layer normalisation in the critics (RLPD; Ball et al., 2023). With a good human there are few
+    failures to learn from, and without it the critics overrate actions that nobody has tried: the
+    actor follows them, and unlearns what it was shown."""
     picture_shift: int = 3
-    """Pixels by which the pictures of a minibatch are shifted at random, up, down and aside, at
-    most (DrQ; Kostrikov et al., 2020); the paper has none. What counts is where cars are to one
-    another, and a network that has seen each picture in many places learns that from fewer."""
+    """Maximum random shift of a minibatch's pictures, up, down and aside, in pixels (DrQ; Kostrikov
+    et al., 2020; the paper has none). Only the cars' places relative to one another count, and
+    shifted pictures teach that with fewer of them."""
     warmup_steps: int = 256
     """Transitions stored before the first update."""
     saturation_weight: float = 0.03
-    """Price on saturation: weight of the mean squared action before tanh in the actor's loss. Not
-    in the paper. Without it the policy saturates before the critic knows anything, and its
-    gradient vanishes."""
+    """Saturation penalty: weight of the mean squared action before tanh in the actor's loss. Not in
+    the paper. Without it the policy saturates before the critic knows anything, and its gradient
+    vanishes."""
     precision: str = "bfloat16"
     """Of the products in convolutions and first connected layers while learning: float32, or
-    bfloat16 where the processor multiplies that faster. Acting is always float32."""
+    bfloat16 where the processor multiplies it faster. Acting is always float32."""
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
@@ -264,11 +260,7 @@ class LearnerConfig:
 
 
 OVERRULED_ACTION, HUMANS_ACTION = "overruled", "human"
-WORDS = {
-    "precision": ("float32", "bfloat16"),
-    "penalty_on": (OVERRULED_ACTION, HUMANS_ACTION),
-}
-"""What each word may be."""
+WORDS = {"precision": ("float32", "bfloat16"), "penalty_on": (OVERRULED_ACTION, HUMANS_ACTION)}
 RANGES = {
     FROM_ONE: ("return_steps", "policy_delay", "warmup_steps"),
     SHARE: ("learning_rate_decay", "learning_rate_final", "gamma", "tau",
@@ -280,7 +272,7 @@ RANGES = {
     (1, 10**9): ("replay_capacity",),
     (0, 20): ("picture_shift",),
 }  # fmt: skip
-"""What these numbers may be; all others are at least 0."""
+"""Ranges of these numbers; all others are at least 0."""
 
 PRINTED_LEARNER = LearnerConfig(
     exploration_initial=1.0,

@@ -2,15 +2,13 @@
 
 Two 6x6 convolutions (6 and 16 filters), each followed by ReLU and 2x2 max pooling, then fully
 connected layers of 256, 128 and 64. Frames come as uint8 and are normalised to [0, 1] (eq. 28)
-inside the network, so that an exported policy needs no preprocessing.
+inside the network, so that an exported policy needs no preprocessing. Observations other than the
+paper's two frames have other features before the same connected layers: pictures of any size those
+of `Convolutions`, numbers themselves, several entries the features of each.
 
-Another observation than the paper's two frames has other features before the same connected
-layers: pictures of any size those of `Convolutions`, numbers themselves, several entries all of
-theirs.
-
-Nearly all products are in the convolutions and in what the first connected layer makes of the
-picture: `Picture`. It follows the ``torch.autocast`` around it, and is computed once a picture for
-all that is asked of it; the rest is small, and always in single precision.
+Nearly all products are in `Picture`: the convolutions and the first connected layer's share of the
+picture. It follows the ``torch.autocast`` around it and is computed once a picture; the rest is
+small, and always in single precision.
 """
 
 import re
@@ -36,8 +34,8 @@ _INSTRUCTIONS = re.compile(r"\b(avx512_bf16|bf16)\b")
 def bfloat16_is_faster(device_type: str) -> bool:
     """Whether ``device_type`` (``cpu``, ``cuda``) multiplies bfloat16 faster than float32.
 
-    On an Intel it takes the matrix unit (AMX): with the vectors' bfloat16 an update took 84 ms, in
-    float32 73 (``results/bench/xeon_threads_1.json`` of revision 25e9c254).
+    An Intel processor needs its matrix unit (AMX) for that: with the vectors' bfloat16 an update
+    took 84 ms, in float32 73 (``results/bench/xeon_threads_1.json`` of revision 25e9c254).
     """
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -49,12 +47,10 @@ def bfloat16_is_faster(device_type: str) -> bool:
 
 
 HIDDEN = (256, 128, 64)
-
-
 FRAMES_SPACE = Box(0, 255, (2, *FRAME), np.uint8)
 """The paper's observation: frames [t-1, t]."""
-UNBOUNDED = 1e6  # A bound beyond this is none: a number is not divided by it
-SMALL_SIDE = 8  # A picture is halved until it is no larger
+UNBOUNDED = 1e6  # A bound beyond this does not scale a number
+SMALL_SIDE = 8  # A picture is halved until its sides are no longer than this
 
 
 def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
@@ -63,22 +59,19 @@ def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
 
 
 def channels_last(shape: tuple[int, ...]) -> bool:
-    """Whether a picture is [rows, columns, channels], and not the channels first."""
+    """Whether a picture is [rows, columns, channels] instead of [channels, rows, columns]."""
     return len(shape) == 3 and shape[2] < shape[0]
 
 
 def tensors(observations: NDArray[Any], device: Any = "cpu") -> list[Tensor]:
-    """The entries of observations [n, ...], in their order, as networks take them."""
+    """Return the entries of observations [n, ...] as networks take them, in their order."""
     names = observations.dtype.names
     parts = [observations[name] for name in names] if names else [observations]
     return [torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in parts]
 
 
 class Trunk(nn.Module):
-    """The two convolutions. Maps frames uint8 [batch, n, 45, 80] to features [batch, 1792].
-
-    Only the newest ``frames`` of them count.
-    """
+    """The two convolutions: the newest ``frames`` of uint8 [batch, n, 45, 80] -> [batch, 1792]."""
 
     features = FEATURES
 
@@ -90,7 +83,6 @@ class Trunk(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, frames: Tensor) -> Tensor:
-        """The features of pictures: by the compiled kernel where there is one."""
         first, second = self.conv1, self.conv2
         assert first.bias is not None
         assert second.bias is not None
@@ -99,7 +91,10 @@ class Trunk(nn.Module):
 
 
 class Convolutions(nn.Module):
-    """3x3 convolutions that halve a picture until it is small; for pictures of any size."""
+    """3x3 convolutions that halve a picture of any size until it is small.
+
+    Maps uint8 [batch, rows, columns], or with channels, to [batch, features].
+    """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__()
@@ -115,7 +110,6 @@ class Convolutions(nn.Module):
         self.features = int(channels * sides[0] * sides[1])
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """[batch, features] from uint8 [batch, rows, columns], or with channels."""
         if pictures.dim() == 3:
             pictures = pictures.unsqueeze(1)
         if self.last:
@@ -124,7 +118,7 @@ class Convolutions(nn.Module):
 
 
 class Numbers(nn.Module):
-    """Numbers of any shape, each brought from its bounds to [-1, 1] where it has some."""
+    """Numbers [batch, ...] of any type to [batch, features], each from its bounds to [-1, 1]."""
 
     middle: Tensor
     reach: Tensor
@@ -139,12 +133,11 @@ class Numbers(nn.Module):
         self.register_buffer("reach", torch.from_numpy((high - low) / 2).float())
 
     def forward(self, numbers: Tensor) -> Tensor:
-        """[batch, features] from [batch, ...] of any type."""
         return (numbers.reshape(-1, self.features).float() - self.middle) / self.reach
 
 
 class Entries(nn.Module):
-    """Features of several entries, one after the other."""
+    """Features [batch, features] of several entries, a tensor each, one after the other."""
 
     def __init__(self, parts: list[Any]) -> None:
         super().__init__()
@@ -152,13 +145,12 @@ class Entries(nn.Module):
         self.features = sum(part.features for part in parts)
 
     def forward(self, *entries: Tensor) -> Tensor:
-        """[batch, features] from a tensor each."""
         seen = zip(self.parts, entries, strict=True)
         return torch.cat([part(entry).float() for part, entry in seen], 1)
 
 
 def make_trunk(space: Space[Any], frames: int) -> Any:
-    """What makes features of an observation: a Box, or a flat Dict of such."""
+    """Make the layers that turn an observation, a Box or a flat Dict of such, into features."""
     if isinstance(space, Dict):
         return Entries([make_trunk(part, frames) for part in space.values()])
     assert isinstance(space, Box)
@@ -168,11 +160,12 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
 
 
 class Picture(nn.Module):
-    """What is seen, as features, and its share of the first connected layer.
+    """The observation's features, and their share of the first connected layer.
 
+    Maps a tensor [batch, ...] for each entry to float32 [batch, 256], before the activation.
     ``frames`` is how many of the newest frames the network sees. The input is always the whole
-    observation, so that every network is run and exported alike.
-    ``more_inputs`` of that layer, beside the features, count in its initial weights.
+    observation, so that every network is run and exported alike. ``more_inputs`` of that layer,
+    beside the features, count in its initial weights.
     """
 
     def __init__(
@@ -187,14 +180,14 @@ class Picture(nn.Module):
         nn.init.uniform_(self.layer.bias, -self.bound, self.bound)
 
     def forward(self, *seen: Tensor) -> Tensor:
-        """float32 [batch, 256], before the activation, from a tensor [batch, ...] an entry."""
         return self.layer(self.trunk(*seen)).float()
 
 
 class Head(nn.Module):
-    """The connected layers after the first one, which ends before its activation.
+    """The connected layers from the first one's activation on: [batch, 256] -> [batch, outputs].
 
-    ``normalised``: each hidden layer is, before its activation.
+    ``normalised``: layer normalisation before each hidden layer's activation. The last layer has no
+    activation.
     """
 
     def __init__(self, outputs: int, normalised: bool = False) -> None:
@@ -207,12 +200,15 @@ class Head(nn.Module):
         self.output = nn.Linear(HIDDEN[-1], outputs)
 
     def forward(self, embedded: Tensor) -> Tensor:
-        """The last layer's values [batch, outputs] from [batch, 256], without an activation."""
         return self.output(self.hidden(embedded))
 
 
 class Actor(nn.Module):
-    """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4)."""
+    """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4).
+
+    Maps frames uint8 [batch, 2, 45, 80], or a tensor for each entry, to actions [batch, n] in
+    [-1, 1].
+    """
 
     def __init__(
         self, action_size: int = 1, frames: int = 2, space: Space[Any] = FRAMES_SPACE
@@ -222,14 +218,11 @@ class Actor(nn.Module):
         self.head = Head(action_size)
 
     def forward(self, *seen: Tensor) -> Tensor:
-        """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80], or a tensor an
-        entry.
-        """
         return torch.tanh(self.head(self.picture(*seen)))
 
     @torch.no_grad()
     def act(self, observations: NDArray[Any]) -> NDArray[np.float32]:
-        """Actions float32 [batch, n] in [-1, 1] for observations [batch, ...]."""
+        """Return actions float32 [batch, n] in [-1, 1] for observations [batch, ...]."""
         seen = tensors(observations, self.head.output.weight.device)
         return self(*seen).cpu().numpy()
 
@@ -237,9 +230,9 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """The value Q(s, a) (table A2): the action joins the picture's features.
 
-    ``frames`` is how many of the newest it sees, ``action_bound`` that of the action's initial
-    weights (0: as one more feature among 1,792). ``normalised``: the picture's share of the first
-    connected layer, and each hidden layer, have mean 0 and variance 1 (layer normalisation).
+    ``frames`` is how many of the newest frames it sees, ``action_bound`` the bound of the action's
+    initial weights (0: as one more feature among 1,792). ``normalised``: layer normalisation of the
+    picture's share of the first connected layer, and of each hidden layer.
     """
 
     def __init__(
@@ -259,12 +252,12 @@ class Critic(nn.Module):
         self.head = Head(1, normalised)
 
     def value(self, embedded: Tensor, action: Tensor) -> Tensor:
-        """Q, shape [batch], from what ``picture`` gave [batch, 256] and actions [batch, n]."""
+        """Return Q [batch] from the output of ``picture`` [batch, 256] and actions [batch, n]."""
         return self.head(self.norm(embedded) + self.action(action)).squeeze(1)
 
 
 class CriticPair(nn.Module):
-    """The two critics of TD3, whose smaller value is believed. Arguments as ``Critic``'s."""
+    """The two critics of TD3, whose smaller value counts; with the arguments of ``Critic``."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__()
@@ -273,5 +266,4 @@ class CriticPair(nn.Module):
 
     @property
     def pair(self) -> tuple[Critic, Critic]:
-        """Both, in order."""
         return self.first, self.second

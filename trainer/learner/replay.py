@@ -1,8 +1,8 @@
 """The prioritised human-demonstration replay buffer (section IV-C, table A6).
 
-One buffer for what the policy and what the human did (eq. 10, 19). Each picture is stored once:
-a transition points at three of them, so 100,000 transitions take 380 MB instead of 1.4 GB. Of
-other observations it points at two.
+One buffer holds the policy's and the human's transitions (eq. 10, 19). Each picture is stored once:
+a transition points at three of them, so 100,000 transitions take 380 MB instead of 1.4 GB. Of other
+observations it points at two.
 """
 
 from __future__ import annotations
@@ -20,22 +20,20 @@ Observation = NDArray[Any]
 Indices = NDArray[np.int64]
 
 
-class Layout(NamedTuple):
+class ReplayLayout(NamedTuple):
     """How an observation lies in an array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]  # Of several entries: a structured one
     stacked: bool = False
-    """It is [older, newer], and its newer half is the older one of the next observation."""
+    """The observation is [older, newer], and its newer half is the next one's older half."""
 
 
-FRAMES_LAYOUT = Layout((2, 45, 80), np.dtype(np.uint8), stacked=True)
+FRAMES_LAYOUT = ReplayLayout((2, 45, 80), np.dtype(np.uint8), stacked=True)
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
-COLUMNS = (
-    "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
-)  # fmt: skip
-"""What is kept of a transition beside its pictures."""
+COLUMNS = ("actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities")
+"""Arrays of a transition's fields, beside its pictures."""
 AHEAD = "foreseen_"  # Prefix of the foreseen buffer's keys in a checkpoint
 
 
@@ -65,7 +63,7 @@ class Batch:
     frames: NDArray[Any]  # s, [n, 2, 45, 80], or [n, ...] of another layout
     actions: NDArray[np.float32]  # a, the action that was carried out, [n, action size]
     rewards: NDArray[np.float32]  # r after shaping: the discounted sum over ``spans`` steps, [n]
-    next_frames: NDArray[Any]  # s' after those steps, likewise
+    next_frames: NDArray[Any]  # s' after those steps, shaped as ``frames``
     terminals: NDArray[np.float32]
     """1 where s' ends the episode for good, or the policy's action in s' is overruled and
     penalised; a timeout is not terminal, [n]."""
@@ -74,32 +72,33 @@ class Batch:
     """p(i), the probability with which each was drawn (eq. 20), [n]."""
     spans: NDArray[np.int64]  # Steps from s to s', [n]
     overruled: NDArray[np.float32]
-    """What the policy would have done where the human acted, else the action, [n, action size]."""
-    penalised: NDArray[np.bool_]  # Whether the overruled action is (eq. 17), [n]
+    """The policy's action where the human acted, else the action, [n, action size]."""
+    penalised: NDArray[np.bool_]  # Whether the overruled action is penalised (eq. 17), [n]
     foreseen: Batch | None = None
-    """A second batch, whose ``next_frames`` are what overruled actions would have led to."""
+    """A second batch, whose ``next_frames`` overruled actions would have led to."""
 
 
 class ReplayBuffer:
     """A ring of transitions, drawn in proportion to priority ** alpha.
 
     Pictures and transitions have running numbers, and a ring of slots each. A transition is
-    forgotten with the oldest of its pictures. An observation that is not stacked is a picture.
+    forgotten with the oldest of its pictures. An observation that is not stacked counts as one
+    picture.
 
     Args:
         capacity: transitions kept (table A6: 1e5).
         action_size: length of an action.
         alpha: priority scaling factor (eq. 20).
-        separate: draw from the human's transitions and from the policy's apart, from each as
-            often as its share of all (section VII-A: RD2).
-        steps: rewards that a drawn transition sums up, at most (n of n-step returns).
+        separate: draw the human's transitions and the policy's separately, each kind as often as
+            its share of all (section VII-A: RD2).
+        steps: maximum number of rewards that a drawn transition sums up (n of n-step returns).
         gamma: their discount factor.
-        overruled_value: what a penalised action is worth, if a sum that reaches one is to end with
-            it; None: a sum goes on with what the human did instead.
+        overruled_value: value of a penalised action, with which a sum that reaches one ends; None:
+            the sum goes on with the human's action.
         layout: of the observations.
-        human_share: share of the human's among what is drawn, once there are both kinds, which
-            are then drawn apart; 0: not fixed.
-        foresees: keep what overruled actions would have led to, and draw as many from it.
+        human_share: share of the human's transitions in a minibatch once there are both kinds,
+            which are then drawn separately; 0: not fixed.
+        foresees: also keep, and draw, the observations to which overruled actions would have led.
     """
 
     def __init__(
@@ -111,7 +110,7 @@ class ReplayBuffer:
         steps: int = 1,
         gamma: float = 1.0,
         overruled_value: float | None = None,
-        layout: Layout = FRAMES_LAYOUT,
+        layout: ReplayLayout = FRAMES_LAYOUT,
         human_share: float = 0.0,
         foresees: bool = False,
     ) -> None:
@@ -148,16 +147,16 @@ class ReplayBuffer:
 
     @property
     def _used(self) -> int:
-        """Slots that hold or held a transition."""
+        """Number of slots that hold or held a transition."""
         return min(self.added, self.capacity)
 
     @property
     def human_count(self) -> int:
-        """How many of the kept transitions are the human's."""
+        """Number of the human's transitions that are not forgotten."""
         return int(self._human[self.alive].sum())
 
     def mean_priorities(self) -> tuple[float, float]:
-        """Mean priority of the policy's and of the human's transitions (nan where none)."""
+        """Return the mean priorities of the policy's and the human's transitions (nan: none)."""
         alive = self.alive
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
@@ -213,12 +212,12 @@ class ReplayBuffer:
         return batch
 
     def _draw(self, count: int, random: np.random.Generator) -> Indices:
-        # Stratified: one from each of `count` equal parts.
+        # Stratified: one draw from each of `count` equal parts.
         strata = (np.arange(count) + random.random(count)) / count
         weights, human = self._weights[: self._used], self._human[: self._used]
         if not self._apart:
             return _find(weights, strata)
-        # Over both kinds: each gets its share of the samples, to one.
+        # Strata over both kinds: each kind gets its share of the samples, to within one.
         policys_share = 1.0 - self._humans_share()
         policys = strata[strata < policys_share] / policys_share
         humans = (strata[strata >= policys_share] - policys_share) / (1.0 - policys_share)
@@ -235,7 +234,7 @@ class ReplayBuffer:
         self._weights[indices] = priorities**self.alpha
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on, without the unused part of the arrays."""
+        """Return the state to resume from, without the unused part of the arrays."""
         columns = {name: getattr(self, f"_{name}")[: self._used] for name in COLUMNS}
         ahead = {} if self._foreseen is None else self._foreseen.state_dict()
         named = {f"{AHEAD}{name}": value for name, value in ahead.items()}
@@ -244,7 +243,7 @@ class ReplayBuffer:
             "frames_added": self._frames_added,
             "oldest": self._oldest,
             "frame_ids": self._frame_ids[: self._used],
-            # Bytes: a checkpoint knows no structured array.
+            # Bytes: a checkpoint holds no structured arrays.
             "pictures": self._pictures[: self._frames_added].view(np.uint8),
             **columns,
             **named,
@@ -259,7 +258,7 @@ class ReplayBuffer:
         self._current = None
         for name in COLUMNS:
             getattr(self, f"_{name}")[: self._used] = state[name]
-        # What was here before must not be drawn any more.
+        # Earlier contents must not be drawn any more.
         self._weights[:] = 0.0
         self.update_priorities(self.alive, self._priorities[self.alive])
         if self._foreseen is not None:
@@ -285,14 +284,14 @@ class ReplayBuffer:
     def _returns(
         self, indices: Indices
     ) -> tuple[NDArray[np.float32], Indices, NDArray[np.float32], NDArray[np.int64]]:
-        """The n-step returns, without their bootstrap, that begin with these transitions.
+        """Sum up the n-step returns that begin with these transitions, without their bootstrap.
 
-        In the order: rewards, the transitions that they end with, 1 where nothing is to be
-        bootstrapped from, and how many steps they sum up; [n] each.
+        Returns, [n] each: the sums, the transitions that they end with, 1 where there is nothing to
+        bootstrap from, and the number of steps.
 
-        A sum ends early where the episode does, for good or by a timeout, and at the newest step.
-        It ends for good, too, at an overruled action that is penalised: what the human did there
-        instead, and came to, is not what the policy's actions before it were worth.
+        A sum ends early at the episode's end, terminal or a timeout, and at the newest step. At an
+        overruled action that is penalised it ends without a bootstrap: the human's action there,
+        and its result, say nothing of the policy's actions before.
         """
         sums: NDArray[np.floating] = self._rewards[indices]
         lasts = indices
@@ -326,24 +325,24 @@ class ReplayBuffer:
         return np.where(human[indices], share * humans, (1.0 - share) * policys)
 
     def _humans_share(self) -> float:
-        """Of what is drawn, where the two kinds are drawn apart."""
+        """The human's share of a minibatch where the two kinds are drawn separately."""
         there = self.human_count / len(self)
         return self.human_share if self.human_share and 0.0 < there < 1.0 else there
 
     def _frames(self, slots: Indices, first: int) -> NDArray[Any]:
-        """What each transition began with (``first`` is 0) or led to (1), [n, 2, 45, 80]."""
+        """Gather s (``first`` is 0) or s' (1) of each transition, [n, 2, 45, 80]."""
         pictures = slice(first, first + 2) if self._stacked else first
         return self._pictures[self._frame_ids[slots, pictures] % self._frame_slots]
 
     def _follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
-        """Whether each transition begins with the picture that another ended with, [n].
+        """Whether each ``following`` begins with the picture that its transition ended with, [n].
 
-        Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
+        Pictures have running numbers, so none of another episode does, nor a forgotten transition.
         """
         return self._frame_ids[slots, -1] == self._frame_ids[following, -2]
 
     def _add_picture(self, picture: NDArray[Any]) -> int:
-        """Store a picture; returns its number. Forgets transitions whose picture it replaces."""
+        """Store a picture, forget transitions whose picture it replaces, and return its number."""
         number = self._frames_added
         self._frames_added += 1
         self._pictures[number % self._frame_slots] = picture
@@ -358,7 +357,7 @@ class ReplayBuffer:
 
 
 def _find(weights: NDArray[np.float64], shares: NDArray[np.float64]) -> Indices:
-    """The indices in whose part of the sum of all weights the shares (0 to below 1) fall."""
+    """Find the indices in whose part of the weights' sum the shares (from 0, below 1) fall."""
     sums = np.cumsum(weights)
     found = np.searchsorted(sums, shares * sums[-1], side="right")
     return np.minimum(found, np.searchsorted(sums, sums[-1]))  # Rounding may lead beyond the last.

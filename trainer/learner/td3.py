@@ -1,7 +1,7 @@
 """The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time.
 
-``trainer/tests/test_reference.py`` has the same written plainly; here each network embeds a picture
-once.
+Each network embeds a picture once; ``trainer/tests/test_reference.py`` has the same algorithm
+written plainly.
 """
 
 import copy
@@ -23,7 +23,7 @@ from trainer.learner.replay import Batch
 
 
 class Losses(NamedTuple):
-    """What one update reports; ``priorities`` are the batch's new ones (eq. 21)."""
+    """Figures of one update; ``priorities`` are the batch's new ones (eq. 21)."""
 
     critic_loss: float
     policy_loss: float
@@ -33,7 +33,7 @@ class Losses(NamedTuple):
 
 
 def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
-    """Whether an intervention costs the action that was overruled, and not the human's (eq. 17)."""
+    """Whether an intervention's penalty goes to the overruled action, not the human's (eq. 17)."""
     return algorithm.penalty and config.penalty_on == OVERRULED_ACTION
 
 
@@ -42,7 +42,7 @@ OPTIMISERS = ("actor_optimiser", "critic_optimiser")
 
 
 def _values(critics: networks.CriticPair, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
-    """Q_1 and Q_2, each [n], from pictures that both critics have embedded."""
+    """Return Q_1 and Q_2, each [n], from the pictures that the two critics have embedded."""
     pairs = zip(critics.pair, pictures, strict=True)
     return [critic.value(picture, actions) for critic, picture in pairs]
 
@@ -50,9 +50,8 @@ def _values(critics: networks.CriticPair, pictures: list[Tensor], actions: Tenso
 class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
-    Both losses are taken at the same weights, before either optimiser steps: a picture is then
-    embedded once for each network and shared by every term that needs it. ``seed`` is that of the
-    initial weights and of the smoothing noise.
+    Both losses are computed before either optimiser steps, so that every term shares one embedding
+    of a picture by each network. ``seed`` is that of the initial weights and the smoothing noise.
     """
 
     def __init__(
@@ -87,19 +86,19 @@ class TD3Learner:
                 group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
-        # bfloat16 has 8 bits: enough for pixels, too few for numbers.
+        # bfloat16 has 8 bits of precision: enough for pixels, too few for numbers.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
 
     @torch.no_grad()
     def doubt(self, frames: NDArray[Any], action: NDArray[np.float32]) -> float:
-        """How much the two critics differ about an action in one observation: |Q_1 - Q_2|."""
+        """Return |Q_1 - Q_2|, the critics' disagreement about an action in one observation."""
         seen, actions = tensors(frames[None], self.device), self._tensor(action[None])
         one, other = (critic.value(critic.picture(*seen), actions) for critic in self.critics.pair)
         return float((one - other).abs())
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
-        """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""
+        """Take one step of algorithm 1 on a minibatch; ``beta`` is eq. 15's exponent."""
         c = self.config
         self.updates += 1
         with_policy = self.updates % c.policy_delay == 0
@@ -130,16 +129,11 @@ class TD3Learner:
         self.critic_optimiser.step()
         if with_policy:
             self._update_targets()
-        return Losses(
-            critic_loss.item(),
-            policy.item(),
-            cloning.item(),
-            value.item(),
-            priorities.double().cpu().numpy(),
-        )
+        critics, actor, clone, mean = (one.item() for one in (critic_loss, policy, cloning, value))
+        return Losses(critics, actor, clone, mean, priorities.double().cpu().numpy())
 
     def decay_learning_rates(self, progress: float) -> None:
-        """Once an episode (table A5); ``progress`` is the share of the run that is over."""
+        """Decay both rates after an episode (table A5); ``progress`` is the share of the run."""
         c = self.config
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
         for optimiser in (self.actor_optimiser, self.critic_optimiser):
@@ -148,18 +142,19 @@ class TD3Learner:
                 group["lr"] = group["decayed_lr"] * left
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, optimisers, noise and counters: all that a resumed run needs."""
+        """Return weights, optimisers, noise and counters: all that a resumed run needs."""
         parts = {name: getattr(self, name).state_dict() for name in (*NETWORKS, *OPTIMISERS)}
         return {**parts, "noise": self.noise.get_state(), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
+        """Restore a ``state_dict``."""
         for name in (*NETWORKS, *OPTIMISERS):
-            # A copy, because optimisers keep the very tensors that they are given.
+            # A copy, because optimisers keep the tensors that they are given.
             getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
         for weights, kept in chain(*(getattr(self, name).state.items() for name in OPTIMISERS)):
             if not kept["exp_avg"].shape == kept["exp_avg_sq"].shape == weights.shape:
-                raise ValueError("an optimiser's state is of other weights")  # torch does not look
+                # torch does not check.
+                raise ValueError("an optimiser's state is of other weights")
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 
@@ -173,9 +168,9 @@ class TD3Learner:
         return torch.from_numpy(column).to(self.device)
 
     def _shift(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """Each picture [n, 2, 45, 80] a few pixels aside; its border is repeated.
+        """Shift each picture [n, 2, 45, 80] at random by a few pixels, repeating its border.
 
-        At most an eighth of a picture's shorter side. Numbers stay as they are.
+        By at most an eighth of a picture's shorter side. Numbers stay as they are.
         """
         if frames.dtype.names:
             moved = frames.copy()
@@ -218,7 +213,7 @@ class TD3Learner:
     def _critic_loss(
         self, batch: Batch, pictures: list[Tensor], actions: Tensor, targets: Tensor, beta: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Both critics' loss, the errors [n] that priorities go by, and the mean value."""
+        """Return both critics' loss, the errors [n] for the priorities, and the mean value."""
         c, human = self.config, self._tensor(batch.human)
         weights = equations.importance_weights(
             self._tensor(batch.probabilities).float(), beta, c.normalise_importance
@@ -236,7 +231,7 @@ class TD3Learner:
                 for value in overruled
             )
             loss = loss + first + second
-            # The larger of the two actions' errors sets the row's priority.
+            # The larger of the two actions' errors decides the row's priority.
             missed = (c.intervention_penalty - overruled[0].detach()) * penalised
             errors = torch.where(missed.abs() > errors.abs(), missed, errors)
         if self.algorithm.proxy_values and batch.human.any():
@@ -248,7 +243,7 @@ class TD3Learner:
     def _actor_losses(
         self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The two terms of eq. 23, unweighted; without cloning the first is over all samples."""
+        """Return eq. 23's two terms, unweighted; without cloning the first has all samples."""
         row, nothing = self.algorithm, torch.zeros((), device=self.device)
         cloned, policy = row.behaviour_cloning, nothing
         if row.q_term:
@@ -259,7 +254,7 @@ class TD3Learner:
         return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
-        """Loss that prefers the human's action in what the overruled one would have led to."""
+        """Prefer the human's action in the states to which the overruled one would have led."""
         seen = tensors(self._shift(foreseen.next_frames), self.device)
         with self._precision():
             picture = self.actor.picture(*seen)
@@ -276,13 +271,13 @@ class TD3Learner:
         human: Tensor,
         own_actions: Tensor,
     ) -> Tensor:
-        """Eq. 21; the target critic looks only at the human's samples, the only ones that count."""
+        """Return eq. 21's priorities; the target critic evaluates only the human's samples."""
         c, row = self.config, self.algorithm
         advantage = torch.zeros_like(errors)
         looked_at = human.nonzero()[:, 0]
         if row.advantage_weight and len(looked_at):
             critic = self.target_critics.first
-            # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
+            # Copies picture by picture; [looked_at] copies byte by byte, 25 times as slow.
             with self._precision():
                 picture = critic.picture(*(entry.index_select(0, looked_at) for entry in seen))
             advantage[looked_at] = equations.q_advantage(
@@ -295,24 +290,21 @@ class TD3Learner:
 
     @torch.no_grad()
     def _update_targets(self) -> None:
-        for online, target in (
-            (self.actor, self.target_actor),
-            (self.critics, self.target_critics),
-        ):
-            torch._foreach_lerp_(
-                list(target.parameters()), list(online.parameters()), self.config.tau
-            )
+        pairs = (self.actor, self.target_actor), (self.critics, self.target_critics)
+        for online, target in pairs:
+            moved: list[Tensor] = list(target.parameters())
+            torch._foreach_lerp_(moved, list[Tensor](online.parameters()), self.config.tau)
 
 
 def _differentiate(loss: Tensor, module: torch.nn.Module) -> None:
-    """Set the gradients of one module's parameters, and of no other's."""
+    """Set the gradients of this module's parameters only."""
     parameters = list(module.parameters())
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
         parameter.grad = gradient
 
 
 def _calculate_exactly() -> None:
-    """Float32 products in full, and the same every time: a resumed run must equal one unbroken."""
+    """Make float32 products exact and deterministic: a resumed run equals an unbroken one."""
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
     torch.backends.cudnn.deterministic = True

@@ -1,7 +1,6 @@
-"""The coach: what a person's guidance has come to, what is typical, and one line of advice.
+"""The coach: what a person's guidance has achieved, what is typical, and one line of advice.
 
-It draws nothing and drives nothing: the loop tells it of episodes and of the policy alone, and the
-page shows what it says.
+The loop tells it of episodes and of validations of the policy alone; the page shows the rest.
 """
 
 import json
@@ -11,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.report import failed
+from bridge.outcomes import failed
 from edge_runtime.util import counted
 from trainer.training.metrics import LEARNED as LEVELS
 from trainer.training.metrics import is_reached, was_validated
@@ -22,8 +21,8 @@ RECENT = 10  # Episodes that are listed, and that the advice looks at
 TOO_LATE_S = 2.0  # A failure so soon after a take-over says that it came too late
 LATE_ONES = 3  # So many recent failures, alone or after a late take-over, make the coach say so
 NEEDLESS_ONES, NEEDLESS_SHARE = 3, 2.0 / 3.0
-"""At least so many recent episodes with take-overs, and this share of them, must be ones that the
-policy alone masters, to say that they were needless."""
+"""At least so many recent episodes with take-overs, and this share of them, must be mastered by the
+policy alone, to say that the take-overs were needless."""
 TYPICAL_FILE = Path(__file__).parent / "typical.json"
 
 Curve = list[tuple[float, float]]
@@ -31,7 +30,7 @@ Curve = list[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Episode:
+class SittingEpisode:
     """One episode of a sitting."""
 
     number: int
@@ -50,7 +49,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Coaching:
-    """What is shown of the coach."""
+    """What the page shows of the coach."""
 
     advice: str  # Empty where there is none
     said: str  # What the person has given; empty where there is nothing to hold it against
@@ -58,7 +57,7 @@ class Coaching:
     curve: Curve
     typical: Curve  # Of a scripted human with the same algorithm; empty where none is known
     human_s: float  # How far along the curves the person is
-    episodes: list[Episode]  # The newest last
+    episodes: list[SittingEpisode]  # The newest last
 
 
 class Coach:
@@ -66,7 +65,7 @@ class Coach:
 
     def __init__(self, typical: Curve | None = None, learning: bool = False) -> None:
         self.typical, self.learning = typical or [], learning
-        self.episodes: deque[Episode] = deque(maxlen=RECENT)
+        self.episodes: deque[SittingEpisode] = deque(maxlen=RECENT)
         self.curve: Curve = []
         self.checking = False  # Whether the policy alone is being validated
         self._mastered: Mapping[int, bool] = {}
@@ -78,16 +77,16 @@ class Coach:
             human_s = int(row["human_steps"]) * period_s
             given_s += human_s
             known = int(row["episode"]), row["outcome"], human_s, int(row["interventions"])
-            self.episodes.append(Episode(*known))
+            self.episodes.append(SittingEpisode(*known))
             if was_validated(row):
                 self.curve.append((given_s, float(row["validation_success"])))
 
     def to_check(self) -> list[int]:
-        """The recent episodes in which the person took over: does the policy master them alone?"""
+        """List the recent episodes with take-overs: does the policy master them alone?"""
         return [episode.number for episode in self.episodes if episode.takeovers]
 
     def take(self, human_s: float, success: float, mastered: Mapping[int, bool]) -> None:
-        """The policy was validated as it stood when the person had given so much.
+        """Take the validation of the policy as it stood when the person had driven ``human_s``.
 
         ``mastered``: an episode that was to be checked -> whether it reached the goal alone.
         """
@@ -95,34 +94,35 @@ class Coach:
         self._mastered = mastered
 
     def show(self, cost: Mapping[str, float]) -> Coaching | None:
-        """What is to be shown; None where there is nothing yet. ``cost`` as ``Sitting.cost``."""
+        """Return what to show; None where there is nothing yet. ``cost`` as ``Sitting.cost``."""
         if not self.learning and not self.episodes:
             return None
         alone = self.curve[-1][1] if self.curve else None
         known = ([] if alone is None else [f"{alone:.0%}"]) + ["checking"] * self.checking
         compared = bool(known or self.typical)
-        advice = advise(list(self.episodes), alone, self._mastered) if self.learning else ""
+        episodes = list(self.episodes)
         return Coaching(
-            advice=advice,
+            advice=advise(episodes, alone, self._mastered) if self.learning else "",
             said=said(cost, self.curve, self.typical) if compared else "",
             alone=", ".join(known),
             curve=[(round(x, 1), round(y, 3)) for x, y in self.curve],
             typical=self.typical,
             human_s=cost["human_s"],
-            episodes=list(self.episodes),
+            episodes=episodes,
         )
 
 
-def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[int, bool]) -> str:
-    """One line of advice: of the first rule that fits, empty where none does.
+def advise(
+    episodes: Sequence[SittingEpisode], alone: float | None, mastered: Mapping[int, bool]
+) -> str:
+    """Return one line of advice, by the first rule that fits; an empty text where none does.
 
     ``alone`` is the newest success of the policy alone, 0 to 1, where it is known; ``mastered``:
     episode -> whether the policy alone reaches the goal in it today.
     """
-    if alone is not None and is_reached(WELL, alone):
-        return f"The policy alone reaches {alone:.0%}: you may stop here."
     if alone is not None and is_reached(LEARNED, alone):
-        return f"The policy alone reaches {alone:.0%}: watch only."
+        what = "you may stop here" if is_reached(WELL, alone) else "watch only"
+        return f"The policy alone reaches {alone:.0%}: {what}."
     late = sum(episode.unattended for episode in episodes)
     if late >= LATE_ONES:
         return (
@@ -139,24 +139,24 @@ def advise(episodes: Sequence[Episode], alone: float | None, mastered: Mapping[i
 
 
 def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
-    """What the person has given so far; after how much of it the policy alone had learned, and
-    after how much of a scripted human's.
+    """Say what the person has given so far, and after how much of it the policy alone had learned.
+
+    Beside it stands how much a scripted human had given by then.
     """
     given = (
         f"{cost['human_s']:.0f} s at the wheel, {counted(int(cost['takeovers']), 'take-over')}, "
         f"{counted(int(cost['failures']), 'failure')}."
     )
-    after = {
-        whose: next((human_s for human_s, success in its if is_reached(LEARNED, success)), None)
-        for whose, its in (("you", curve), ("a scripted human", typical))
-    }
-    known = ((who, human_s) for who, human_s in after.items() if human_s is not None)
-    there = [f"after {human_s:.0f} s of {who}" for who, human_s in known]
+    there = [
+        f"after {reached[0]:.0f} s of {who}"
+        for who, points in (("you", curve), ("a scripted human", typical))
+        if (reached := [human_s for human_s, success in points if is_reached(LEARNED, success)])
+    ]
     return f"{given} The policy alone: {LEARNED:.0%} {', '.join(there)}." if there else given
 
 
 def typical_curve(scenario: str, algorithm: str) -> Curve:
-    """The curve of a scripted human's ordinary run; empty where none is known.
+    """Return the curve of a scripted human's ordinary run; empty where none is known.
 
     ``python -m trainer experiment typical`` makes the file from the experiments' records.
     """

@@ -20,9 +20,9 @@ import numpy as np
 from mcap.stream_reader import MAGIC_SIZE
 from numpy.typing import NDArray
 
+from bridge.outcomes import DISCARDED
 from bridge.record import close_torn, new_recording_at
 from bridge.recording import Recording
-from bridge.report import DISCARDED
 from edge_runtime.util import UserError
 from trainer.human.model import HumanModel
 from trainer.person.interface import Amount, Control, vector

@@ -7,11 +7,11 @@ import math
 import time
 from typing import Any
 
-from bridge.report import DISCARDED, RESTARTED, STOPPED, failed, settled
+from bridge.outcomes import DISCARDED, RESTARTED, STOPPED, failed, settled
 from edge_runtime.util import counted
 from trainer.human.guide import BY_PERSON, Guide, GuideGone, Intervention
 from trainer.learner.replay import Action, Observation, Transition
-from trainer.person.coach import Coach, Episode
+from trainer.person.coach import Coach, SittingEpisode
 from trainer.person.interface import Amount, Control, Person, Reading, View, amount, vector
 from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.person.takeover import Intent, TakeOver
@@ -67,7 +67,7 @@ class Sitting(Guide):
         self.stop = self.closed = False
         self.episode = 0  # The number of the episode, or of the next one
         self.progress = ""
-        self.driven: list[Episode] = []  # In this sitting
+        self.driven: list[SittingEpisode] = []  # In this sitting
         self.ended: list[str] = []  # How each episode of the run ended
         self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
@@ -166,7 +166,7 @@ class Sitting(Guide):
         self.cost["failures"] = sum(map(failed, settled(self.ended)))
         since_s = (self._step - self._taken_over_at) * period_s
         human_s = self._human_steps * period_s
-        self.driven.append(Episode(self.episode, outcome, human_s, self._takeovers, since_s))
+        self.driven.append(SittingEpisode(self.episode, outcome, human_s, self._takeovers, since_s))
         self.coach.episodes.append(self.driven[-1])
         self.episode += 1
         return outcome

@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import torch
 from numpy.typing import NDArray
 
-from bridge.report import GOAL, EpisodeResult
+from bridge.outcomes import GOAL
+from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.util import counted
 from trainer.drivers import TogetherDriver

@@ -1,6 +1,6 @@
 """The browser cockpit (``--human web``): a small page behind a token, a WebSocket for each page.
 
-A thread of its own serves it; the loop only hands over. ``Seat`` decides which page drives.
+A thread of its own serves it; the loop only hands views over. ``Seat`` decides which page drives.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,9 +40,12 @@ from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
 TOKEN_BYTES = 16
-MAX_INPUT_BYTES = 1024  # A page's message is not longer: with 16 actions it is half of this
+MAX_INPUT_BYTES = 1024  # Of a page's message, which is half as long with 16 actions
 KEEP_ALIVE_S = 10.0  # How long a connection stays open for another request
-LOGGER = logging.getLogger(__name__)
+MAX_CONNECTIONS = 32  # A page opens some six for its files, and keeps one
+HEADERS_S = 5.0  # A connection must show the token within this time
+BACKLOG = 16
+"""Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE = ("0.0.0.0", "::")
 SOMEWHERE = ("192.0.2.1", 9)  # RFC 5737: no machine has this address
@@ -58,23 +61,14 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """The address holds the token: no browser may keep it, pass it on, or frame the page."""
+NO_PAGE = "no such page\n"
 NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
 NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
-Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
-MAX_CONNECTIONS = 32  # A page opens some six for its files, and keeps one
-HEADERS_S = 5.0  # A connection must show the token within this time
-BACKLOG = 16
-"""Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
-
-
-def _is_ours(record: logging.LogRecord) -> bool:
-    """Whether it is an error of the cockpit's, and not of a client that speaks no HTTP to it."""
-    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
-
-
-LOGGER.addFilter(_is_ours)
+LOGGER = logging.getLogger(__name__)
+# A client that speaks no HTTP is no error of the cockpit's.
+LOGGER.addFilter(lambda told: not isinstance((told.exc_info or [None] * 3)[1], HttpProcessingError))
 
 
 def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
@@ -112,10 +106,10 @@ class Page:
 
 
 class Cockpit:
-    """A person in a browser.
+    """A person in a browser; UserError where the address cannot be listened on.
 
-    The loop's thread calls what is public; it only hands over, in microseconds. Everything else
-    runs in the server's thread. Raises UserError where the address cannot be listened on.
+    The loop's thread calls the public methods, which take microseconds. Everything else runs in
+    the server's thread.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
@@ -143,8 +137,9 @@ class Cockpit:
         self._thread.start()
 
     def one_time_url(self) -> str:
-        """The address to start a browser with. It leads on to the cockpit for one request only:
-        every user of this machine can read the command line of a browser.
+        """Return an address that leads on to the cockpit for one request only.
+
+        Every user of this machine can read it in the command line of the browser that it starts.
         """
         self._one_time_token = secrets.token_urlsafe(TOKEN_BYTES)
         return self.url.replace(self._token, self._one_time_token)
@@ -155,11 +150,11 @@ class Cockpit:
         return self.seat.is_heard(time.monotonic())
 
     def poll(self, now_s: float) -> Reading:
-        """What the driving page said last; nothing, if that is half a second ago."""
+        """Return what the driving page said last; hands off if that is half a second ago."""
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
-        """Show the newest view to every page."""
+        """Show a view to every page, unless the next one overtakes it."""
         self._shown += 1
         self._tell(self._take_view, self._shown, view)
 
@@ -202,34 +197,30 @@ class Cockpit:
             page.wake.set()
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
-        given, slash, name = request.path.partition("/")[2].partition("/")
-        status, text = 404, "no such page\n"
+        given, slash, name = request.path[1:].partition("/")
         if not self._is_asked_by_name(request):
-            status, text = 421, NO_NAME
-        elif self._one_time_token and hmac.compare_digest(
-            given.encode(), self._one_time_token.encode()
-        ):
+            return _refusal(421, NO_NAME)
+        if self._one_time_token and _is_same(given, self._one_time_token):
             self._one_time_token = ""
             raise web.HTTPFound(f"/{self._token}/", headers=HEADERS)
-        elif not hmac.compare_digest(given.encode(), self._token.encode()):
-            status, text = 403, NO_TOKEN
-        else:
-            self._door.has_token(request.transport)
-            if name == "socket":
-                return await self._talk(request)
-            if not slash:  # The page's own files stand beside it only behind the slash.
-                raise web.HTTPFound(request.path + "/", headers=HEADERS)
-            name = name or "index.html"
-            if name in self._files:
-                kind, body = TYPES[name.rpartition(".")[2]], self._files[name]
-                return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
-        refusal = web.Response(status=status, text=text, headers=HEADERS)
-        refusal.force_close()
-        return refusal
+        if not _is_same(given, self._token):
+            return _refusal(403, NO_TOKEN)
+        self._door.has_token(request.transport)
+        if name == "socket":
+            return await self._talk(request)
+        if not slash:  # The page's own files stand beside it only behind the slash.
+            raise web.HTTPFound(request.path + "/", headers=HEADERS)
+        name = name or "index.html"
+        if name not in self._files:
+            return _refusal(404, NO_PAGE)
+        kind, body = TYPES[name.rpartition(".")[2]], self._files[name]
+        return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
 
     def _is_asked_by_name(self, request: web.BaseRequest) -> bool:
-        """Whether the request names this machine. Another site's name may resolve to it, too: a
-        page from there would be of the same origin (DNS rebinding).
+        """Whether the request names this machine.
+
+        Another site's name may resolve to it, too: a page from there would be of the same origin
+        (DNS rebinding).
         """
         try:
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname
@@ -261,7 +252,7 @@ class Cockpit:
         return socket
 
     async def _hear(self, page: Page) -> WSCloseCode:
-        """Hear a page until it goes, falls silent, or says what no page of ours says."""
+        """Hear a page until it goes, falls silent, or sends what no page of ours sends."""
         while True:
             try:
                 message = await page.socket.receive(timeout=GONE_S)
@@ -298,6 +289,16 @@ class Cockpit:
                     await page.socket.send_str(message)
 
 
+def _is_same(given: str, token: str) -> bool:
+    return hmac.compare_digest(given.encode(), token.encode())
+
+
+def _refusal(status: int, text: str) -> web.Response:
+    response = web.Response(status=status, text=text, headers=HEADERS)
+    response.force_close()
+    return response
+
+
 def _listen(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -317,10 +318,10 @@ def _encode(kind: str, **fields: Any) -> str:
 
 
 def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
-    """View ``number``, from 1; ``hints`` say what to press for what, one line each.
+    """Encode view ``number``, from 1; ``hints`` say what to press for what, one line each.
 
-    ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show; ``picture`` is
-    base64 of a JPEG.
+    ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` base64 of a JPEG; ``ground`` is the
+    part to show.
     """
     left_m, top_m = _corner(view.scene or {})
     frames = None if view.frames is None else view.frames.tobytes()
@@ -334,17 +335,13 @@ def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
 
 
 def _corner(scene: Mapping[str, Any]) -> tuple[float, float]:
-    """Where the ground shown begins, m: as the scene says, or so that a car that has left it is
-    in the middle.
-    """
+    """Where the ground shown begins, m: as the scene says, or so that the ego car is on it."""
     left_m, top_m = scene.get("view", VIEW)
-    ego = next((car for car in scene.get("vehicles", ()) if car.get("ego")), None)
-    if "view" in scene or ego is None:
-        return left_m, top_m
-    x, y = ego["x"], ego["y"]
-    if 0.0 <= x - left_m <= WIDTH_M and 0.0 <= y - top_m <= HEIGHT_M:
-        return left_m, top_m
-    return x - WIDTH_M / 2, y - HEIGHT_M / 2
+    for car in scene.get("vehicles", ()):
+        inside = 0.0 <= car["x"] - left_m <= WIDTH_M and 0.0 <= car["y"] - top_m <= HEIGHT_M
+        if car.get("ego") and "view" not in scene and not inside:
+            return car["x"] - WIDTH_M / 2, car["y"] - HEIGHT_M / 2
+    return left_m, top_m
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:
@@ -354,9 +351,9 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 
 def lan_address(host: str) -> str:
-    """The address by which others in this network find a server that listens on ``host``.
+    """Return the address at which others in this network reach a server that listens on ``host``.
 
-    With several networks it is that of the way to the internet; nothing is sent.
+    With several networks it is that of the route to the internet; nothing is sent.
     """
     if host not in EVERYWHERE:
         return host
@@ -386,32 +383,31 @@ def _page_files(phone_url: str | None, actions: int) -> dict[str, bytes]:
 
 
 class Door(web.Server):
-    """Limits the connections. Until one has shown the token, it is a stranger.
+    """Limits the connections. Until a connection has shown the token, it is a stranger.
 
     At the limit, the oldest stranger is cut off; where there is none, the newcomer.
     """
 
-    def __init__(self, handler: Handler, **options: Any) -> None:
+    def __init__(self, handler: Any, **options: Any) -> None:
         super().__init__(handler, **options)
         self._inside: dict[asyncio.Transport, asyncio.TimerHandle] = {}
         """Open connections, oldest first, and the timer that cuts off a stranger."""
 
     def has_token(self, transport: asyncio.Transport | None) -> None:
-        """A connection has shown the token: it may stay."""
+        """Let a connection that has shown the token stay."""
         if transport in self._inside:
             self._inside[transport].cancel()
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Called for each newcomer."""
-        for gone in [each for each in self._inside if each.is_closing()]:
-            self._inside.pop(gone).cancel()
-        strangers = (each for each, timer in self._inside.items() if not timer.cancelled())
-        if len(self._inside) >= MAX_CONNECTIONS and (longest := next(strangers, None)):
-            self._inside.pop(longest).cancel()
-            longest.abort()
+        """Take in a newcomer, or cut it off."""
+        self._inside = {one: timer for one, timer in self._inside.items() if not one.is_closing()}
         if len(self._inside) >= MAX_CONNECTIONS:
-            transport.abort()
-            return
+            strangers = (one for one, timer in self._inside.items() if not timer.cancelled())
+            leaving = next(strangers, transport)
+            leaving.abort()
+            if leaving is transport:
+                return
+            del self._inside[leaving]
         super().connection_made(handler, transport)
         loop = asyncio.get_running_loop()
         self._inside[transport] = loop.call_later(HEADERS_S, transport.abort)

@@ -5,12 +5,11 @@ from typing import Literal
 from gymnasium.envs.registration import register, registry
 
 Scene = Literal["nominal", "variant", "dense"]
-"""The trained scene; one with more vehicles and other types of them (section VII-D); one whose
-traffic stands closer and leaves less to do right."""
+"""The trained scene; one with more and other vehicles (section VII-D); one with denser traffic."""
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario name on the command line -> gymnasium id."""
 LEFT_TURN, CONGESTION = SCENARIOS.values()
-"""What the entry points of the group ``phil.scenarios`` name."""
+"""For the entry points of the group ``phil.scenarios``."""
 _CLASSES = {
     "phil/LeftTurn-v0": "trainer.scenarios.left_turn:LeftTurnEnv",
     "phil/Congestion-v0": "trainer.scenarios.congestion:CongestionEnv",

@@ -26,7 +26,7 @@ from trainer.scenarios.traffic import TrafficVehicle
 
 @dataclass(frozen=True)
 class CongestionConfig(ScenarioConfig):
-    """Every number of the scenario, with its reason."""
+    """Numbers of the scenario, each with its reason."""
 
     scaled = "steer_weight"
     max_steps: int = 300  # At 4 m/s the goal takes 200
@@ -41,22 +41,21 @@ class CongestionConfig(ScenarioConfig):
     """Its heading: at the edges of this range the wheels held straight lead 4 m aside."""
     ego_speed_mps: Range = (4.0, 6.0)  # Initial speed of the ego car
     desired_speed_mps: float = 6.0
-    """Target of the IDM on the ego car's pedals (section VI-A), and of the cars behind others."""
+    """Target of the IDM on the ego car's pedals (section VI-A), and of cars with a leader."""
     brake_mps2: float = 4.0
-    """Deceleration of the ego car at most; what the brake of a safe stop does."""
+    """Maximum deceleration of the ego car, also of a safe stop."""
     traffic_speed_mps: Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
     jam_speed_mps: Range = (4.5, 5.5)  # Speed of the whole jam
     lane_speed_mps: Range = (-0.5, 0.5)
-    """How much faster than the jam each lane's first car is. Lanes that drifted apart at 2 m/s
-    would leave the ego car alone before half of the way."""
+    """Speed of each lane's first car relative to the jam. Lanes that drifted apart at 2 m/s would
+    leave the ego car alone before half of the way."""
     side_cars: int = 3
     """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
     cars_behind: int = 1
-    """In the ego car's lane. They follow it as one of them; cars in other lanes never react to
-    it."""
+    """In the ego car's lane; they follow it. Cars in other lanes never react to it."""
     traffic_mix: traffic.Mix = traffic.CARS_ONLY
     side_front_m: Range = (9.0, 13.0)
-    """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
+    """Distance to each neighbouring lane's first car, centre to centre."""
     gap_m: Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
     ahead_gap_m: Range = (4.0, 9.0)  # From the ego car to the one ahead of it
     time_gap_factor: float = 0.5  # Share of a vehicle's usual time gap that is kept in the jam
@@ -64,18 +63,18 @@ class CongestionConfig(ScenarioConfig):
     """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
     ego car in mid-lane, in the variant 1.1 m."""
     steer_weight: float = 0.1
-    """Scale of the steering term: this times the change of the action, which costs (eq. 32 is
-    printed without the minus sign that its text demands). With gamma 0.95 and 10 Hz the horizon is
-    2 s. A correction (the action out, across and back, 2 in all) costs 0.2; the crash that it
-    avoids is worth -3.6 seen 20 steps ahead and -0.8 seen 50 ahead, so correcting early pays. With
-    weight 1 it would pay to wait for the last second; worse, trembling at random (2/3 a step) would
-    cost 13 in discounted sum, and an early crash, which is -10, would be the best policy of a
-    beginner. With 0.1 trembling costs 1.3: felt, and never worth a crash."""
+    """Cost of a unit change of the action (eq. 32 is printed without the minus sign that its text
+    demands). With gamma 0.95 and 10 Hz the horizon is 2 s. A correction (the action out, across and
+    back, 2 in all) costs 0.2; the crash that it avoids is worth -3.6 seen 20 steps ahead and -0.8
+    seen 50 ahead, so correcting early pays. With weight 1 waiting for the last second would pay;
+    worse, random trembling (2/3 a step) would cost 13 in discounted sum, and an early crash, which
+    is -10, would be a beginner's best policy. With 0.1 trembling costs 1.3: felt, and never worth a
+    crash."""
     metres_per_pixel: float = 0.375
     view_behind_m: float = 12.0
-    """The picture shows 30 m x 16.9 m of ground, all three lanes. It moves along the road with the
-    ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
-    movement between the two frames is their speed relative to the ego car's."""
+    """The picture shows 30 m x 16.9 m of ground with all three lanes. It moves along the road with
+    the ego car, and neither turns nor moves aside: place and heading show as they are, and other
+    cars' movement between the two frames shows their speed relative to the ego car's."""
 
 
 SCENES: dict[Scene, CongestionConfig] = {
@@ -105,7 +104,7 @@ REACH_M = 200.0  # How far the road goes on before start and goal
 def spawn_traffic(
     road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[TrafficVehicle]:
-    """Surround the ego car: cars ahead of it, beside it and behind it."""
+    """Surround the ego car with cars ahead, beside and behind."""
     jam_mps = float(random.uniform(*config.jam_speed_mps))
     cars: list[TrafficVehicle] = []
     for lane in range(LANES):
@@ -118,7 +117,7 @@ def spawn_traffic(
         if lane == EGO_LANE and config.cars_behind:
             own[1].leader = ego
         traffic.equip(own, types, config.time_gap_factor)
-        # The first of a lane goes with the jam, the others would go faster if they could.
+        # A lane's first car goes with the jam; the others would go faster if they could.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
     for car in cars:
@@ -129,7 +128,7 @@ def spawn_traffic(
 def _side_lane(
     config: CongestionConfig, random: np.random.Generator
 ) -> tuple[list[traffic.VehicleType], list[float]]:
-    """The vehicles of a neighbouring lane, and where they are."""
+    """Draw a neighbouring lane's vehicles, and their places along it in m."""
     types = traffic.draw_types(config.traffic_mix, config.side_cars, random)
     x = [float(random.uniform(*config.side_front_m))]
     for ahead, behind in itertools.pairwise(types):
@@ -140,7 +139,7 @@ def _side_lane(
 def _own_lane(
     config: CongestionConfig, random: np.random.Generator
 ) -> tuple[list[traffic.VehicleType], list[float]]:
-    """One car ahead of the ego car; those behind follow the ego car as one of theirs."""
+    """Draw the ego lane's vehicles and places, one ahead; those behind follow the ego car."""
     types = traffic.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
     nose_m = 0.5 * EgoVehicle.LENGTH
     x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
@@ -152,8 +151,9 @@ def _own_lane(
 
 
 class CongestionEnv(DrivingEnv):
-    """Congestion as a gymnasium environment; the action is the steering angle (eq. 29), negative
-    to the left, in shares of ``lambda_rad``.
+    """Congestion as a gymnasium environment.
+
+    The action is the steering angle (eq. 29) in shares of ``lambda_rad``, negative to the left.
     """
 
     scenario = "congestion"
@@ -182,7 +182,7 @@ class CongestionEnv(DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """The IDM sets the throttle, no action does; the action +1 turns right."""
+        """The IDM, not the action, sets the throttle; the action +1 turns right."""
         c = self.config
         return {
             "throttle_mps2": traffic.CAR.acceleration_mps2,
@@ -211,7 +211,6 @@ class CongestionEnv(DrivingEnv):
         return self._report()
 
     def scene(self) -> dict[str, Any]:
-        """What a viewer needs to draw the scene; plain lists and numbers."""
         c = self.config
         start_m, end_m = -40.0, c.goal_m + 60.0
         line_y = [(lane - 0.5 * LANES) * c.lane_width_m for lane in range(1, LANES)]
@@ -280,6 +279,6 @@ class CongestionEnv(DrivingEnv):
         return "timeout" if self.steps >= self.config.max_steps else None
 
     def _reward(self, outcome: str | None) -> float:
-        """Eq. 32: goal, failure, and the cost of changing the steering."""
+        """Rate goal, failure, and the change of the steering (eq. 32)."""
         change = abs(self._steering - self._last_steering)
         return -self.config.steer_weight * change + self._ending_reward(outcome)

@@ -1,4 +1,4 @@
-"""What the scenarios share: the ego car, spaces, the two frames, and what a step reports."""
+"""The base of the scenarios: the ego car, spaces, the two frames, and the report of a step."""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ FAILURES = ("collision", "off_road")
 
 @dataclass(frozen=True)
 class ScenarioConfig:
-    """The numbers that every scenario has."""
+    """Numbers of every scenario."""
 
     control_period_s: float = 0.1  # Control interval of all vehicles (section VI-A)
     max_steps: int = 200  # Steps until the episode is cut off as a timeout
@@ -35,7 +35,7 @@ class ScenarioConfig:
     scaled: ClassVar[str]  # The field that scales the third term of the reward
 
     def with_printed_reward(self) -> Self:
-        """The same with eq. 31 or 32 as it is printed, but for the latter's sign."""
+        """Return a copy with eq. 31 or 32 as it is printed, but for the latter's sign."""
         change: dict[str, Any] = {self.scaled: 1.0}
         return replace(self, **change)
 
@@ -43,8 +43,8 @@ class ScenarioConfig:
 class EgoVehicle(Vehicle):
     """The controlled car. Traffic never looks for it, and so never yields.
 
-    It moves by ``highway_env.vehicle.kinematics.Vehicle.step``; what is added is a speed that
-    stays within ``[0, max_speed_mps]`` and the accelerations of the last step.
+    It moves as highway-env's ``Vehicle``; besides, its speed stays within ``[0, max_speed_mps]``,
+    and it keeps the accelerations of the last step.
     """
 
     MAX_STEERING_RAD = math.pi / 4
@@ -58,33 +58,33 @@ class EgoVehicle(Vehicle):
     ) -> None:
         """Hold an acceleration and a front-wheel angle for one step.
 
-        The step's mean acceleration is bounded so that the speed stays in range: a pressed
-        brake holds a standing car instead of driving it backwards.
+        The mean acceleration is bounded so that the speed stays in range: a pressed brake holds a
+        standing car instead of driving it backwards.
         """
         before_mps, before_rad = self.speed, self.heading
         lowest, highest = -self.speed / dt_s, (max_speed_mps - self.speed) / dt_s
         self.action["acceleration"] = min(max(acceleration_mps2, lowest), highest)
         self.action["steering"] = steering_rad
         self.step(dt_s)
-        # A plain float again: arithmetic on numpy's scalars is many times slower.
+        # A plain float: arithmetic on numpy's scalars is many times slower.
         self.heading = float(self.heading)
         self.speed = min(max(self.speed, 0.0), max_speed_mps)
         self.longitudinal_acceleration_mps2 = (self.speed - before_mps) / dt_s
         self.lateral_acceleration_mps2 = self.speed * (self.heading - before_rad) / dt_s
 
     def on_state_update(self) -> None:
-        """No lane look-up: the planned path says where the car is."""
+        """Skip the lane look-up: the planned path says where the car is."""
 
 
 class DrivingEnv(gymnasium.Env[Observation, Action]):
     """A scenario as a gymnasium environment.
 
-    Observation: uint8 [2, 45, 80], frames [t-1, t]. Action: float32 [1] in [-1, 1]. ``info``:
+    Observation: uint8 [2, 45, 80], frames [t-1, t]. Action: float32 [1] in [-1, 1]. ``info`` holds
     ``distance_m``, ``speed_mps``, the accelerations of the step and, at the end, ``outcome``.
 
     A scenario builds its road (``_build``), places its vehicles (``_place``), moves them in
-    ``step`` (``_move``) and says whether it has ended (``_outcome``), and what a step is worth
-    (``_reward``); ``_frame`` is what is seen.
+    ``step`` (``_move``), says whether the episode has ended (``_outcome``) and rates a step
+    (``_reward``); ``_frame`` draws the policy's picture.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
@@ -121,20 +121,20 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self._build()
 
     def expert(self) -> Any:
-        """The scripted human: ``act()`` drives, ``wants_control(action)`` says when and why."""
+        """Make the scripted human; ``wants_control(action)`` says when and why it takes over."""
         return resolve_name(self.expert_class)(self)
 
     def render(self) -> NDArray[np.uint8]:
-        """The scene from above for a person, uint8 [height, width, 3]."""
+        """Draw the scene from above for a person, uint8 [height, width, 3]."""
         return draw_scene(self.scene(), self.frames, self._caption())
 
     @property
     def car(self) -> dict[str, float]:
-        """What a robot needs in the car's place: the fields of ``edge_runtime.manifest.Car``."""
+        """The fields of ``edge_runtime.manifest.Car``, for a robot in the car's place."""
         raise NotImplementedError
 
     def scene(self) -> dict[str, Any]:
-        """What a viewer needs to draw the scene; plain lists and numbers."""
+        """Describe the scene for viewers, in plain lists and numbers."""
         raise NotImplementedError
 
     def reset(
@@ -142,7 +142,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; the seed alone decides traffic and the ego car's start.
 
-        Option ``standing``: the ego car is at rest, as a robot is that starts an episode.
+        Option ``standing``: the ego car is at rest, as a robot is at an episode's start.
         """
         super().reset(seed=seed)
         self.road = Road(network=self.network, np_random=self.np_random)
@@ -154,27 +154,26 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         return self.frames.copy(), self._info(None)
 
     def _build(self) -> None:
-        """Make what is the same in all episodes: network, rasteriser."""
+        """Make the network and the rasteriser, which all episodes share."""
         raise NotImplementedError
 
     def _place(self) -> None:
-        """Put the ego car and the traffic on the road, in an order that keeps what seeds mean."""
+        """Put the ego car and the traffic on the road, always drawing in the same order."""
         raise NotImplementedError
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        """What the policy sees now, uint8 [45, 80]: from the footprints of ego car and traffic."""
+        """Draw the policy's picture, uint8 [45, 80], from the footprints of ego car and traffic."""
         return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
-        """How the episode has ended, or None; from the same footprints."""
+        """Return how the episode has ended, or None, from the same footprints."""
         raise NotImplementedError
 
     def _reward(self, outcome: str | None) -> float:
-        """The reward of the step."""
         raise NotImplementedError
 
     def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
-        """Move all vehicles by one control period, the ego car as it is told."""
+        """Move all vehicles by one step, the ego car as told."""
         for car in self.traffic:
             car.act()
         for car in self.traffic:
@@ -184,7 +183,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.steps += 1
 
     def _report(self) -> Step:
-        """What ``step`` returns, after the vehicles have moved."""
+        """Return the result of ``step``, after the vehicles have moved."""
         ego, cars = self._footprints()
         self.frames[0] = self.frames[1]
         self.frames[1] = self._frame(ego, cars)
@@ -197,13 +196,13 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         return footprint(self.ego), [footprint(car) for car in self.traffic]
 
     def _ending_reward(self, outcome: str | None) -> float:
-        """Goal and failure: the first two terms of eq. 31 and 32."""
+        """Return the terms of goal and failure, the first two of eq. 31 and 32."""
         if outcome == "goal":
             return self.config.goal_reward
         return self.config.fail_reward if outcome in FAILURES else 0.0
 
     def _vehicles(self) -> list[dict[str, Any]]:
-        """The scene's vehicles, the ego car first."""
+        """Describe the scene's vehicles, the ego car first."""
         cars: list[EgoVehicle | TrafficVehicle] = [self.ego, *self.traffic]
         return [
             dict(zip(BODY, footprint(car), strict=True))

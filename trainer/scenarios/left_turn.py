@@ -56,7 +56,7 @@ class LeftTurnPath:
         self.centre_y = self.start_y - straight_m
 
     def pose(self, s_m: float) -> Pose:
-        """The pose at arc length ``s_m`` (metres)."""
+        """Return the pose at arc length ``s_m``."""
         on_arc_m = s_m - self.straight_m
         if on_arc_m <= 0.0:
             return Pose(self.start_x, self.start_y - s_m, -0.5 * math.pi)
@@ -69,7 +69,7 @@ class LeftTurnPath:
         return Pose(self.centre_x - beyond_m, self.centre_y - self.radius_m, -math.pi)
 
     def project(self, x: float, y: float) -> tuple[float, float]:
-        """The nearest point of the path: its arc length and the offset to its right, metres."""
+        """Return the arc length of the nearest point of the path, and the offset to its right."""
         if y >= self.centre_y:
             return self.start_y - y, x - self.start_x
         if x <= self.centre_x:
@@ -80,13 +80,13 @@ class LeftTurnPath:
         return self.straight_m + angle * self.radius_m, math.hypot(dx, dy) - self.radius_m
 
     def curvature(self, s_m: float) -> float:
-        """Signed curvature at ``s_m``, 1/m; negative is a left turn (headings are clockwise)."""
+        """Return the curvature at ``s_m``, 1/m; negative in a left turn (headings: clockwise)."""
         return -1.0 / self.radius_m if 0.0 < s_m - self.straight_m <= self.arc_m else 0.0
 
 
 @dataclass(frozen=True)
 class LeftTurnConfig(ScenarioConfig):
-    """Every number of the scenario, with its reason where there is one."""
+    """Numbers of the scenario, each with its reason where there is one."""
 
     scaled = "speed_weight"
     lane_width_m: float = 4.0
@@ -94,7 +94,7 @@ class LeftTurnConfig(ScenarioConfig):
     turn_radius_m: float = 6.0
     goal_m: float = 21.0  # Path length from start to goal
     stop_line_m: float = 6.0
-    """Where a waiting car stands; its nose is then 1.5 m short of the main road."""
+    """Place of a waiting car; its nose is then 1.5 m short of the main road."""
     ego_speed_mps: Range = (3.0, 5.0)  # Initial speed of the ego car
     max_speed_mps: float = 6.0
     throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
@@ -106,15 +106,15 @@ class LeftTurnConfig(ScenarioConfig):
     first_car_m: Range = (2.0, 12.0)
     """Distance of the first car before the middle of the crossing: too near to turn before it."""
     short_gap_m: Range = (10.0, 16.0)
-    """A gap nobody can use, centre to centre (of cars; longer vehicles keep the room between)."""
-    long_gap_m: Range = (32.0, 42.0)  # A gap that a driver who is ready can use
+    """A gap too short for anybody, centre to centre of cars; longer vehicles keep the room."""
+    long_gap_m: Range = (32.0, 42.0)  # A gap long enough for a driver who is ready
     long_gap_share: float = 0.5  # How often a gap is a long one
     target_speed_mps: float = 5.0  # Target of the reward's speed term (eq. 31).
     speed_weight: float = 0.02
-    """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: seen from the stop
-    line the goal, 30 steps off, is worth 10 x 0.95^30 = 2.1, a crash 15 steps off -4.6, waiting
-    for ever -100 x this weight. The literal weight 1 makes an early crash the best policy; below
-    0.046 waiting for ever is better than crashing, and 0.02 leaves a margin."""
+    """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: from the stop line the
+    goal, 30 steps off, is worth 10 x 0.95^30 = 2.1, a crash 15 steps off -4.6, and waiting for ever
+    -100 x this weight. The literal weight 1 makes an early crash the best policy; below 0.046
+    waiting for ever is better than crashing, and 0.02 leaves a margin."""
     view_left_m: float = -30.0
     view_top_m: float = -6.0
     metres_per_pixel: float = 0.5
@@ -126,11 +126,10 @@ SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
     # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
     "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=traffic.MIXED, max_steps=300),
-    # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
-    # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between
-    # them the two cars' speeds decide, and a policy that only ever met gaps up to 16 m and from
-    # 32 m on has to have learned more than to tell these apart. Half of the range is such
-    # near-ties, a third cannot be used.
+    # A longer queue whose gaps all come from one range, neither clearly long nor clearly short. The
+    # scripted expert takes no gap under 16 m and every gap over 25 m; between them the two cars'
+    # speeds decide, so a policy that has only met gaps up to 16 m and from 32 m on must have
+    # learned more than to tell those apart. Half of the range is such near-ties, a third unusable.
     "dense": LeftTurnConfig(
         traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
     ),
@@ -151,7 +150,7 @@ class LeftTurnEnv(DrivingEnv):
     scenes = SCENES
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
-    """The action that stops the car: what a simulator applies when commands stop."""
+    """The action that stops the car; a simulator applies it when commands stop."""
 
     def _build(self) -> None:
         c = self.config
@@ -174,7 +173,7 @@ class LeftTurnEnv(DrivingEnv):
 
     @property
     def car(self) -> dict[str, float]:
-        """Its full steering is the path control's limit: no action of the left turn steers."""
+        """Full steering is the path control's limit: no action of the left turn steers."""
         c = self.config
         return {
             "throttle_mps2": c.throttle_mps2,
@@ -194,11 +193,10 @@ class LeftTurnEnv(DrivingEnv):
         return self._report()
 
     def _steering_rad(self) -> float:
-        """PI control of the front wheels along the planned path (section VI, auxiliary functions).
+        """Steer along the planned path by PI control (section VI, auxiliary functions).
 
         The proportional part acts on heading error and lateral offset, the integral part on the
-        offset; the path's curvature is fed forward, so that the feedback only has to take up what
-        the kinematic model leaves over.
+        offset; the path's curvature is fed forward.
         """
         ego, limit, dt_s = self.ego, INTEGRAL_LIMIT_MS, self.config.control_period_s
         self._integral_ms = min(max(self._integral_ms + self._offset_m * dt_s, -limit), limit)
@@ -215,10 +213,9 @@ class LeftTurnEnv(DrivingEnv):
         return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
 
     def pedal_for_speed(self, speed_mps: float) -> float:
-        """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.
+        """Return the pedal in [-1, 1] that brings the car closest to this speed in one step.
 
-        For a simulator that follows a real vehicle: what is missed now is made up for later, so
-        that errors do not add up.
+        A simulator that follows a real vehicle uses it; errors do not add up.
         """
         c = self.config
         wanted_mps2 = (speed_mps - self.ego.speed) / c.control_period_s
@@ -226,7 +223,6 @@ class LeftTurnEnv(DrivingEnv):
         return min(max(pedal, -1.0), 1.0)
 
     def scene(self) -> dict[str, Any]:
-        """What a viewer needs to draw the scene; plain lists and numbers."""
         c = self.config
         far_m = 40.0
         path = [self.path.pose(0.1 * i * c.goal_m / 2) for i in range(21)]
@@ -275,7 +271,7 @@ class LeftTurnEnv(DrivingEnv):
         return "timeout" if self.steps >= self.config.max_steps else None
 
     def _reward(self, outcome: str | None) -> float:
-        """Eq. 31: goal, failure, and the distance to the target speed."""
+        """Rate goal, failure, and the distance to the target speed (eq. 31)."""
         c = self.config
         speed_term = -c.speed_weight * abs(self.ego.speed - c.target_speed_mps)
         return speed_term + self._ending_reward(outcome)

@@ -1,8 +1,8 @@
 """Pictures of a scene: the 45x80 grey values that the policy sees, and a larger one for people.
 
-Both show oriented rectangles. In the policy's, a pixel's value is the class of what covers it,
-mixed by the covered area: a car that moves by a tenth of a pixel changes the picture, so two frames
-show speed (eq. 28 stacks two). A picture takes tens of microseconds.
+Both show oriented rectangles. A pixel of the policy's has the values of the classes that cover it,
+mixed by area: a car that moves by a tenth of a pixel changes the picture, so two frames show speed
+(eq. 28 stacks two). A picture takes tens of microseconds.
 """
 
 import math
@@ -28,7 +28,7 @@ class Rectangle(NamedTuple):
 
 
 def corners(rectangle: Rectangle) -> NDArray[np.float64]:
-    """The four corners in order, shape [4, 2], metres."""
+    """Return the four corners in order, shape [4, 2], metres."""
     x, y, heading, length, width = rectangle
     cos, sin = math.cos(heading), math.sin(heading)
     along = np.array([0.5, 0.5, -0.5, -0.5]) * length
@@ -81,17 +81,17 @@ class Rasteriser:
         self._up_to_traffic = (TRAFFIC - self.background).astype(np.float64)
 
     def frame(self, traffic: list[Rectangle], ego: Rectangle) -> NDArray[np.uint8]:
-        """One frame of the observation, uint8 [45, 80]; the ego car on top."""
+        """Draw one frame of the observation, uint8 [45, 80], with the ego car on top."""
         picture = self._with_traffic(traffic)
         self.draw(picture, ego, EGO)
         return (picture + 0.5).astype(np.uint8)
 
     def _with_traffic(self, cars: list[Rectangle]) -> NDArray[np.float32]:
-        """The background with the cars on it, float32 [45, 80].
+        """Draw the cars on the background, float32 [45, 80].
 
-        What a car parallel to the rows covers is a row of shares times a column of them. Where no
-        two cars share a pixel, one matrix product adds up what all of them cover, and gives the
-        same bits as drawing one after another.
+        A car parallel to the rows covers a row of shares times a column of shares. Where no two
+        cars share a pixel, one matrix product adds all of them, with the same bits as drawing one
+        after another.
         """
         if cars and all(car.heading == 0.0 for car in cars):
             shapes = np.array(cars)[:, :, None]
@@ -105,7 +105,7 @@ class Rasteriser:
         return picture
 
     def draw(self, picture: NDArray[np.float32], shape: Rectangle, value: float) -> None:
-        """Blend one rectangle into ``picture`` [45, 80], weighted by the area it covers."""
+        """Blend a rectangle into ``picture`` [45, 80], weighted by the area it covers."""
         cos, sin = math.cos(shape.heading), math.sin(shape.heading)
         pixel_m = self.metres_per_pixel
         reach_x = 0.5 * (abs(cos) * shape.length + abs(sin) * shape.width) + pixel_m
@@ -130,14 +130,14 @@ class Rasteriser:
     def _covered(
         self, offset_m: NDArray[np.floating], side_m: float | NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """How much of a pixel lies between two sides, by its offset from their middle."""
+        """Return how much of a pixel lies between two sides, by its offset from their middle."""
         share = (0.5 * side_m - np.abs(offset_m)) / self.metres_per_pixel + 0.5
         # np.clip costs more than the arithmetic on arrays this small.
         return np.minimum(np.maximum(share, 0.0), 1.0)
 
 
 def _product(axes: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Each car's row times its column, given [n, 2, 80], summed over the cars: [45, 80]."""
+    """Sum up each car's row times its column: [n, 2, 80] -> [45, 80]."""
     columns, rows = axes[:, 0], axes[:, 1, :ROWS]
     product: NDArray[np.floating] = rows.T @ columns
     return product
@@ -153,9 +153,7 @@ BODY = ("x", "y", "heading_rad", "length_m", "width_m")
 
 
 def draw_scene(
-    scene: dict[str, Any],
-    frames: NDArray[np.uint8] | None = None,
-    caption: str = "",
+    scene: dict[str, Any], frames: NDArray[np.uint8] | None = None, caption: str = ""
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
@@ -204,7 +202,7 @@ def draw_scene(
 
 
 def _dashes(road: Sequence[Sequence[float]], skip_m: float) -> Iterator[list[list[float]]]:
-    """A line dashed every 2 m, leaving out what is nearer to the origin than ``skip_m``."""
+    """Dash a line every 2 m, except nearer to the origin than ``skip_m``."""
     start, end = np.array(road[0]), np.array(road[-1])
     length_m = float(np.hypot(*(end - start)))
     for start_m in np.arange(0.0, length_m, 4.0):
@@ -214,7 +212,7 @@ def _dashes(road: Sequence[Sequence[float]], skip_m: float) -> Iterator[list[lis
 
 
 def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:
-    """What the policy sees, enlarged, in the lower left corner: the older frame first."""
+    """Paste the policy's frames, enlarged, into the lower left corner, the older first."""
     scale, margin = 2.3, 12
     size = (int(frames.shape[2] * scale), int(frames.shape[1] * scale))
     top = image.height - size[1] - margin

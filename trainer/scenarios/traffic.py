@@ -1,7 +1,7 @@
-"""Surrounding traffic: its types of vehicles, and highway-env's IDM, which keeps its lane.
+"""Surrounding traffic: types of vehicles, and highway-env's IDM within a lane.
 
-The intelligent driver model is that of Treiber, Hennecke and Helbing (2000); it also has the ego
-car's pedals in the congestion. Cars are blind to the ego car unless they follow it.
+The intelligent driver model is that of Treiber, Hennecke and Helbing (2000); in the congestion it
+also controls the ego car's pedals. Cars are blind to the ego car unless they follow it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def idm_acceleration(
     closing_mps: float = 0.0,
     time_gap_factor: float = 1.0,
 ) -> float:
-    """The acceleration in m/s2 of a vehicle that is ``closing_mps`` faster than its leader.
+    """Return the acceleration, m/s2, of a vehicle that is ``closing_mps`` faster than its leader.
 
     ``gap_m`` is bumper to bumper, infinite without a leader; ``time_gap_factor`` as in ``equip``.
     """
@@ -74,7 +74,7 @@ MIXED: Mix = ((CAR, 0.4), (VAN, 0.2), (TRUCK, 0.2), (MOTORCYCLE, 0.2))
 
 
 def draw_types(mix: Mix, count: int, random: np.random.Generator) -> list[VehicleType]:
-    """The types of ``count`` vehicles; a mix of one type takes nothing from ``random``."""
+    """Draw the types of ``count`` vehicles; a mix of one type draws nothing."""
     if len(mix) == 1:
         return [mix[0][0]] * count
     chosen = random.choice(len(mix), size=count, p=[share for _, share in mix])
@@ -82,16 +82,16 @@ def draw_types(mix: Mix, count: int, random: np.random.Generator) -> list[Vehicl
 
 
 def bodies_m(behind: VehicleType, ahead: VehicleType) -> float:
-    """Centre to centre of two vehicles that touch, bumper to bumper."""
+    """Return the distance of the centres of two vehicles that touch, bumper to bumper."""
     return 0.5 * (behind.length_m + ahead.length_m)
 
 
 def equip(
     cars: list[TrafficVehicle], types: list[VehicleType], time_gap_factor: float = 1.0
 ) -> None:
-    """Give each vehicle, its leader before it, its type's size and IDM parameters.
+    """Give each vehicle, after its leader, its type's size and IDM parameters.
 
-    ``time_gap_factor``: share of the type's time gap that is kept; people close up in a jam.
+    ``time_gap_factor``: share of the type's time gap; people close up in a jam.
     """
     for car, kind in zip(cars, types, strict=True):
         car.LENGTH, car.WIDTH = kind.length_m, kind.width_m
@@ -164,7 +164,6 @@ class TrafficVehicle(IDMVehicle):
 
 
 def footprint(car: Vehicle) -> Rectangle:
-    """The car's rectangle on the ground."""
     x, y = car.position.tolist()
     return Rectangle(x, y, float(car.heading), car.LENGTH, car.WIDTH)
 
@@ -172,7 +171,7 @@ def footprint(car: Vehicle) -> Rectangle:
 def straight_lanes(
     ends: tuple[str, str], start_m: float, end_m: float, middles_m: list[float], width_m: float
 ) -> RoadNetwork:
-    """Lanes along x, side by side, as highway-env has them; ``middles_m`` are their y."""
+    """Make highway-env's lanes along x, side by side; ``middles_m`` are their y."""
     network = RoadNetwork()
     for y in middles_m:
         # No speed limit: the cars' own desired speeds are what limits them.
@@ -184,9 +183,9 @@ def straight_lanes(
 def queue(
     road: Road, lane_index: LaneIndex, positions_m: list[float], speeds_mps: list[float]
 ) -> list[TrafficVehicle]:
-    """Cars in one lane at falling distances along it; each follows the one before it.
+    """Put cars into a lane at falling distances along it; each follows the car before it.
 
-    Speeds are the initial and the desired ones.
+    Each speed is a car's initial and desired one.
     """
     cars: list[TrafficVehicle] = []
     for position_m, speed_mps in zip(positions_m, speeds_mps, strict=True):

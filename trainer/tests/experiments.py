@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.report import COLLISION, GOAL
+from bridge.outcomes import COLLISION, GOAL
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.data import Result, Results
 from trainer.experiments.plan import (

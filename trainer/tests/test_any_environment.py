@@ -42,7 +42,7 @@ from trainer.human.config import HumanModelConfig
 from trainer.human.model import HumanModel
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
-from trainer.learner.replay import Layout, ReplayBuffer, Transition
+from trainer.learner.replay import ReplayBuffer, ReplayLayout, Transition
 from trainer.learner.td3 import TD3Learner
 from trainer.person import drive as driving
 from trainer.person.controls import controls_of
@@ -52,7 +52,7 @@ from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting
 from trainer.person.web import encode_view
 from trainer.training.delayed import DelayedVehicle
-from trainer.view import Shown, Steps
+from trainer.view import ShownStep, sitting_entries
 
 
 @pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
@@ -176,7 +176,7 @@ def test_an_observation_is_one_array_and_an_action_has_one_scale():
 def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space):
     env: Any = Rover()
     env.observation_space = space
-    layout: Layout = Adapted(env, "any").layout
+    layout: ReplayLayout = Adapted(env, "any").layout
     random, buffer = np.random.default_rng(0), ReplayBuffer(50, 2, steps=3, layout=layout)
     size = layout.dtype.itemsize * int(np.prod(layout.shape))
     seen = np.frombuffer(random.bytes(41 * size), np.uint8) & 63  # no float that is not finite
@@ -444,8 +444,7 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
     assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
     assert np.isfinite(model.learn(2))
-    shown = Shown()
-    first, *_ = shown.entries([sitting.recorder.path])
-    assert isinstance(first, Steps)
+    first, *_ = sitting_entries([sitting.recorder.path])
+    assert isinstance(first, ShownStep)
     assert isinstance(first.scene, np.ndarray)
     assert first.scene.shape == (8, 8, 3)

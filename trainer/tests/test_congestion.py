@@ -51,8 +51,8 @@ def test_zero_steering_succeeds_in_less_than_half_and_random_rarely():
         outcomes = [drive(env, driver, seed)[1]["outcome"] for seed in range(drives)]
         return outcomes.count("goal")
 
-    assert 8 <= arrived(STRAIGHT, 40) <= 20
-    assert arrived(lambda _: random.uniform(-1, 1, 1).astype(np.float32), 20) <= 5
+    assert 4 <= arrived(STRAIGHT, 20) <= 10
+    assert arrived(lambda _: random.uniform(-1, 1, 1).astype(np.float32), 10) <= 3
 
 
 @pytest.mark.parametrize(("action", "sign"), [(RIGHT, 1.0), (LEFT, -1.0)])
@@ -209,23 +209,13 @@ def test_who_will_touch_a_car_with_its_side_is_taken_over():
         assert trigger.wants_control(action) == reason
 
 
-@pytest.mark.parametrize("offset_m", [0.2, 0.45, 0.7])
-def test_on_the_way_back_to_the_middle_nobody_is_taken_over(offset_m):
-    env = environment(offset_m, -0.08, replace(ALONE, ego_speed_mps=(6.0, 6.0)))
-    trigger = CongestionHuman(env)
-    for _ in range(40):
-        action = trigger.act(env.frames)
-        assert trigger.wants_control(action) is None
-        env.step(action)
-
-
 def test_every_crash_is_foreseen(monkeypatch):
     """By a trigger that objects to nothing but cars that would be hit."""
     monkeypatch.setattr(CongestionHuman, "HEADING_RAD", math.inf)
     monkeypatch.setattr(CongestionHuman, "OFFSET_M", math.inf)
     env, random = CongestionEnv(), np.random.default_rng(1)
     trigger, crashes = CongestionHuman(env), 0
-    for seed in range(25):
+    for seed in range(12):
         objected: list[bool] = []
 
         def judged(_, objected=objected):
@@ -237,4 +227,4 @@ def test_every_crash_is_foreseen(monkeypatch):
         if info["outcome"] == "collision":
             crashes += 1
             assert any(objected[-round(trigger.HORIZON_S / env.config.control_period_s) :])
-    assert crashes > 10
+    assert crashes > 5

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.statistics import Estimate, mean_estimate
 from hil_tests.testing.commands import call
 from trainer.experiments import claims, data, report
 from trainer.experiments.guidance import (
@@ -43,21 +44,21 @@ def finding(results, test, ours, others, bar=0.0):
 
 class TestStatistics:
     def test_an_interval_as_in_the_tables(self):
-        found, half = data.mean_estimate([1.0, 2.0, 3.0]), 4.302653 / 3**0.5
+        found, half = mean_estimate([1.0, 2.0, 3.0]), 4.302653 / 3**0.5
         assert found[:3] == pytest.approx((2.0, 2.0 - half, 2.0 + half))
-        assert data.mean_estimate([]).size == 0
-        assert np.isinf(data.mean_estimate([1.0]).high)
+        assert mean_estimate([]).size == 0
+        assert np.isinf(mean_estimate([1.0]).high)
 
     @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=9), st.floats(-1e3, 1e3))
     def test_a_verdict_never_says_both(self, values, least):
-        found = data.mean_estimate(values)
+        found = mean_estimate(values)
         assert (found.low <= found.value <= found.high) or len(set(values)) == 1
         opposite = {"yes": "no", "no": "yes", "undecided": "undecided"}
         assert data.above(found.times(-1.0), -least) == opposite[data.above(found, least)]
 
     def test_one_level_and_all_of_several(self):
         spans = [(-0.5, 0.5), (-0.5, 1.5), (1.5, 2.0), (-3.0, -1.5)]
-        found = [data.within(data.Estimate(0.5 * sum(ends), *ends, 5), 1.0) for ends in spans]
+        found = [data.within(Estimate(0.5 * sum(ends), *ends, 5), 1.0) for ends in spans]
         assert found == ["yes", "undecided", "no", "no"]
         answers: list[list[data.Holds]]
         answers = [["yes", "yes"], ["yes", "undecided"], ["no", "undecided"], []]
@@ -95,7 +96,7 @@ class TestData:
         over, seconds, less = (cell(hi) for cell in place_columns(results).values())
         points = [100.0 * (b.mean("nominal", "success") - a.mean("nominal", "success"))
                   for a, b in zip(phil, hi, strict=True)]  # fmt: skip
-        assert over == data.mean_estimate(points).text(1)
+        assert over == mean_estimate(points).text(1)
         # HI-TD3 never gets to 90 %, PHIL-TD3 in each of its seeds.
         assert not any(one.until(0.9) for one in hi)
         assert (seconds, less) == ("∞ [∞, ∞]", "0 of 3")

@@ -104,8 +104,8 @@ def test_what_does_not_fit_together_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("scenario", "human", "drives"),
-    [("left_turn", "expert", 20), ("congestion", "expert", 10),
-     ("left_turn", "trainer.human.left_turn:SlowHuman", 20)],
+    [("left_turn", "expert", 10), ("congestion", "expert", 5),
+     ("left_turn", "trainer.human.left_turn:SlowHuman", 10)],
 )  # fmt: skip
 def test_the_trigger_lets_the_expert_drive(scenario, human, drives):
     """Or the policy would be punished for driving like the human: theorem 1's assumption."""

@@ -61,8 +61,8 @@ def test_a_crash_is_a_failure_and_always_driving_on_no_solution():
     rewards, info = drive(env, FULL)
     assert info["outcome"] == "collision"
     assert rewards[-1] < -9.9
-    outcomes = [drive(LeftTurnEnv(), FULL, seed)[1]["outcome"] for seed in range(60)]
-    assert outcomes.count("goal") < 20
+    outcomes = [drive(LeftTurnEnv(), FULL, seed)[1]["outcome"] for seed in range(30)]
+    assert outcomes.count("goal") < 10
 
 
 def test_traffic_does_not_yield():
@@ -110,13 +110,13 @@ def triggered(**changes):
 def test_foresight_agrees_with_what_then_happens():
     env = LeftTurnEnv()
     crossing, agreed = Crossing(env, side_clearance_m=0.0), 0
-    for seed in range(80):
+    for seed in range(40):
         env.reset(seed=seed)
         foreseen = crossing.clear(5.0, margin_m=0.0, plan=PedalPlan(pedal=1.0, hold_s=10.0))
         *_, (_, _, info) = episode(env, FULL)
         agreed += foreseen == (info["outcome"] == "goal")
     # Traffic is foreseen at constant speed; IDM speeds differ a little.
-    assert agreed >= 74
+    assert agreed >= 37
 
 
 @pytest.mark.parametrize(

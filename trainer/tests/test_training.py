@@ -16,9 +16,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from bridge.report import COLLISION
+from bridge.outcomes import COLLISION
 from edge_runtime.cli import AGAIN_S, INTERRUPTED, run_cli
 from edge_runtime.util import UserError
+from hil_tests.testing.learners import same_weights
 from trainer import drivers
 from trainer.__main__ import main
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
@@ -27,7 +28,6 @@ from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.pictures import write_learning_curve
 from trainer.tests.loops import rows_of
-from trainer.tests.test_td3 import same_weights
 from trainer.training import validation as validation_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory

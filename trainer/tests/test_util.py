@@ -1,3 +1,4 @@
+import math
 import subprocess
 
 import numpy as np
@@ -13,8 +14,7 @@ from trainer.learner.config import LearnerConfig
 @pytest.mark.parametrize("command", ["train", "human"])
 def test_a_second_training_in_a_directory_is_refused(command, capsys, tmp_path):
     with util.claimed(tmp_path):
-        err = refusal(capsys, command, "--out", str(tmp_path), "--episodes", "1")
-        assert f"{tmp_path} is being trained in by another process" in err
+        assert str(tmp_path) in refusal(capsys, command, "--out", str(tmp_path), "--episodes", "1")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -43,22 +43,20 @@ def test_a_processor_that_no_list_describes_has_a_name(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "values", "limits"),
     [
-        *(
-            ("priority_offset", offset, "it must be above 0")
-            for offset in (0.0, -1e-3, 1e-45, float("inf"), float("nan"))
-        ),
-        ("gamma", 1.5, "0 to 1"),
-        ("batch_size", 0, "1 to 1000000"),
-        ("return_steps", 0, "at least 1"),
-        ("intervention_penalty", float("nan"), "it must be a finite number"),
+        # The offset keeps every transition drawable.
+        ("priority_offset", (0.0, -1e-3, 1e-45, math.inf, math.nan), "above 0"),
+        ("gamma", (1.5,), "0 to 1"),
+        ("batch_size", (0,), "1 to 1000000"),
+        ("return_steps", (0,), "at least 1"),
+        ("intervention_penalty", (math.nan,), "finite"),
     ],
 )
-def test_what_is_out_of_range_is_told_the_range(name, value, said):
-    """The offset keeps every transition drawable."""
-    with pytest.raises(UserError, match=rf"{name} = {value} is out of range: {said}"):
-        LearnerConfig(**{name: value})
+def test_a_number_out_of_range_is_refused_with_its_range(name, values, limits):
+    for value in values:
+        with pytest.raises(UserError, match=f"{name} .*{limits}"):
+            LearnerConfig(**{name: value})
     LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
 
 

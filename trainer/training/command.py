@@ -15,8 +15,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from bridge.outcomes import GOAL
 from bridge.progress import ProgressBar
-from bridge.report import GOAL
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml

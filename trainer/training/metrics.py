@@ -12,7 +12,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.report import GOAL, failed, settled
+from bridge.outcomes import GOAL, failed, settled
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 

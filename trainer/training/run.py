@@ -12,7 +12,7 @@ import numpy as np
 
 from bridge.episode import finite
 from bridge.network import parse_spec
-from bridge.report import DISCARDED
+from bridge.outcomes import DISCARDED
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
 from trainer import util

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, EpisodeResult
+from bridge.outcomes import GOAL
+from bridge.report import EpisodeResult
 from trainer.drivers import BEST_FILE, TogetherDriver
 from trainer.environments import make_environment
 from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Dict, NamedTuple, Optional, Type
 from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import (
     BITRATE,
@@ -43,16 +43,22 @@ _LISTEN_S = 0.1
 _JOIN_S = 0.5
 
 DEFAULT_BUS = "socketcan:can0"
-_SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
-# These take none: socketcan's is set by `ip link`, virtual has none.
-_WITHOUT_BITRATE = ("socketcan", "virtual")
-_ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
-
+UDP = "udp_multicast"
 GROUP, PORT = "239.74.163.2", 43113  # python-can's own
 # Two buses need two ports: Linux hands what comes for any group to every socket of its port.
-MULTICAST_BUS = f"udp_multicast:{GROUP}:{PORT}"
+MULTICAST_BUS = f"{UDP}:{GROUP}:{PORT}"
 _LOOPBACK = "lo"
-_GROUP_AND_PORT = re.compile(r"([0-9.]+)(?::([0-9]{1,5}))?")
+_ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
+_SYNTAX = {
+    "socketcan": f"{DEFAULT_BUS}; its bit rate is set by `ip link`",
+    UDP: MULTICAST_BUS,
+    "": "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0",
+}
+_ADVICE = {
+    "socketcan": "bring it up with `ip link set CHANNEL up type can bitrate 500000`",
+    UDP: "it needs msgpack, and a route for multicast (`ip route`)",
+    "": "see python-can's manual for what this interface needs",
+}
 
 
 class BusName(NamedTuple):
@@ -65,29 +71,28 @@ class BusName(NamedTuple):
 
 
 def parse_bus(text: str) -> BusName:
-    """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
+    """Parse INTERFACE:CHANNEL[:BITRATE], udp_multicast:GROUP[:PORT] too. Raises UserError."""
     interface, _, channel = text.partition(":")
-    if interface == "udp_multicast":  # GROUP:PORT, an IPv4 group, or nothing
-        found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
-        with contextlib.suppress(ValueError):  # no address
-            port = int(found[2] or PORT) if found else 0
-            if found and ipaddress.IPv4Address(found[1]).is_multicast and 1 <= port <= 65535:
-                return BusName(interface, found[1], None, port)
-        raise UserError(
-            f"bus {text!r} is no IPv4 multicast group and port: write it as {MULTICAST_BUS}"
-        )
-    name, colon, rate = channel.partition(":")
-    if interface == "socketcan" and colon:
-        raise UserError(f"bus {text!r} has its bit rate from `ip link`: write {interface}:{name}")
-    if interface in _WITHOUT_BITRATE and channel:
+    name, colon, number = channel.partition(":")
+    count = int(number) if re.fullmatch("[0-9]{1,9}", number) else 0
+    if interface == "virtual" and channel:
         return BusName(interface, channel, None)
-    if interface and name and (not rate or (rate.isdecimal() and int(rate) > 0)):
-        return BusName(interface, name, int(rate or BITRATE))
-    raise UserError(f"bus {text!r} is no CAN bus: write it as {_SYNTAX}")
+    if interface == UDP:
+        port, group = count if colon else PORT, name or GROUP
+        with contextlib.suppress(ValueError):  # no address
+            if ipaddress.IPv4Address(group).is_multicast and 1 <= port <= 65535:
+                return BusName(interface, group, None, port)
+    elif interface and name and not colon:
+        return BusName(interface, name, None if interface == "socketcan" else BITRATE)
+    elif interface != "socketcan" and interface and name and count:
+        return BusName(interface, name, count)
+    syntax = _SYNTAX.get(interface, _SYNTAX[""])
+    kind = "IPv4 multicast group and port" if interface == UDP else "CAN bus"
+    raise UserError(f"bus {text!r} is no {kind}: write it as {syntax}")
 
 
 def open_bus(name: BusName) -> Any:
-    """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
+    """Open a python-can bus; send nothing. Raises UserError."""
     can = import_can()
     options: Dict[str, Any] = {} if name.bitrate is None else {"bitrate": name.bitrate}
     if name.port is not None:  # pinned to the loopback device as well: no neighbour hears it
@@ -100,7 +105,9 @@ def open_bus(name: BusName) -> Any:
     except Exception as error:  # each backend raises what its library raises, NameError included
         if bus is not None:
             bus.shutdown()
-        raise UserError(_explain(name, error)) from None
+        where, cause = f"{name.interface}:{name.channel}", str(error) or type(error).__name__
+        advice = _ADVICE.get(name.interface, _ADVICE[""])
+        raise UserError(f"the CAN bus {where} cannot be opened: {cause}; {advice}") from None
     return bus
 
 
@@ -127,7 +134,7 @@ def pin_to_loopback(bus: Any, group: str) -> None:
 
 
 def import_can() -> Any:
-    """The python-can package. Raises UserError where it is not installed."""
+    """Return the python-can package. Raises UserError where it is not installed."""
     # Its backends say on stderr what they miss; our error says it in its one line.
     logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
@@ -138,39 +145,12 @@ def import_can() -> Any:
     return can
 
 
-def _explain(name: BusName, error: Exception) -> str:
-    where = f"the CAN bus {name.interface}:{name.channel} cannot be opened"
-    cause = " ".join(str(error).split()) or type(error).__name__
-    if name.interface != "socketcan" and "Unknown interface" in cause:
-        return f"{where}: choose from {', '.join(sorted(import_can().VALID_INTERFACES))}"
-    number: Any = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    advice = f"python-can's manual says what its {name.interface} needs"
-    if name.interface == "udp_multicast":
-        advice = "it needs msgpack, and a route for multicast (`ip route`)"
-    elif name.interface == "socketcan":
-        advice = {
-            errno.EPERM: "this user may not open a CAN socket",
-            errno.EACCES: "this user may not open a CAN socket",
-            errno.EAFNOSUPPORT: "this kernel has no SocketCAN (modprobe can_raw)",
-        }.get(
-            number,
-            f"bring it up with `ip link set {name.channel} up type can bitrate {BITRATE}`,"
-            " `ip link` lists them",
-        )
-    return f"{where}: {cause}; {advice}"
-
-
 class Gate:
-    """The only way out to the bus: closed until `open`, and then for our commands only."""
+    """The only way out to the bus: closed until `is_open`, and then for our commands only."""
 
     def __init__(self, bus: Any) -> None:
-        self._bus = bus
-        self._can = import_can()
-        self._is_open = False
-
-    def open(self) -> None:
-        """From now on our commands may pass."""
-        self._is_open = True
+        self.is_open = False
+        self._bus, self._can = bus, import_can()
 
     def send(self, frame: Frame, data: bytes) -> None:
         """Put a frame on the bus without waiting.
@@ -178,7 +158,7 @@ class Gate:
         Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
         anything is sent, for a frame that must not leave.
         """
-        if not self._is_open:
+        if not self.is_open:
             raise RuntimeError("nothing is sent before the vehicle is enabled")
         can_id, length = frame.can_id, len(data)
         if frame not in COMMANDS or length != frame.length:
@@ -212,7 +192,7 @@ class HunterVehicle(StreamedVehicle):
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
         # Our own frames come back there: a command need not be somebody else's.
-        self._ignores_commands = bus.interface == "udp_multicast"
+        self._ignores_commands = bus.interface == UDP
         self._core: HunterCore
         super().__init__(HunterCore(similarity, settings.profile))
         self._stopping = False
@@ -222,7 +202,7 @@ class HunterVehicle(StreamedVehicle):
 
     def enable(self, now_s: float) -> None:
         """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
-        self._gate.open()  # the core gives no frame before it is enabled
+        self._gate.is_open = True  # the core gives no frame before it is enabled
         super().enable(now_s)
 
     def _leave(self) -> None:
@@ -275,7 +255,7 @@ class HunterVehicle(StreamedVehicle):
         with self._lock:
             was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
-            stopped = self._core.state is State.STOPPED and was is not State.STOPPED
+            stopped = self._core.state is VehicleState.STOPPED and was is not VehicleState.STOPPED
         if stopped:
             self._stream.wake()
 

@@ -99,8 +99,16 @@ class Frame(NamedTuple):
 
     @property
     def length(self) -> int:
-        """Of its data, in bytes."""
         return struct.calcsize(self.layout)
+
+    def sent(self, message: Any) -> Sent:
+        """Return the frame with the data of a message."""
+        return Sent(self, encode(self, message))
+
+
+class Sent(NamedTuple):
+    frame: Frame
+    data: bytes
 
 
 _MILLI, _TENTH = 0.001, 0.1
@@ -129,15 +137,8 @@ FRAMES: Dict[int, Frame] = {frame.can_id: frame for frame in COMMANDS + FEEDBACK
 MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTORS)}
 
 
-class Sent(NamedTuple):
-    """A frame to be sent."""
-
-    frame: Frame
-    data: bytes
-
-
 def encode(frame: Frame, message: Any) -> bytes:
-    """The data bytes of a message: rounded to counts, and clamped to what the field can hold.
+    """Return the data of a message: rounded to counts, and clamped to what each field can hold.
 
     Raises ValueError for a number that is not finite: no count stands for it.
     """
@@ -152,15 +153,15 @@ def encode(frame: Frame, message: Any) -> bytes:
     return struct.pack(frame.layout, *counts)
 
 
-def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
-    """0x111 within the limits of the model. Raises ValueError for what is not finite."""
+def motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> Sent:
+    """Return 0x111 within the limits of the model. Raises ValueError for what is not finite."""
     speed_mps = clamp(speed_mps, spec.max_speed_mps)  # NaN passes, and encode refuses it
     inner_rad = clamp(inner_steering_rad, spec.max_inner_steering_rad)
-    return encode(MOTION_COMMAND, MotionCommand(speed_mps, inner_rad))
+    return MOTION_COMMAND.sent(MotionCommand(speed_mps, inner_rad))
 
 
 def decode(can_id: int, data: bytes) -> Any:
-    """The message of a frame; None for an identifier or a length that is not in the table."""
+    """Return the message of a frame; None for an identifier or length not in the table."""
     frame = FRAMES.get(can_id)
     if frame is None or len(data) != frame.length:
         return None
@@ -220,7 +221,7 @@ DRIVER_FAULTS = {
 
 
 def status_faults(status: SystemStatus, profile: str) -> List[str]:
-    """The faults that 0x211 names, in words; empty where it names none."""
+    """Return the faults that 0x211 names, in words."""
     known = PROFILES[profile]
     words = [fault for mask, fault in known.items() if status.faults & mask]
     for bit in range(16):
@@ -230,11 +231,11 @@ def status_faults(status: SystemStatus, profile: str) -> List[str]:
 
 
 def fault_bits(words: str, profile: str) -> int:
-    """The bits of SystemStatus.faults of a fault in words: what the mock sends."""
+    """Return the bits of SystemStatus.faults of a fault in words: the mock sends them."""
     return sum(mask for mask, fault in PROFILES[profile].items() if fault == words)
 
 
 def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:
-    """The faults that 0x261 to 0x263 name, in words, with the motor's place."""
+    """Return the faults that 0x261 to 0x263 name, in words, with the motor's place."""
     known = [words for mask, words in DRIVER_FAULTS.items() if motor.status & mask]
     return [f"{MOTOR_OF_SLOW[can_id]} motor: {words}" for words in known]

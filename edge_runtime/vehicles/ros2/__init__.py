@@ -1,40 +1,60 @@
 """A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
 
-First names and settings; then what decides, pure: odometry in, motion out; then the session and two
-threads around it:
-- The stream's thread publishes what `tick` gives: the vehicle's ROS driver makes a frame of each
-  message, and has no stream of its own.
-- Zenoh's thread hands every odometry to `hear`.
+First the messages and a node without ROS 2; then what decides, pure: odometry in, motion out; then
+the session and two threads around it. The stream's thread publishes what `tick` gives: the ROS
+driver makes a frame of each message, and has no stream of its own. Zenoh's thread hands every
+odometry to `hear`.
 
-node.py, which needs pycdr2, is imported when a session opens: settings are checked without it, too.
+Field names, order and types are those of the packages' .msg files (common_interfaces and
+ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
+the left, positive steering and yaw to the left (REP 103). On the wire they are CDR behind a header
+of four bytes that says plain CDR (XCDR version 1), little-endian: `00 01 00 00`; a big-endian one
+is read, too. Safe with several threads: pycdr2's own buffer, one for each type, is not used.
+
+No `from __future__ import annotations` here: pycdr2 reads the annotations, also on Python 3.8.
 """
-
-from __future__ import annotations
 
 import math
 import re
+import struct
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Callable, ClassVar, List, NamedTuple, Optional, Type
+from dataclasses import dataclass, field, is_dataclass
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    ClassVar,
+    Dict,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Type,
+    TypeVar,
+    Union,
+)  # fmt: skip
+
+import zenoh
 
 from edge_runtime import log
 from edge_runtime.config import check_choice
-from edge_runtime.transport import check_endpoint, is_tls, open_session
+from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import (
-    ENABLE_TIMEOUT_S,
-    IMPOSSIBLE,
-    Event,
-    Finding,
-    Speeds,
-    State,
-    StreamedCore,
-)
+from edge_runtime.vehicles.core import Speeds, StreamedCore, VehicleEvent, VehicleState
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 from edge_runtime.vehicles.stream import StreamedVehicle
+from edge_runtime.wire import Reason
 
-if TYPE_CHECKING:
-    from edge_runtime.vehicles.ros2.node import Odometry
+try:
+    from pycdr2 import IdlStruct
+
+    # Private, but in the signature of `serialize`; the package is pinned, and a test would notice.
+    from pycdr2._support import Buffer, Endianness
+    from pycdr2.types import array, float32, float64, int32, uint32
+except ImportError:
+    raise UserError("ROS 2 messages need the package pycdr2: pip install pycdr2") from None
 
 # Beside our own 7447, where a bridge listens by default, too; and of this machine only.
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
@@ -49,7 +69,7 @@ STEERS_FROM_MPS = 0.2
 
 
 def topic_key(namespace: str, topic: str) -> str:
-    """The Zenoh key of a topic: below the namespace, or as it is where it begins with a slash.
+    """Return the Zenoh key of a topic: below the namespace unless it begins with a slash.
 
     Raises UserError for names that ROS would not take.
     """
@@ -66,6 +86,245 @@ def topic_key(namespace: str, topic: str) -> str:
     return joined
 
 
+class Motion(NamedTuple):
+    """What the vehicle is told: `centre_rad` of the front wheels, positive to the left."""
+
+    speed_mps: float
+    centre_rad: float
+
+
+PUBLISHER, SUBSCRIBER = "MP", "MS"
+_SLASH = "\u00a7"  # The bridge's replacement for a slash inside one chunk of a token.
+TYPES: Dict[str, str] = {
+    "ackermann_msgs/msg/AckermannDriveStamped": (
+        "48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf"
+    ),
+    "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+}
+"""The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery."""
+
+HEADER_BYTES = 4
+MAX_PAYLOAD_BYTES = 1024 * 1024
+_ALIGNMENT = 4  # DDS fills a message up to this.
+# What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
+_DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
+if TYPE_CHECKING:
+    Covariance = List[float]
+else:
+    Covariance = array[float64, 36]
+
+
+@dataclass
+class RosTime(IdlStruct, typename="builtin_interfaces/msg/Time"):
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs/msg/Header"):
+    stamp: RosTime = field(default_factory=RosTime)
+    frame_id: str = ""
+
+
+@dataclass
+class AckermannDrive(IdlStruct, typename="ackermann_msgs/msg/AckermannDrive"):
+    """`steering_angle` (rad) of a wheel at the centre of the front axle; `speed` in m/s.
+
+    Zero in `acceleration` (m/s2), `jerk` and `steering_angle_velocity` means as quick as can be.
+    """
+
+    steering_angle: float32 = 0.0
+    steering_angle_velocity: float32 = 0.0
+    speed: float32 = 0.0
+    acceleration: float32 = 0.0
+    jerk: float32 = 0.0
+
+
+@dataclass
+class AckermannDriveStamped(IdlStruct, typename="ackermann_msgs/msg/AckermannDriveStamped"):
+    header: Header = field(default_factory=Header)
+    drive: AckermannDrive = field(default_factory=AckermannDrive)
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
+    """Three numbers; as a Point of the same layout, a place in metres."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+    w: float64 = 1.0
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
+    position: Vector3 = field(default_factory=Vector3)
+    orientation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
+    """A pose, and the covariance of x, y, z and the rotations about them."""
+
+    pose: RosPose = field(default_factory=RosPose)
+    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
+    twist: Twist = field(default_factory=Twist)
+    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
+
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
+    """A pose in the frame `header.frame_id`, and the velocity in the frame `child_frame_id`."""
+
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+_M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry)
+
+
+def encode(message: IdlStruct) -> bytes:
+    """Return little-endian CDR. Raises struct.error for a number that its field cannot hold."""
+    return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
+
+
+def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Reason]:
+    """Return a message of the kind with finite numbers, or why it is none. Never raises."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        return Reason.OVERSIZED
+    if len(payload) < HEADER_BYTES:
+        return Reason.MALFORMED
+    if payload[:2] not in (b"\0\0", b"\0\1"):  # big-endian, little-endian
+        return Reason.SCHEMA
+    buffer = Buffer(payload, align_offset=HEADER_BYTES)
+    try:
+        # A buffer of our own in place of the bytes, to see where the message ends.
+        message: _M = kind.deserialize(buffer)  # type: ignore[arg-type]
+    except _DECODE_ERRORS:
+        return Reason.MALFORMED
+    # pycdr2 takes a text or data that is cut off for a short one; and the type is not in the
+    # payload: what is left over is the mark of another one.
+    if not 0 <= len(payload) - buffer.tell() < _ALIGNMENT:
+        return Reason.MALFORMED
+    return message if all(map(math.isfinite, _floats(message))) else Reason.NOT_FINITE
+
+
+def _floats(value: Any) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, (list, tuple)):  # a covariance
+        yield from value
+    elif is_dataclass(value):
+        for part in vars(value).values():
+            yield from _floats(part)
+
+
+def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
+    """Return `linear.x` in m/s, and `angular.z` as yaw rate (rad/s) or steering angle (rad).
+
+    A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
+    """
+    z = motion.centre_rad
+    if angular != STEERING:
+        z = motion.speed_mps * math.tan(motion.centre_rad) / wheelbase_m
+    return Twist(linear=Vector3(x=motion.speed_mps), angular=Vector3(z=z))
+
+
+def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
+    """Return speed and centre angle; no acceleration: the speed is a ramp already."""
+    return AckermannDriveStamped(
+        header=Header(RosTime(*divmod(time_ns, 10**9)), "base_link"),
+        drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
+    )
+
+
+def member_token(zid: str) -> str:
+    return f"@/{zid}/@ros2_lv"
+
+
+def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
+    """Return the token of a PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
+
+    It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
+    bridge would carry only what a ROS node beside it already wants. Its last part is
+    `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. We
+    publish reliably, because a reader of either kind matches, and subscribe best effort: a reliable
+    reader would never hear a best-effort writer, as sensors are. No key, no old messages for late
+    readers, and the last ten kept.
+    """
+    names = (name.replace("/", _SLASH) for name in (key, kind.__idl_typename__))
+    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind.__idl_typename__]};"
+    return "/".join((member_token(zid), role, *names, qos))
+
+
+class Ros2Node:
+    """Uses a session that somebody else opens and closes. `close` it before the session.
+
+    `rejected` counts what could not be read, by reason.
+    """
+
+    def __init__(self, session: zenoh.Session, namespace: str) -> None:
+        self.rejected: Dict[str, int] = {}
+        self._session = session
+        self._namespace = namespace
+        self._zid = str(session.info.zid())
+        self._declared: List[Any] = []
+        self._announce(member_token(self._zid))
+
+    def publisher(self, topic: str, kind: Type[_M]) -> Callable[[_M], None]:
+        """Return what publishes messages of a kind on a topic. It never waits for a subscriber."""
+        key = topic_key(self._namespace, topic)
+        publisher = self._session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._declared.append(publisher)
+        self._announce(topic_token(self._zid, PUBLISHER, key, kind))
+        return lambda message: publisher.put(encode(message))
+
+    def subscribe(self, topic: str, kind: Type[_M], take: Callable[[_M], None]) -> None:
+        """Call `take` with each message, in Zenoh's thread; what cannot be read is counted."""
+        key = topic_key(self._namespace, topic)
+
+        def hear(sample: zenoh.Sample) -> None:
+            message: Union[_M, Reason] = Reason.OVERSIZED
+            if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
+                message = decode(sample.payload.to_bytes(), kind)
+            if isinstance(message, Reason):
+                self.rejected[message.value] = self.rejected.get(message.value, 0) + 1
+            else:
+                take(message)
+
+        self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
+        self._announce(topic_token(self._zid, SUBSCRIBER, key, kind))
+
+    def close(self) -> None:
+        while self._declared:
+            self._declared.pop().undeclare()
+
+    def _announce(self, token: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(token))
+
+
 class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
     """`config.example.toml` documents each key. A topic that is empty is not published."""
 
@@ -79,41 +338,27 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
     odometry_angular: str = YAW_RATE
 
     def __post_init__(self) -> None:
-        check_settings(self)
-
-
-def check_settings(settings: Ros2Settings) -> None:
-    """Raise UserError where the settings are not valid, or name nothing to be driven by."""
-    for name in ("twist_angular", "odometry_angular"):
-        check_choice(f"vehicle.ros2.{name}", getattr(settings, name), _ANGULAR)
-    if settings.listen is not None and settings.connect is not None:
-        raise UserError("ros2 has both listen and connect: give one of them")
-    for endpoint in (settings.listen, settings.connect):
+        for name in ("twist_angular", "odometry_angular"):
+            check_choice(f"vehicle.ros2.{name}", getattr(self, name), _ANGULAR)
+        if self.listen is not None and self.connect is not None:
+            raise UserError("ros2 has both listen and connect: give one of them")
+        endpoint = self.listen or self.connect
         if endpoint is not None and is_tls(check_endpoint(endpoint)):
             raise UserError(
                 f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
                 " use tcp/ or udp/ on one machine, or inside a tunnel"
             )
-    if not settings.twist_topic and not settings.ackermann_topic:
-        raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
-    if not settings.odometry_topic:
-        raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
-    topics = [settings.twist_topic, settings.ackermann_topic, settings.odometry_topic]
-    keys = [topic_key(settings.namespace, topic) for topic in topics if topic]
-    if len(set(keys)) < len(keys):
-        raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
-
-
-class Motion(NamedTuple):
-    """What the vehicle is told: `centre_rad` of the front wheels, positive to the left."""
-
-    speed_mps: float
-    centre_rad: float
+        if not self.twist_topic and not self.ackermann_topic:
+            raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
+        if not self.odometry_topic:
+            raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
+        topics = (self.twist_topic, self.ackermann_topic, self.odometry_topic)
+        keys = [topic_key(self.namespace, topic) for topic in topics if topic]
+        if len(set(keys)) < len(keys):
+            raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
 
 
 class Ros2Core(StreamedCore):
-    """The state machine, what was heard, and what is asked for."""
-
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         super().__init__(similarity, Speeds())
         self.stale = 0  # odometry that was repeated or came late: it shows nobody alive
@@ -131,40 +376,36 @@ class Ros2Core(StreamedCore):
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
-        """Nothing more is sent."""
-        self._apply(Finding(Event.CLOSE, ""), now_s)
+        self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
-        """Finite odometry; it counts where it is newer than the last by its own stamp.
+        """Take finite odometry; it counts where it is newer than the last by its own stamp.
 
         A sender that leaves its stamps at 0 is believed by the time of arrival alone.
         """
         if 0 < stamp_ns <= self._stamp_ns:
             self.stale += 1
             # While nothing is driven, a clock set back is believed; a repetition is not.
-            if self.state in (State.ENABLING, State.ENABLED) or stamp_ns == self._stamp_ns:
+            if self._has_asked or stamp_ns == self._stamp_ns:
                 return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
-        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
-            self._apply(Finding(Event.LYING, f"the odometry says {speed_mps:.2f} m/s"), now_s)
-        elif self._is_angle and abs(angular) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
-            self._apply(Finding(Event.LYING, f"the odometry says {angular:.2f} rad"), now_s)
-        else:
-            self._apply(Finding(Event.CONFIRMED, ""), now_s)
+        words = impossible(speed_mps, angular if self._is_angle else 0.0, self._spec)
+        lie = Finding(Fault.LYING, f"the odometry says {words}") if words else None
+        self._apply(lie or Finding(VehicleEvent.CONFIRMED, ""), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
-        """What to publish now; None while DISABLED."""
-        self._watch(now_s)
-        if self.state is State.DISABLED:
+        """Return what to publish now; None while DISABLED."""
+        self._look(now_s)
+        if self.state is VehicleState.DISABLED:
             return None
         self._step(now_s)
         return Motion(self.set_point.speed_mps, self._asked_rad())
 
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nothing was ever asked of it."""
+        """Return whether the vehicle is known to stand, or nothing was ever asked of it."""
         is_fresh = self._silence(-math.inf, now_s) is None
-        return self.state is State.DISABLED or (is_fresh and self._heard.stands)
+        return self.state is VehicleState.DISABLED or (is_fresh and self._heard.stands)
 
     def _why_not_confirmed(self, now_s: float) -> str:
         return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"
@@ -172,10 +413,10 @@ class Ros2Core(StreamedCore):
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         if now_s - max(self._newest_s, since_s) <= self._heard.silence_s:
             return None
-        return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
+        return Finding(Fault.SILENT, f"no fresh odometry on {self._topic}")
 
     def _centre_rad(self) -> Optional[float]:
-        """From the odometry; None where a yaw rate tells nothing: it hardly moves."""
+        """Return the angle by the odometry; None where a yaw rate tells none: it hardly moves."""
         angular, speed_mps = self._angular, self._heard.speed_mps
         if angular is None or self._is_angle:
             return angular
@@ -194,12 +435,9 @@ class Ros2Vehicle(StreamedVehicle):
     settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings
 
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
-        from edge_runtime.vehicles.ros2 import node as ros
-
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
-        self._failing = False
-        self._publish: List[Callable[[Motion], None]] = []
+        self._fails = False
         # A router (by default on loopback), or a peer that goes on connecting to a bridge.
         connect, listen = settings.connect, None
         if connect is None:
@@ -209,20 +447,16 @@ class Ros2Vehicle(StreamedVehicle):
         except UserError as error:
             raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
         try:
-            self._node = node = ros.Ros2Node(self._session, settings.namespace)
+            self._node = node = Ros2Node(self._session, settings.namespace)
+            self._twist = self._drive = None
             if settings.twist_topic:
-                twist = node.publisher(settings.twist_topic, ros.Twist)
-                self._publish.append(
-                    lambda motion: twist(
-                        ros.twist_of(motion, settings.twist_angular, similarity.spec.wheelbase_m)
-                    )
-                )
+                self._twist = node.publisher(settings.twist_topic, Twist)
             if settings.ackermann_topic:
-                drive = node.publisher(settings.ackermann_topic, ros.AckermannDriveStamped)
-                self._publish.append(lambda motion: drive(ros.drive_of(motion, time.time_ns())))
-            node.subscribe(settings.odometry_topic, ros.Odometry, self._hear)
+                self._drive = node.publisher(settings.ackermann_topic, AckermannDriveStamped)
+            self._angular = settings.twist_angular
+            node.subscribe(settings.odometry_topic, Odometry, self._hear)
         except BaseException:
-            self._session.close()  # An open session would hang the process at its exit.
+            self._session.close()  # an open session would hang the process at its exit
             raise
         self._stream.start()
 
@@ -249,12 +483,15 @@ class Ros2Vehicle(StreamedVehicle):
         if motion is None:
             return False
         try:
-            for publish in self._publish:
-                publish(motion)
+            if self._twist:
+                wheelbase_m = self._core.similarity.spec.wheelbase_m
+                self._twist(twist_of(motion, self._angular, wheelbase_m))
+            if self._drive:
+                self._drive(drive_of(motion, time.time_ns()))
         except Exception as error:  # the vehicle stops by its own time-out, and the silence tells
-            if not self._failing:
+            if not self._fails:
                 log.event("error", "ros2_not_sent", detail=error)
-            self._failing = True
+            self._fails = True
             return False
-        self._failing = False
+        self._fails = False
         return True

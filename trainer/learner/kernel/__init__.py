@@ -1,8 +1,7 @@
 """The networks' two convolutions as one function in C++, built at first use; else by torch.
 
-The system's compiler builds it into the user's cache. Nothing is built at installation, so the
-package needs no compiler to be installed; without one, callers take their torch path.
-``PHIL_KERNEL=0`` in the environment does the same on purpose.
+The system's compiler builds it into the user's cache, so that no compiler is needed to install the
+package. Without a compiler, or with ``PHIL_KERNEL=0`` in the environment, torch does the work.
 """
 
 import ctypes
@@ -36,7 +35,7 @@ _TIMEOUT_S = 120.0  # For a build; it takes a few
 
 @functools.cache
 def load() -> ctypes.CDLL | None:
-    """The library built from ``trunk.cpp``, or None, with one warning, if there can be none.
+    """Return the library built from ``trunk.cpp``; None, with one warning, if it cannot be built.
 
     On Linux a kernel of GCC shares the OpenMP threads of torch, which is imported before it: two
     pools of threads would fight for the same cores.
@@ -46,7 +45,7 @@ def load() -> ctypes.CDLL | None:
     try:
         library = _built(Path(__file__).with_name("trunk.cpp"))
     except (UserError, OSError, RuntimeError, ValueError) as error:
-        # RuntimeError: no home directory, hence no cache. ValueError: quotes in $CXX left open.
+        # RuntimeError: no home directory, hence no cache. ValueError: an open quote in $CXX.
         _LOGGER.warning(
             "no compiled trunk kernel (%s): torch does its work, several times slower",
             " ".join(str(error).split()),
@@ -61,9 +60,10 @@ def load() -> ctypes.CDLL | None:
 
 
 def _built(source: Path) -> ctypes.CDLL:
-    """The library of this source, compiler and processor: from the cache, or built now."""
+    """Load the library of this source, compiler and processor, built now if not in the cache."""
     compiler = _compiler()
-    settings = *compiler, _version(compiler), *_FLAGS, _OPENMP, _processor(), ""
+    version = _ask([*compiler, "--version"]).stdout  # A newer one may know more of the processor.
+    settings = *compiler, version, *_FLAGS, _OPENMP, _processor(), ""
     key = "\0".join(settings).encode() + source.read_bytes()
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
     if not library.exists():
@@ -72,7 +72,7 @@ def _built(source: Path) -> ctypes.CDLL:
 
 
 def _build(compiler: list[str], source: Path, library: Path) -> None:
-    """Compile under a name of its own: two processes may build at once."""
+    """Compile into a temporary directory: two processes may build at once."""
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as directory:
         target = Path(directory) / library.name
@@ -81,7 +81,7 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
             if done.returncode == 0:
                 write_atomic(library, target.read_bytes())
                 return
-            # A compiler without OpenMP still gives a kernel of one thread; another fault may pass.
+            # Without OpenMP the kernel has one thread; no other fault is tried again.
             if not re.search(r"fopenmp|[lg]omp", done.stderr):
                 break
     errors = (line for line in done.stderr.splitlines() if "error" in line)
@@ -98,24 +98,17 @@ def _ask(command: list[str]) -> subprocess.CompletedProcess[str]:
         raise UserError(f"{command[0]} cannot be run: {error}") from error
 
 
-def _version(compiler: list[str]) -> str:
-    """What it says of itself: a newer one may know more of the processor."""
-    return _ask([*compiler, "--version"]).stdout
-
-
 def _compiler() -> list[str]:
-    """The command of the C++ compiler: ``$CXX``, or the first that is installed."""
-    chosen = shlex.split(os.environ.get("CXX", ""))
-    if chosen:
-        return chosen
-    for candidate in ("c++", "g++", "clang++"):
-        if shutil.which(candidate):
-            return [candidate]
+    """Return the command of the C++ compiler: ``$CXX``, or the first that is installed."""
+    installed = [[name] for name in ("c++", "g++", "clang++") if shutil.which(name)]
+    for command in (shlex.split(os.environ.get("CXX", "")), *installed):
+        if command:
+            return command
     raise UserError("there is no C++ compiler; a package such as g++ or clang brings one")
 
 
 def _processor() -> str:
-    """Names the instruction set: a cache on a shared home may meet several machines."""
+    """Name the instruction set: several machines may share a home, and so the cache."""
     wanted = ("model name", "flags", "features", "cpu part")
     known = dict.fromkeys(line for line in cpu_info() if line.lower().startswith(wanted))
     return "\n".join([platform.machine(), platform.processor(), *known])
@@ -138,13 +131,13 @@ def trunk_features(
     conv2_weight: Tensor,
     conv2_bias: Tensor,
 ) -> Tensor:
-    """The features of pictures: normalisation, and twice convolution, 2x2 max pooling and ReLU.
+    """Compute the features: normalisation, and twice convolution, 2x2 max pooling and ReLU.
 
     Differentiable once with respect to the parameters. The compiled kernel serves the networks of
-    this project on the CPU; anything else, and every export, takes the torch operations.
-    Under ``torch.autocast`` the kernel multiplies in bfloat16 where the processor can, backward
-    only with a matrix unit. Its sums, features and gradients stay in single precision. The torch
-    operations follow autocast's own rules, which round features too.
+    this project on the CPU; anything else, and every export, takes the torch operations. Under
+    ``torch.autocast`` the kernel multiplies in bfloat16 where the processor can, backward only with
+    a matrix unit; its sums, features and gradients stay in single precision. The torch operations
+    follow autocast's own rules, which round features too.
 
     Args:
         frames: uint8 [batch, n, 45, 80] with n = 1 or 2. A slice of a longer stack of frames,
@@ -177,7 +170,7 @@ def _torch_features(
 
 
 def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
-    """Whether the kernel can do it."""
+    """Whether the kernel can compute these features."""
     if torch.compiler.is_compiling() or torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
         return False
     shapes = (
@@ -196,13 +189,13 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
 
 
 def _in_place(frames: Tensor) -> Tensor:
-    """The frames, copied only if a picture's own frames do not lie one after the other."""
+    """Copy the frames only if those of a picture do not lie one after the other."""
     rows, columns = FRAME
     return frames if frames.stride()[1:] == (rows * columns, columns, 1) else frames.contiguous()
 
 
 def _channels_innermost(weight: Tensor) -> Tensor:
-    """[filter, row, column, channel]: a copy only if the weight is not channels-last already."""
+    """Return the weight as [filter, row, column, channel]; a copy unless it is channels-last."""
     return weight.detach().permute(0, 2, 3, 1).contiguous()
 
 
@@ -213,17 +206,13 @@ def _pictures(frames: Tensor) -> tuple[int, int, int, int]:
 def _forward(
     frames: Tensor, parameters: tuple[Tensor, ...], saved: tuple[Tensor | None, ...]
 ) -> Tensor:
-    """The features; ``saved`` (hidden, winners1, winners2) are filled, unless None."""
+    """Compute the features, and fill ``saved`` (hidden, winners1, winners2) unless None."""
     library = load()
     assert library is not None
     weight1, bias1, weight2, bias2 = parameters
     # Named, so that copies live until the kernel is done.
-    given = (
-        _channels_innermost(weight1),
-        bias1.contiguous(),
-        _channels_innermost(weight2),
-        bias2.contiguous(),
-    )
+    kernels = _channels_innermost(weight1), _channels_innermost(weight2)
+    given = kernels[0], bias1.contiguous(), kernels[1], bias2.contiguous()
     features = torch.empty(frames.shape[0], FEATURES)
     library.trunk_forward(
         *_pictures(frames),

@@ -15,7 +15,6 @@ from hil_tests.testing.browser import (
     WHY,
     Tunnel,
     first_view,
-    open_browser,
     page,
     poll,
     reads,
@@ -24,8 +23,8 @@ from hil_tests.testing.browser import (
 )
 from hil_tests.testing.environments import ROVER
 from hil_tests.testing.people import LET_GO
-from trainer.person.coach import Coaching, Episode, advise
-from trainer.person.web import VIEWS_UNDERWAY, Cockpit
+from trainer.person.coach import Coaching, SittingEpisode, advise
+from trainer.person.web import Cockpit
 
 pytestmark = pytest.mark.usefixtures("opened")
 
@@ -82,14 +81,6 @@ async def test_in_the_congestion_left_and_right_steer(browser, cockpit):
     await browser.keyboard.up("ArrowUp")
 
 
-async def test_a_page_that_loses_the_focus_has_let_go(browser, cockpit):
-    await browser.keyboard.down("ArrowUp")
-    await reads(cockpit, lambda r: r.engaged)
-    await browser.evaluate("dispatchEvent(new Event('blur'))")
-    await reads(cockpit, lambda r: not r.engaged)
-    await browser.keyboard.up("ArrowUp")
-
-
 HIDE = "Object.defineProperty(document, 'hidden', {configurable: true, value: %s})"
 SEEN = "window.dispatchEvent(new Event('visibilitychange'))"
 
@@ -115,17 +106,9 @@ async def test_a_hidden_page_has_let_go_and_comes_back_without_a_pile_of_frames(
     assert await browser.evaluate("asked") == 1
 
 
-async def test_no_view_is_sent_ahead_of_what_is_drawn(browser, cockpit):
-    await browser.evaluate("window.asked = 0; requestAnimationFrame = () => asked++")
-    for step in range(20):
-        cockpit.show(view_of_step(step))
-        await asyncio.sleep(0.02)
-    assert await browser.evaluate("asked") <= VIEWS_UNDERWAY + 1  # One may be drawn already.
-
-
 async def test_a_key_whose_coming_up_may_be_lost_is_let_go(browser, cockpit):
-    for lost in ("new KeyboardEvent('keydown', {key: 'Meta', metaKey: true})",
-                 "new MouseEvent('contextmenu')"):  # fmt: skip
+    for lost in ("new Event('blur')", "new MouseEvent('contextmenu')",
+                 "new KeyboardEvent('keydown', {key: 'Meta', metaKey: true})"):  # fmt: skip
         await browser.keyboard.down("ArrowUp")
         await reads(cockpit, lambda r: r.engaged)
         await browser.evaluate(f"window.dispatchEvent({lost})")
@@ -180,15 +163,16 @@ async def test_a_finger_on_the_pad_drives(browser, cockpit):
     await reads(cockpit, lambda r: r == LET_GO)
 
 
-TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 768), (768, 1024)]
+TOUCHED = [(667, 375), (932, 430), (360, 640), (1024, 768), (768, 1024)]
 """Phones and tablets, either way up."""
-LONG_ADVICE = advise([Episode(0, "collision", 0.0, 0)] * 10, None, {})
+LONG_ADVICE = advise([SittingEpisode(0, "collision", 0.0, 0)] * 10, None, {})
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
-async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, scenario):
+async def test_a_thumb_finds_pad_and_buttons_beside_the_road(browser, cockpit, scenario):
     said = Coaching(LONG_ADVICE, "", "", [], [], 0.0, [])
-    async with open_browser(is_mobile=True, has_touch=True) as page:
+    context = await browser.context.browser.new_context(is_mobile=True, has_touch=True)
+    async with context, await context.new_page() as page:
         for width, height in TOUCHED:
             await page.set_viewport_size({"width": width, "height": height})
             await page.goto(cockpit.url)  # Laid out anew.
@@ -208,12 +192,6 @@ async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, scenario):
             assert road["width"] >= 0.55 * width, height
             beside = pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
             assert beside, (width, height)
-
-
-async def test_colours_are_those_of_every_view(browser):
-    for name in ("policy", "human", "applied"):
-        shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
-        assert await browser.evaluate(shown) == f"rgb{BY_NAME[name]}"
 
 
 async def test_a_gamepads_triggers_drive_while_its_button_is_held(browser, cockpit):
@@ -317,12 +295,12 @@ async def test_several_actions_are_drawn_in_colours_of_their_own(browser):
     with closing(Cockpit(scenario=ROVER)) as cockpit:
         await browser.goto(cockpit.url)
         await until(browser, LIVE)
-        for step in range(40):
+        for step in range(20):
             cockpit.show(replace(
                 view, step=step, policy_action=(0.9, 0.4), human_action=(0.0, 0.0),
                 applied_action=(-0.4, -0.9),
             ))  # fmt: skip
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(0.03)
         bars = await browser.evaluate(
             "[...document.querySelectorAll('.bar.policy u, .bar.applied u')]"
             ".map((bar) => getComputedStyle(bar).backgroundColor)"
@@ -343,7 +321,7 @@ async def test_the_coach_is_shown_and_leaves_where_there_is_none(browser, cockpi
     coach = Coaching(
         advice="Watch only.", said="42 s at the wheel", alone="94%", human_s=42.0,
         curve=[(5.0, 0.2), (30.0, 0.94)], typical=[(10.0, 0.5), (28.0, 0.9)],
-        episodes=[Episode(6, "collision", 0.0, 0), Episode(7, "goal", 2.25, 1, 1.5)],
+        episodes=[SittingEpisode(6, "collision", 0.0, 0), SittingEpisode(7, "goal", 2.25, 1, 1.5)],
     )  # fmt: skip
     cockpit.show(replace(first_view(), coach=coach))
     await until(browser, "document.getElementById('advice').textContent === 'Watch only.'")
@@ -399,5 +377,5 @@ async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, 
         await until(browser, "document.body.dataset.link === 'lost'")
         await press_again(browser, cockpit)
         joined = len(tunnel._ways)
-        await asyncio.sleep(3.0 * ("then" in how))
+        await asyncio.sleep(1.5 * ("then" in how))
         assert len(tunnel._ways) == joined, "it does not connect again and again"

@@ -4,14 +4,14 @@ from typing import Any
 
 import pytest
 
-from trainer.person.coach import Coach, Episode, advise, said, typical_curve
+from trainer.person.coach import Coach, SittingEpisode, advise, said, typical_curve
 
-FINE = Episode(0, "goal", 0.0, 0)
-HELPED = Episode(0, "goal", 2.0, 1, since_takeover_s=3.0)
-ALONE_FAILED = Episode(0, "collision", 0.0, 0)
-TOO_LATE = Episode(0, "collision", 0.5, 1, since_takeover_s=2.0)
-IN_TIME = Episode(0, "collision", 3.0, 1, since_takeover_s=2.1)
-RESTARTED = Episode(0, "restarted", 0.0, 0)
+FINE = SittingEpisode(0, "goal", 0.0, 0)
+HELPED = SittingEpisode(0, "goal", 2.0, 1, since_takeover_s=3.0)
+ALONE_FAILED = SittingEpisode(0, "collision", 0.0, 0)
+TOO_LATE = SittingEpisode(0, "collision", 0.5, 1, since_takeover_s=2.0)
+IN_TIME = SittingEpisode(0, "collision", 3.0, 1, since_takeover_s=2.1)
+RESTARTED = SittingEpisode(0, "restarted", 0.0, 0)
 ALL, NONE = dict.fromkeys(range(10), True), dict.fromkeys(range(10), False)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.report import STOPPED
+from bridge.outcomes import STOPPED
 from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, record, recorded_step
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from bridge.report import DISCARDED
+from bridge.outcomes import DISCARDED
 from hil_tests.processes import wait_until
 from hil_tests.testing.people import record, recorded_step
 from trainer.human.guide import Guide

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bridge.report import DISCARDED, RESTARTED, STOPPED
+from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
 from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 from trainer.drivers import constant_driver
 from trainer.person.drive import drive

@@ -1,0 +1,151 @@
+"""What every vehicle of this package does, in made-up time; and the mock by hand."""
+
+import math
+from typing import Any
+
+import pytest
+from hil_tests.testing.policies import T
+from hil_tests.testing.vehicles import CAR, CARS, PEDAL, HunterRig, MockRig, Ros2Rig, a_manifest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_runtime.vehicles import make_vehicle
+
+WILD = st.floats(allow_nan=False, allow_infinity=False)
+BAD = [{name: value} for name in ("pedal", "steering") for value in (math.nan, math.inf, -math.inf)]
+
+
+class VehicleConformance:
+    """The rules of `Vehicle`, for the rig of a subclass."""
+
+    make: Any = MockRig
+    holds_s = 2 * T  # a command
+    latches_silence = True  # only `enable` moves it after commands ceased
+
+    @pytest.fixture
+    def rig(self):
+        return self.make()
+
+    def moves(self, rig):
+        return rig.report.speed_mps > 0.01
+
+    def test_nothing_moves_it_before_it_is_enabled_nor_then_before_a_command(self, rig):
+        assert not self.moves(rig.step(100, PEDAL))
+        assert not self.moves(rig.enabled().step(100))
+
+    def test_commands_move_it_and_it_tells_of_no_fault(self, rig):
+        report = rig.driving().report
+        assert report.speed_mps > 0.3
+        assert (report.self_braking, report.faults, list(report.standing)) == (False, [], [])
+        assert report.action["pedal"] == pytest.approx(1.0, abs=0.05)
+
+    def test_without_commands_it_brakes_by_itself(self, rig):
+        rig.driving()
+        rig.core.command(PEDAL, rig.now_s)
+        rig.step(round(self.holds_s / 0.02))
+        assert not rig.report.self_braking
+        assert rig.step(2).report.self_braking
+        assert not self.moves(rig.step(200))
+        assert self.moves(rig.step(50, PEDAL)) != self.latches_silence
+
+    @pytest.mark.parametrize("latch", [True, False])
+    def test_a_stop_brakes_and_lasts_until_enable_or_the_next_command(self, rig, latch):
+        rig.driving().core.brake(rig.now_s, latch)
+        assert not self.moves(rig.step(200))
+        assert rig.report.action["pedal"] == pytest.approx(-1.0, abs=0.01)
+        rig.step(50, PEDAL)
+        assert self.moves(rig) != latch
+        rig.core.brake(rig.now_s, latch)
+        assert self.moves(rig.enabled().step(50, PEDAL))
+
+    @pytest.mark.parametrize("action", [*BAD, {}, {"": 0.5}])
+    def test_a_command_that_is_not_finite_or_lacks_an_action_is_refused(self, rig, action):
+        with pytest.raises(ValueError, match="a command that"):
+            rig.enabled().core.command(action, rig.now_s)
+        assert not self.moves(rig.step(10))
+
+    def test_it_stays_within_its_limits_whatever_is_asked(self):
+        @settings(max_examples=50)
+        @given(st.lists(st.tuples(WILD, WILD), max_size=10))
+        def drive(actions):
+            rig = self.make().enabled()
+            for pedal, steering in actions:
+                rig.step(5, {"pedal": pedal, "steering": steering})
+                assert all(-1.0 <= value <= 1.0 for value in rig.report.action.values())
+                assert 0.0 <= rig.report.speed_mps <= 6.0
+
+        drive()
+
+
+class TestHunter(VehicleConformance):
+    make = HunterRig
+    holds_s = 2.4 * T
+
+
+class TestRos2(VehicleConformance):
+    make = Ros2Rig
+    holds_s = 2.4 * T
+
+
+class TestMock(VehicleConformance):
+    latches_silence = False
+
+    def test_lag_and_rate_limit_by_hand(self):
+        """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
+        rig = MockRig(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9).enabled()
+        rig.core.command({"pedal": 1.0, "steering": 1.0}, rig.now_s)
+        after = rig.step(5).report
+        assert after.action["pedal"] == pytest.approx(1 - 2 * math.exp(-1))
+        assert after.action["steering"] == pytest.approx(1 - math.exp(-1))
+        pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
+        speed_mps = sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005
+        assert after.speed_mps == pytest.approx(speed_mps)
+        rig = MockRig(dead_time_s=0.0, time_constant_s=1e-9, slew_per_s=2.0).enabled()
+        rig.core.command(PEDAL, rig.now_s)
+        assert rig.step(5).report.action["pedal"] == pytest.approx(-1.0 + 0.2)
+
+    @pytest.mark.parametrize(("manifests", "ours", "car"), [
+        (CAR, None, CAR), (None, None, CARS["left_turn"]), (CARS["congestion"], CAR, CAR),
+    ])  # fmt: skip
+    def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(
+        self, manifests, ours, car
+    ):
+        names = ("throttle_mps2", "brake_mps2", "max_speed_mps") if ours else ()
+        settings = {name: getattr(ours, name) for name in names}
+        vehicle = make_vehicle("mock", {"mock": settings}, a_manifest(manifests))
+        vehicle.control_period_s = T
+        vehicle.enable(0.0)
+        speeds = []
+        for tick in range(400):
+            vehicle.command({"pedal": 1.0 if tick < 300 else -1.0}, tick * 0.1)
+            speeds.append(vehicle.feedback(tick * 0.1).speed_mps)
+        assert max(speeds) == car.max_speed_mps
+        changes = [(after - before) / 0.1 for before, after in zip(speeds, speeds[1:])]
+        assert max(changes) == pytest.approx(car.throttle_mps2, rel=0.01)
+        assert min(changes) == pytest.approx(-car.brake_mps2, rel=0.01)
+
+    def test_it_holds_a_command_for_two_periods_of_the_policy_and_its_steering_in_a_stop(self):
+        rig = MockRig().driving()
+        for period_s in (T, 0.5):
+            rig.core.control_period_s = period_s
+            rig.core.command({"pedal": 1.0, "steering": 0.5}, rig.now_s)
+            late_s = rig.now_s + 2 * period_s
+            assert not rig.core.feedback(late_s - 1e-6).self_braking
+            assert rig.core.feedback(late_s + 0.01).self_braking
+            rig.now_s = late_s + 0.01
+        stopped = rig.core.feedback(rig.now_s + 10.0)
+        assert stopped.speed_mps == 0.0
+        assert stopped.action == pytest.approx({"pedal": -1.0, "steering": 0.5}, abs=1e-3)
+
+    @pytest.mark.parametrize("brakes", [False, True])
+    def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it(self, brakes):
+        vehicle = MockRig(dead_time_s=0.1).enabled().core
+        vehicle.command(PEDAL, 200.0)
+        if brakes:
+            vehicle.brake(200.05)
+        assert vehicle.feedback(200.09).action["pedal"] == -1.0
+        assert (vehicle.feedback(200.19).action["pedal"] > -1.0) != brakes
+        assert vehicle.feedback(1e6).speed_mps == 0.0  # a long gap is no long computation
+
+
+del VehicleConformance  # not to be collected for itself

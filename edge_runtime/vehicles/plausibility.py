@@ -1,0 +1,245 @@
+"""Whether a vehicle can be believed. Pure: every call is passed the time, in monotonic seconds.
+
+Two watch over a vehicle with the same words (`Fault`). `VehicleWatch` sees the commands and reports
+of any driver. `DriveWatch` sees set-point and feedback of a streamed vehicle (core.py), in m/s and
+rad; so it finds a steering that does not follow, and a speed whose pedal nobody asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Deque, Dict, List, NamedTuple, Optional, Tuple
+
+from edge_runtime.controller import Limits
+from edge_runtime.safety import SILENCE_PERIODS
+
+if TYPE_CHECKING:
+    from edge_runtime.vehicles.base import VehicleReport
+    from edge_runtime.vehicles.mapping import HunterSpec
+
+PEDAL = "pedal"
+ENABLE_TIMEOUT_S = 1.0  # a vehicle may take so long to confirm that it is enabled
+DEVIATES_S = 0.1  # an actuator is stuck that deviates for so long without a break
+
+# Any driver: an actuator may be at what was asked within LAG_S, give or take a share of its range.
+LAG_S = 0.3
+LAG_DEVIATION = 0.125
+MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
+SPEED_NOISE_MPS = 0.5
+_ROUNDING = 5e-4  # of an action's range
+
+# A streamed vehicle: the age of a set-point that a drive may still follow; that of a wheel, by its
+# dead time and lag (what is heard of it is older still); and a share of top speed or of full lock.
+FOLLOWS_S = 1.0
+STEERS_S = 0.2
+DEVIATION = 0.1
+IMPOSSIBLE = 1.3  # times what the model can do
+
+
+class Fault(str, Enum):
+    SILENT = "feedback_silent"  # feedback that was due is missing, or repeats itself
+    LYING = "feedback_impossible"
+    STUCK = "speed_stuck"  # or an action of any driver
+    STEERING_STUCK = "steering_stuck"
+    SELF_BRAKING = "vehicle_self_braking"  # though it is to drive
+
+
+REASONS: Dict[Fault, str] = {
+    Fault.SILENT: "vehicle_silent",
+    Fault.LYING: "vehicle_lying",
+    Fault.STUCK: "vehicle_stuck",
+    Fault.SELF_BRAKING: "vehicle_self_braking",
+}
+"""What feedback and health say where `VehicleWatch` finds the fault."""
+
+
+class Finding(NamedTuple):
+    """A fault, or another event of a streamed vehicle; `words` are empty for what we asked for."""
+
+    event: Enum
+    words: str
+
+
+class Lasting:
+    """Since when a condition has held, at every look."""
+
+    def __init__(self) -> None:
+        self.since_s = math.inf
+
+    def note(self, holds: bool, now_s: float) -> None:
+        self.since_s = min(self.since_s, now_s) if holds else math.inf
+
+
+class Asked:
+    """What was asked within `window_s` of the newest, and what was in force when that began."""
+
+    def __init__(self, window_s: float) -> None:
+        self._window_s = window_s
+        self.noted: Deque[Tuple[float, Any]] = deque()
+
+    def note(self, asked: Any, now_s: float) -> None:
+        self.noted.append((now_s, asked))
+        while len(self.noted) > 1 and self.noted[1][0] < now_s - self._window_s:
+            self.noted.popleft()
+
+    def is_full(self, now_s: float) -> bool:
+        """Return whether all of the window before now is known."""
+        return bool(self.noted) and self.noted[0][0] <= now_s - self._window_s
+
+    @property
+    def values(self) -> List[Any]:
+        return [asked for _, asked in self.noted]
+
+
+class VehicleWatch:
+    """Watch the commands and reports of any driver. Not thread-safe."""
+
+    def __init__(self, control_period_s: float, limits: Limits) -> None:
+        self._silence_s, self._limits = 2 * control_period_s, limits
+        self._brakes_s = SILENCE_PERIODS * control_period_s
+        self._drives, self._enabled_s = False, -math.inf
+        self._braking, self._deviates = Lasting(), Lasting()
+        self._asked = Asked(LAG_S)
+        self._reported_s: Optional[float] = None
+        self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
+        self._lies = False
+
+    @property
+    def silent_at_s(self) -> float:
+        """When it counts as silent if no further report comes; inf before the first report."""
+        return math.inf if self._reported_s is None else self._reported_s + self._silence_s
+
+    def begin(self, now_s: float) -> None:
+        """Expect reports from now on."""
+        self._reported_s = now_s
+
+    def enable(self, now_s: float) -> None:
+        """Note that the driver is asked to take control: until it has, it brakes by itself."""
+        self._enabled_s = now_s
+
+    def command(self, action: Dict[str, float], now_s: float, drives: bool = True) -> None:
+        """Note what was asked; `drives` is False for a safe stop."""
+        self._drives = drives
+        self._asked.note(action, now_s)
+
+    def report(self, report: VehicleReport, now_s: float) -> None:
+        self._lies = self._is_impossible(report, now_s)
+        if not self._lies:
+            self._believed = (now_s, report.speed_mps)
+        self._reported_s = now_s
+        self._deviates.note(self._is_astray(report, now_s), now_s)
+        if not report.self_braking:
+            self._enabled_s = -math.inf  # it has taken control
+        self._braking.note(self._drives and report.self_braking, now_s)
+
+    def fault(self, now_s: float) -> Optional[Fault]:
+        if now_s > self.silent_at_s:
+            return Fault.SILENT
+        if self._lies:
+            return Fault.LYING
+        may_brake_until_s = max(self._braking.since_s, self._enabled_s + ENABLE_TIMEOUT_S)
+        if now_s - may_brake_until_s > self._brakes_s:
+            return Fault.SELF_BRAKING  # it obeys nobody, and would drive off with the next command
+        return Fault.STUCK if now_s - self._deviates.since_s > DEVIATES_S else None
+
+    def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
+        for name, value in report.action.items():
+            low, high = self._range(name)
+            slack = _ROUNDING * (high - low)
+            if not low - slack <= value <= high + slack:  # NaN is in no range
+                return True
+        if not math.isfinite(report.speed_mps):
+            return True
+        # From the last possible report on: a leap is a lie until that speed could be real.
+        since_s, speed_mps = self._believed or (now_s, report.speed_mps)
+        most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
+        return abs(report.speed_mps - speed_mps) > most_mps
+
+    def _is_astray(self, report: VehicleReport, now_s: float) -> bool:
+        if report.self_braking or not self._asked.is_full(now_s):
+            return False  # it obeys no command yet, or has had no time to
+        for name, value in report.action.items():
+            if name == PEDAL and report.commanded_speed_mps is not None:
+                continue  # worked out from a speed, whose limits are the driver's to judge
+            asked = [action[name] for action in self._asked.values if name in action]
+            low, high = self._range(name)
+            most = LAG_DEVIATION * (high - low)
+            if asked and not min(asked) - most <= value <= max(asked) + most:
+                return True
+        return False
+
+    def _range(self, name: str) -> Tuple[float, float]:
+        """Return the range of an action; one that the vehicle does not take lies in -1 to 1."""
+        limit = self._limits.get(name)
+        return (-1.0, 1.0) if limit is None else (limit.low, limit.high)
+
+
+class FollowWatch:
+    """Watch whether a measured value stays outside of all that a healthy actuator can do.
+
+    It is, give or take `tolerance`, where it was asked to be within `follows_s`. At first, or where
+    it was not judged for a time, it comes from elsewhere: by `rate` a second.
+    """
+
+    def __init__(self, tolerance: float, follows_s: float, rate: float = 1e9) -> None:
+        self._tolerance, self._rate = tolerance, rate
+        self._asked = Asked(follows_s)
+        self._low = self._high = 0.0  # a healthy one is in between
+        self._deviates = Lasting()
+
+    def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
+        """Note what is asked and measured now, and judge; a None is not judged."""
+        if measured is None:
+            self._asked.noted.clear()
+            return False
+        noted = self._asked.noted
+        nearer = self._rate * (now_s - noted[-1][0]) if noted else 0.0
+        self._asked.note(asked, now_s)
+        if not self._asked.is_full(now_s):  # it has had no time to follow
+            self._low = self._high = measured
+            self._deviates.note(False, now_s)
+            return False
+        self._low = min(*self._asked.values, self._low + nearer)
+        self._high = max(*self._asked.values, self._high - nearer)
+        follows = self._low - self._tolerance <= measured <= self._high + self._tolerance
+        self._deviates.note(not follows, now_s)
+        return now_s - self._deviates.since_s > DEVIATES_S
+
+
+class DriveWatch:
+    """Watch whether the drive and the steering of a streamed vehicle follow its set-point.
+
+    `silence_s` is how old feedback may be.
+    """
+
+    def __init__(self, spec: HunterSpec, silence_s: float) -> None:
+        full_rad = spec.centre_rad(spec.max_inner_steering_rad)
+        rate_radps, steers_s = spec.max_steering_rate_radps, STEERS_S + silence_s
+        self._speed = FollowWatch(DEVIATION * spec.max_speed_mps, FOLLOWS_S)
+        self._steering = FollowWatch(DEVIATION * full_rad, steers_s, rate_radps)
+
+    def stuck(
+        self, asked: Tuple[float, float], measured: Tuple[float, Optional[float]], now_s: float
+    ) -> Optional[Finding]:
+        """Note speed (m/s) and centre angle (rad; measured: None is not judged), and judge."""
+        (asked_mps, asked_rad), (speed_mps, turned_rad) = asked, measured
+        speed_is_stuck = self._speed.is_stuck(asked_mps, speed_mps, now_s)
+        steering_is_stuck = self._steering.is_stuck(asked_rad, turned_rad, now_s)
+        if speed_is_stuck:
+            words = f"the speed stays at {speed_mps:.2f} m/s, asked for {asked_mps:.2f}"
+            return Finding(Fault.STUCK, words)
+        if steering_is_stuck:
+            words = f"the steering stays at {turned_rad:.2f} rad, asked for {asked_rad:.2f}"
+            return Finding(Fault.STEERING_STUCK, words)
+        return None
+
+
+def impossible(speed_mps: float, inner_rad: float, spec: HunterSpec) -> str:
+    """Say what no vehicle of the model can do; empty where it can."""
+    if abs(speed_mps) > IMPOSSIBLE * spec.max_speed_mps:
+        return f"{speed_mps:.1f} m/s"
+    if abs(inner_rad) > IMPOSSIBLE * spec.max_inner_steering_rad:
+        return f"a steering angle of {inner_rad:.2f} rad"
+    return ""
