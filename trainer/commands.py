@@ -214,7 +214,7 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     compute and report the table of human guidance, which is not the paper's, or with status how
     much of it is done; typical: write the curves that a person's coach shows, from both tables'
     records"""
-    known = [*plan.EXPERIMENTS, *plan.WORDS]
+    known = [*plan.EXPERIMENTS, *plan.WORDS, *plan.STUDIES]
     add("names", nargs="+", metavar="NAME", choices=known, help=words)
     seeds = "trainings of each algorithm in each setting; the page tells of these alone"
     add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
