@@ -6,7 +6,7 @@ What is killed goes on from its last checkpoint, to the same bits.
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -44,15 +44,11 @@ EPISODES = {
     "outcome": "outcome",
     "human_steps": "human_steps",
     "takeovers": "interventions",
+    "validation_success": "validation_success",
+    "validation_distance_m": "validation_distance_m",
+    "validation_reward": "validation_reward",
 }
 """Column of the table of episodes -> column of a run's metrics."""
-VALIDATIONS = {
-    "at_step": "total_steps",
-    "success": "validation_success",
-    "distance_m": "validation_distance_m",
-    "reward": "validation_reward",
-}
-"""The same of the table of validations."""
 DRIVES = ("outcome", "distance_m", "reward", *ARRIVED_ONLY)  # What is measured in a test drive
 TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
@@ -107,8 +103,8 @@ def make_record(job: Job) -> Record | None:
         if not _train(job):
             return None
         rows = read_metrics(job.run_dir)
-        record["episodes"] = _columns(rows, EPISODES)
-        record["validations"] = _columns(list(filter(was_validated, rows)), VALIDATIONS)
+        record["episodes"] = {ours: [_value(row[theirs]) for row in rows]
+                              for ours, theirs in EPISODES.items()}  # fmt: skip
         env = make_environment(unit.environment)
         tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
         own = {
@@ -180,14 +176,14 @@ def _train(job: Job) -> bool:
     return run.over
 
 
-def _columns(rows: Sequence[Mapping[str, str]], names: Mapping[str, str]) -> Columns:
-    def value(text: str) -> Any:
-        try:
-            return int(text) if text.lstrip("-").isdigit() else rounded(float(text))
-        except ValueError:
-            return text  # an outcome
-
-    return {ours: [value(row[theirs]) for row in rows] for ours, theirs in names.items()}
+def _value(text: str) -> Any:
+    """Return a number of a row of metrics with five digits, None for nan, or an outcome."""
+    if text in ("", "nan"):
+        return None
+    try:
+        return int(text) if text.lstrip("-").isdigit() else rounded(float(text))
+    except ValueError:
+        return text
 
 
 def drive_tests(unit: Unit, policy: str, study: Study) -> dict[str, Columns]:

@@ -37,14 +37,22 @@ LATERAL, LONGITUDINAL = "lateral_acceleration_mps2", "longitudinal_acceleration_
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
 """Compared over drives that reach the goal only: a car that crashes at once is quick and smooth."""
 TABLES: Mapping[str, Sequence[str]] = {
-    "episodes": ("end_step", "return", DISTANCE, "outcome", "human_steps", "takeovers"),
-    "validations": ("at_step", SUCCESS, DISTANCE, REWARD),
+    "episodes": (
+        "end_step",
+        "return",
+        DISTANCE,
+        "outcome",
+        "human_steps",
+        "takeovers",
+        *(f"validation_{score}" for score in (SUCCESS, DISTANCE, REWARD)),
+    ),
     "tests": ("condition", "drives", SUCCESS, REWARD, DISTANCE),
     "drives": ("condition", "drive", *ARRIVED_ONLY),
     "units": ("digest", "period_s", "training_s"),
 }
-"""Table -> columns that it has at least: of trainings an episode and a validation a row, of tests a
-condition and a drive a row. The last one is written last: it says which units the others hold."""
+"""Table -> columns that it has at least: a row is a training episode, with the validation at its
+end if there was one; a test condition; a test drive; a unit. The last table is written last: it
+says which units the others hold."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
@@ -222,13 +230,13 @@ class Records:
     def _costs(self, unit: Unit) -> dict[str, float]:
         if not unit.trained:
             return {}
-        validations, episodes = self._validations[unit], self._episodes[unit]
-        whole = self._spent(unit, float(episodes.end_step.iloc[-1]))
-        lost = validations.success.max() - self.end(unit, ALONE, SUCCESS)
+        steps, success = self.points(unit, ALONE, SUCCESS)
+        whole = self._spent(unit, float(self._episodes[unit].end_step.iloc[-1]))
+        lost = success.max() - self.end(unit, ALONE, SUCCESS)
         row = {**whole, "unlearned": max(lost, 0.0)}  # A mean of equals may be rounded up
         for level in LEVELS:
-            there = validations.at_step[[is_reached(level, each) for each in validations.success]]
-            spent = self._spent(unit, float(there.iloc[0])) if len(there) else {}
+            there = steps[[is_reached(level, each) for each in success]]
+            spent = self._spent(unit, float(there[0])) if len(there) else {}
             row |= {f"{name}_to_{level:.0%}": spent.get(name, np.inf) for name in SPENT}
         return row
 
@@ -246,19 +254,15 @@ class Records:
         return {Unit(*key): rows for key, rows in self.tables["episodes"].groupby(KEY)}
 
     @cached_property
-    def _validations(self) -> dict[Unit, pd.DataFrame]:
-        return {Unit(*key): rows for key, rows in self.tables["validations"].groupby(KEY)}
-
-    @cached_property
     def _period_s(self) -> dict[tuple[Any, ...], float]:
         return self.tables["units"].period_s.to_dict()
 
     def points(self, unit: Unit, kind: str, metric: str) -> tuple[Numbers, Numbers]:
         """Return at which steps a metric was measured, and its values; in training an episode."""
-        if kind == ALONE:
-            rows = self._validations[unit]
-            return rows.at_step.to_numpy(float), rows[metric].to_numpy(float)
         rows = self._episodes[unit]
+        if kind == ALONE:
+            rows = rows[rows.validation_success.notna()]
+            return rows.end_step.to_numpy(float), rows[f"validation_{metric}"].to_numpy(float)
         if metric == SUCCESS:
             values = (rows.outcome == GOAL).to_numpy(float)
         else:

@@ -80,6 +80,13 @@ def record_of(store, unit=UNIT):
     return record
 
 
+def validated(*shares):
+    """The column of a validation every ninth episode: these successes, then the last one on."""
+    column = [None] * 100
+    column[8::9] = [*shares, *[shares[-1]] * 11][:11]
+    return {"validation_success": column}
+
+
 def made_up(unit, digest):
     """The record of a unit that learns to its skill, the more skilled the sooner."""
     skill = SKILLS.get(unit.algorithm, 0.9)
@@ -103,18 +110,14 @@ def made_up(unit, digest):
         own |= {"action": 0.1, "searched": 39, "search_success": 0.3}
     if unit.trained:
         own |= {"period_s": 0.1, "updates": 6000, "training_s": 300 + unit.seed}
-        ends, at_step = np.arange(60, 6_060, 60), np.arange(500, 6_001, 500) + 20
+        ends = np.arange(60, 6_060, 60)
         learned = skill * (1.0 - np.exp(-ends * skill / 900.0))
-        success = np.interp(at_step, ends, learned)
         record["episodes"] = {
             "end_step": ends.tolist(), "return": (20.0 * learned - 10.0).tolist(),
             "distance_m": (full_m * learned).tolist(), "takeovers": [1] * len(ends),
             "outcome": np.where(random.random(len(ends)) < learned, GOAL, COLLISION).tolist(),
-            "human_steps": [3] * len(ends),
-        }  # fmt: skip
-        record["validations"] = {
-            "at_step": at_step.tolist(), "success": success.tolist(),
-            "distance_m": (full_m * success).tolist(), "reward": (20 * success - 10).tolist(),
+            "human_steps": [3] * len(ends), **validated(*learned[8::9]),
+            "validation_distance_m": learned.tolist(), "validation_reward": learned.tolist(),
         }  # fmt: skip
     return {**record, "units": {name: [value] for name, value in own.items()}}
 
@@ -134,11 +137,12 @@ class TestUnit:
     def test_it_ends_as_a_record_and_an_actor(self, straight):
         (unit,) = straight.load([UNIT], 1).numbers.to_dict("records")
         rows = {name: pd.read_csv(straight.results / f"{name}.csv.xz")
-                for name in ("units", "episodes", "validations", "tests")}  # fmt: skip
+                for name in ("units", "episodes", "tests")}  # fmt: skip
         assert set(rows["tests"].condition) == set(CONDITIONS)
         assert set(rows["tests"].drives) == {TINY.test_runs}
         assert rows["episodes"].end_step.iloc[-1] == unit["steps"] >= TINY.steps["left_turn"]
-        assert unit["tested_actor_at_step"] in set(rows["validations"].at_step)
+        validated = rows["episodes"].dropna(subset="validation_success")
+        assert unit["tested_actor_at_step"] in set(validated.end_step)
         assert (unit["human_steps"], unit["takeovers"]) == (0, 0)
         assert pd.isna(unit["human_model"])
         assert json.loads(unit["config"]) == TINY.config(UNIT)
@@ -258,10 +262,9 @@ class TestTables:
         first, second = (leave(store, units) for units in (self.UNITS[:1], self.UNITS))
         assert (*first.found, *second.found) == (UNIT, *self.UNITS)
         own = made_up(GUIDED, "")
-        for name in ("episodes", "validations"):
-            rows = second.tables[name].loc[[tuple(GUIDED)]]
-            for column, values in own[name].items():
-                assert rows[column].tolist() == values
+        rows = second.tables["episodes"].loc[[tuple(GUIDED)]]
+        for column, values in own["episodes"].items():
+            assert rows[column].dropna().tolist() == [each for each in values if each is not None]
 
     def test_a_kill_while_tables_are_written_loses_nothing(self, store, monkeypatch):
         leave(store, self.UNITS[:1])
@@ -367,35 +370,33 @@ GOOD_UNITS = [Unit(*each) for each in product(
 )]  # fmt: skip
 
 
-def successes(*shares):
-    """A column of validations: these, and then the last one on."""
-    return {"success": [*shares, *[shares[-1]] * (12 - len(shares))]}
-
-
 class TestNumbers:
     def test_what_it_took_is_counted_until_the_validation_that_shows_it(self, store):
         found = leave(
             replace(store, study=PAPER), [GUIDED],
-            validations={**successes(0.4, 0.8, *[1.0] * 8, 0.9, 0.8),
-                         "at_step": list(range(500, 6_001, 500))},
-            episodes={"human_steps": [3, 5, *[7] * 98], "end_step": [700, 1500, *[6000] * 98],
-                      "outcome": [*[COLLISION] * 5, *[GOAL] * 95]},
+            episodes={**validated(0.4, 0.8, *[1.0] * 7, 0.9, 0.8),
+                      "outcome": [COLLISION] * 5 + [GOAL] * 95},
         )  # fmt: skip
         (row,) = found.numbers.to_dict("records")
-        assert (row["steps_to_90%"], row["episodes_to_90%"], row["failures_to_90%"]) == (1500, 2, 2)
-        assert row["human_s_to_98%"] == pytest.approx(0.8)
-        assert (row["steps"], row["human_steps"], row["failures"]) == (6000, 694, 5)
+        assert (row["steps_to_90%"], row["episodes_to_90%"], row["failures_to_90%"]) == (
+            1620,
+            27,
+            5,
+        )
+        assert row["human_s_to_98%"] == pytest.approx(8.1)
+        assert (row["steps"], row["human_steps"], row["failures"]) == (6000, 300, 5)
         assert row["unlearned"] == pytest.approx(0.1)  # the mean of 1.0, 0.9 and 0.8
-        assert found.human_s(GUIDED, found.grid("left_turn"))[:3] == pytest.approx([0, 0.3, 0.8])
+        given = found.human_s(GUIDED, found.grid("left_turn"))
+        assert given[:2] == pytest.approx([2.4, 4.8])
 
     def test_a_seed_that_never_learned_costs_more_than_any_other(self, store):
         units = [GUIDED._replace(seed=seed) for seed in (1, 2, 3)]
-        found = leave(store, units, validations=lambda unit: {
-            "success": [float(unit.seed < 3 and n >= unit.seed) for n in range(12)]
-        }).of("left_turn", Line("phil_td3"))  # fmt: skip
+        found = leave(store, units, episodes=lambda unit: validated(
+            *(float(unit.seed < 3 and n >= unit.seed) for n in range(12))
+        )).of("left_turn", Line("phil_td3"))  # fmt: skip
         cell = report.until(0.9, "steps")
-        assert cell(found) == "1,520 [1,020, ∞] (2 of 3)"
-        assert cell(found[1:]) == "∞ [1,520, ∞] (1 of 2)"
+        assert cell(found) == "1,620 [1,080, ∞] (2 of 3)"
+        assert cell(found[1:]) == "∞ [1,620, ∞] (1 of 2)"
         assert cell(found[2:]) == "never"
         assert report.spread([-0.3, -3.0, np.inf]) == "0 [-3, ∞]"
 
@@ -410,9 +411,11 @@ class TestNumbers:
         assert end == pytest.approx(values[steps > 4500].mean())
 
     def test_tests_are_summed_up_by_what_arrives_and_distances_end_at_the_goal(self):
-        drives: dict[str, Any] = {"outcome": [GOAL] * 50 + [COLLISION] * 50, "distance_m": [21.4] * 50 + [1.0] * 50,
-                  "reward": [1.0] * 100, "time_s": [4.0] * 50 + [1.0] * 50,
-                  records.LATERAL: [None] * 100, records.LONGITUDINAL: [0.5] * 100}  # fmt: skip
+        drives: dict[str, Any] = {
+            "outcome": [GOAL] * 50 + [COLLISION] * 50, "distance_m": [21.4] * 50 + [1.0] * 50,
+            "reward": [1.0] * 100, "time_s": [4.0] * 50 + [1.0] * 50,
+            records.LATERAL: [None] * 100, records.LONGITUDINAL: [0.5] * 100,
+        }  # fmt: skip
         row = records.summarise_tests("left_turn", "noise", drives)
         assert (row["success"], row["paper_success"], row["distance_m"]) == (0.5, 1.0, 11.0)
         assert (row["paper_distance_m"], row["paper_distance_sd_m"]) == (21.0, 0.0)
@@ -428,33 +431,33 @@ class TestNumbers:
         ours = [unit for unit in GOOD_UNITS if unit.algorithm == "hi_td3"]
 
         def steps(unit):
-            return {"human_steps": [2 if unit in ours[:cheaper] else 3] * 100}
+            cost = [2 if unit in ours[:cheaper] else 3] * 100
+            return {"human_steps": cost, **validated(0.0, 1.0)}
 
         def tests(unit):
             fails = unit in ours and behind and unit.scenario == "congestion"
             return {"success": [1.0, 1.0, 0.0 if fails else 1.0, 1.0]}
 
         monkeypatch.setattr(plan, "RIVALS", ("hi_td3",))
-        learned = successes(0.0, 1.0)
-        found = leave(store, GOOD_UNITS, episodes=steps, tests=tests, validations=learned)
+        found = leave(store, GOOD_UNITS, episodes=steps, tests=tests)
         assert report.verdict(found) == f"By the rule the default is {default}-TD3."
         assert report.less_in(report.pairs(found, "hi_td3")) == f"{cheaper} of 10"
 
     def test_pairs_of_which_none_learns_are_not_compared(self, store):
-        found = leave(store, GOOD_UNITS[:10], validations=lambda unit: successes(
+        found = leave(store, GOOD_UNITS[:10], episodes=lambda unit: validated(
             float(unit.algorithm == "phil_td3")
         ))  # fmt: skip
         (row,) = [line for line in report.place(found).splitlines() if line.startswith("| HI-TD3")]
         assert row.endswith("| ∞ [∞, ∞] | 0 of 5 |")
         other = replace(store, results=store.results / "other")
-        found = leave(other, GOOD_UNITS[:10], validations=successes(0.0))
+        found = leave(other, GOOD_UNITS[:10], episodes=validated(0.0))
         assert report.place(found).splitlines()[-1].endswith("| – | 0 of 5 |")
 
     def test_a_row_forgives_a_human_beside_whom_it_still_succeeds(self, store):
         units = [Unit("left_turn", *each, 1) for each in product(
             ("phil_td3", "hi_td3"), ("good", "slower")
         )]  # fmt: skip
-        found = leave(store, units, validations=successes(1.0), tests=lambda unit: {
+        found = leave(store, units, episodes=validated(1.0), tests=lambda unit: {
             "success": [0.6 if unit[1:3] == ("hi_td3", "slower") else 0.9] * 4
         })  # fmt: skip
         assert report.forgives(found) == "PHIL-TD3. Less beside some: HI-TD3 (slower 60.0)."
