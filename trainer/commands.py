@@ -210,7 +210,7 @@ def bench(parser: argparse.ArgumentParser) -> None:
 def experiment(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("what is computed").add_argument
     words = f"""compute what {", ".join(plan.EXPERIMENTS)} or all of them need, and report; status:
-    how much is done; report: draw the figures and judge the claims from what is done; guidance:
+    how much is done; report: draw the figures and write the page from what is done; guidance:
     compute and report the table of human guidance, which is not the paper's, or with status how
     much of it is done; typical: write the curves that a person's coach shows, from both tables'
     records"""
@@ -232,7 +232,7 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     options.add_time_limit(how, f"{last}command goes on from there")
     where = parser.add_argument_group("where it is kept")
     for option, default, text in (
-        ("--results", None, "records, figures and report (default: results/paper, or "
+        ("--results", None, "tables, figures and page (default: results/paper, or "
          "results/guidance; typical: the directory of both, results)"),
         ("--runs", None, "checkpoints and actors (default: runs/paper, or runs/guidance)"),
         ("--humans", kept("results/humans/paper"),
