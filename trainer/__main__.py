@@ -13,7 +13,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "plot": ("trainer.commands:plot", "draw the learning curve of a run"),
     "view": ("trainer.commands:view", "show recorded sittings in rerun"),
     "bench": ("trainer.commands:bench", "measure learner, environments and training beside peers"),
-    "experiment": ("trainer.commands:experiment", "run the paper's experiments, judge its claims"),
+    "experiment": ("trainer.commands:experiment", "run the paper's experiments or another table"),
 }
 
 

@@ -229,30 +229,31 @@ def bench(parser: argparse.ArgumentParser) -> None:
 )
 def experiment(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("what is computed").add_argument
-    words = f"""compute what {", ".join(plan.EXPERIMENTS)} or all of them need, and report; status:
-    how much is done; report: draw the figures and judge the claims from what is done; guidance:
-    compute and report the table of human guidance, which is not the paper's, or with status how
-    much of it is done; typical: write the curves that a person's coach shows, from both tables'
-    records"""
-    known = [*plan.EXPERIMENTS, *plan.WORDS]
+    words = (
+        f"compute the missing runs of {', '.join(plan.EXPERIMENTS)} or all (the paper's), or of "
+        "the guidance table, and write the page; status (of guidance): count the finished runs; "
+        "report: write the paper's page from the runs that there are; typical: write the curves "
+        "that the coach of the cockpit shows"
+    )
+    known = [*plan.EXPERIMENTS, *plan.WORDS, *plan.STUDIES]
     add("names", nargs="+", metavar="NAME", choices=known, help=words)
-    seeds = "trainings of each algorithm in each setting; the page tells of these alone"
+    seeds = "trainings of each algorithm in each setting"
     add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
-    one = f"compute this one only (default: all; {', '.join(plan.FOREIGN)}: of guidance)"
+    one = f"compute this task only (default: all; {', '.join(plan.FOREIGN)}: of guidance)"
     add("--scenario", choices=[*plan.SCENARIOS, *plan.FOREIGN], help=one)
-    quick = "a few steps of everything, kept in RUNS/quick: a look whose numbers mean nothing"
+    quick = "train for a few steps, in RUNS/quick: a trial whose numbers mean nothing"
     add("--quick", action="store_true", help=quick)
     how = parser.add_argument_group("how it is computed")
-    jobs = "processes of one thread each; 0: one a core"
+    jobs = "processes of one thread each; 0: one for each core"
     how.add_argument("--jobs", type=cli.not_negative, default=0, metavar="N", help=jobs)
     ray = "compute on a Ray cluster instead of this machine: HOST:PORT, auto or local"
     how.add_argument("--ray", metavar="ADDRESS", help=ray)
     options.add_device(how)
-    last = "begin nothing after this time, and stop what runs after its next episode; the same "
-    options.add_time_limit(how, f"{last}command goes on from there")
+    last = "stop every run after its next episode once this time is over; the same command resumes"
+    options.add_time_limit(how, last)
     where = parser.add_argument_group("where it is kept")
     for option, default, text in (
-        ("--results", None, "records, figures and report (default: results/paper, or "
+        ("--results", None, "tables, figures and page (default: results/paper, or "
          "results/guidance; typical: the directory of both, results)"),
         ("--runs", None, "checkpoints and actors (default: runs/paper, or runs/guidance)"),
         ("--humans", kept("results/humans/paper"),

@@ -9,7 +9,7 @@ import aiohttp
 import av
 import msgspec
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
+import pandas as pd
 import pytest
 from pyarrow import parquet
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from bridge.network import parse_spec
-from bridge.report import GOAL, TRUNCATED, UNKNOWN
+from bridge.outcomes import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime.cli import run_cli
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError

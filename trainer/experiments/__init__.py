@@ -1,1 +1,1 @@
-"""The paper's experiments: what is trained, the kept records, its claims, figures and report."""
+"""Tables of many runs: what they compare, their records, their pages and figures."""

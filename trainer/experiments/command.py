@@ -1,73 +1,292 @@
-"""Run the paper's experiments and hold their results against its claims; or compare guidance."""
+"""``python -m trainer experiment``: compute what is missing of a study, then write its page.
+
+Units are computed in processes of this machine or on a Ray cluster. Each leaves a file of its own;
+the tables are made of these at the end, or by the next command.
+"""
 
 import argparse
+import multiprocessing
+import os
+import sys
+import tempfile
+import threading
 import time
+import traceback
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from multiprocessing.connection import wait
 from pathlib import Path
+from typing import Any
 
+from bridge.progress import ProgressBar
+from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
-from trainer.experiments import plan
-from trainer.experiments.guidance import write_guidance, write_typical
-from trainer.experiments.plan import ALL, FOREIGN, GUIDANCE, REPORT, STATUS, TYPICAL
-from trainer.experiments.report import write_report
-from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
+from trainer import util
+from trainer.drivers import CHECKPOINT_FILE
+from trainer.experiments import plan, report
+from trainer.experiments.compute import BUSY, FAILED, FILES, FINISHED, STOPPED, Job, compute
+from trainer.experiments.plan import FOREIGN, REPORT, STATUS, STUDIES, TYPICAL
+from trainer.experiments.records import Store
+from trainer.human.config import MODEL_FILE
 from trainer.options import check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
-from trainer.util import cores, kept
+
+PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
+EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
+"""Exit status of a unit's process -> how the unit ended."""
+Files = dict[str, bytes]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute, say how much is done, or report; returns the exit status."""
+    """Compute, say how much is done, or report; return the exit status."""
     names = list(dict.fromkeys(arguments.names))
-    alone = {STATUS, REPORT, GUIDANCE, TYPICAL} & set(names)
-    if len(names) > 1 and alone and set(names) != {STATUS, GUIDANCE}:
+    studies = [name for name in names if name in STUDIES]
+    alone = {STATUS, REPORT, TYPICAL, *STUDIES} & set(names)
+    is_status_of_study = len(names) == 2 and STATUS in names and bool(studies)
+    if len(names) > 1 and alone and not is_status_of_study:
+        known = ", ".join(STUDIES)
         raise UserError(
-            f"{STATUS}, {REPORT}, {GUIDANCE} and {TYPICAL} stand alone, or {STATUS} with {GUIDANCE}"
+            f"{STATUS}, {REPORT}, {TYPICAL}, {known} stand alone, or {STATUS} with a table"
         )
     if names == [TYPICAL]:
-        results = Path(arguments.results or kept("results"))
-        write_typical(results, Path(arguments.humans), arguments.seeds, TYPICAL_FILE)
-        print(f"wrote {TYPICAL_FILE}")
-        return 0
-    work, quick, place = plan.PLAN, plan.QUICK, "paper"
-    if GUIDANCE in names:
-        work, quick, place = plan.GUIDANCE_PLAN, plan.QUICK_GUIDANCE, GUIDANCE
-    results = Path(arguments.results or kept(f"results/{place}"))
-    runs, humans = Path(arguments.runs or kept(f"runs/{place}")), Path(arguments.humans)
-    store = Store(work, results, runs, humans)
-    if arguments.quick:
-        store = Store(quick, runs / "quick" / "results", runs / "quick", humans)
+        return _write_typical(arguments)
+    store = _store(arguments, plan.study_of(names))
+    seeds = arguments.seeds
     if STATUS in names:
-        counted = GUIDANCE if GUIDANCE in names else ALL
-        print("\n".join(store.status_lines(counted, arguments.seeds, arguments.scenario)))
+        print("\n".join(_status(store, seeds, arguments.scenario)))
         return 0
+    everything = store.study.units(seeds)
     if names == [REPORT]:
-        print(f"wrote {write_report(store, arguments.seeds)}")
+        print(f"wrote {report.write_page(store, store.load(everything, seeds))}")
         return 0
+    units = store.study.units(seeds, arguments.scenario, names)
+    ends, left = _compute_missing(arguments, store, units)
+    if ends[FINISHED] < left:
+        print("the same command goes on")
+    records = store.load(everything, seeds)
+    if set(units) & set(records.found):
+        print(f"wrote {report.write_page(store, records)}")
+    return 1 if ends[FAILED] else 0
+
+
+def _store(arguments: argparse.Namespace, study: plan.Study) -> Store:
+    results = Path(arguments.results or util.kept(f"results/{study.name}"))
+    runs = Path(arguments.runs or util.kept(f"runs/{study.name}"))
+    if arguments.quick:
+        study, results, runs = study.quick(), runs / "quick" / "results", runs / "quick"
+    return Store(study, results, runs, Path(arguments.humans))
+
+
+def _write_typical(arguments: argparse.Namespace) -> int:
+    """Write the curves that a person's coach shows, of all studies."""
+    results, seeds = Path(arguments.results or util.kept("results")), arguments.seeds
+    found = []
+    for study in STUDIES.values():
+        store = Store(study, results / study.name, Path(os.devnull), Path(arguments.humans))
+        found.append(store.load(study.units(seeds), seeds))
+    report.write_typical(found, TYPICAL_FILE)
+    print(f"wrote {TYPICAL_FILE}")
+    return 0
+
+
+def _status(store: Store, seeds: int, scenario: str | None) -> Iterator[str]:
+    """Yield a line for each algorithm and setting of a study: how many units are done."""
+    units = store.study.units(seeds, scenario)
+    records = store.load(units, seeds)
+    done = Counter(unit[:3] for unit in records.found)
+    for line, count in Counter(unit[:3] for unit in units).items():
+        task, algorithm, setting = line
+        yield f"{setting:10} {algorithm:24} {task:11} {done[line]} of {count} done"
+    stale = f"{len(records.stale)} records of other settings"
+    yield f"{len(records.found)} of {len(units)} units done; {stale}"
+
+
+def _compute_missing(
+    arguments: argparse.Namespace, store: Store, wanted: Sequence[plan.Unit]
+) -> tuple[Counter[str], int]:
+    """Compute the units that have no current record.
+
+    Returns how many ended in which way, and how many there were to compute.
+    """
+    names, scenario = ", ".join(arguments.names), arguments.scenario
     if arguments.ray and arguments.device != "cpu":
         raise UserError("--ray computes on processors: leave out --device")
     check_device(arguments.device)
-    wanted = plan.units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
-        raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
+        raise UserError(f"{names}: nothing to compute in {scenario}")
     if arguments.ray and any(unit.scenario in FOREIGN for unit in wanted):
-        kinds = " or ".join(plan.SCENARIOS)
-        raise UserError(f"--ray lacks {', '.join(FOREIGN)}: compute one with --scenario {kinds}")
-    possible = [unit for unit in wanted if plan.is_possible(unit, humans)]
+        ours = " or ".join(plan.SCENARIOS)
+        raise UserError(f"--ray lacks {', '.join(FOREIGN)}: compute one with --scenario {ours}")
+    possible = [unit for unit in wanted if unit.is_possible(store.humans)]
     if left_out := len(wanted) - len(possible):
-        say(f"{left_out} units left out: {humans} holds no human model of their scenario")
-    done, _ = store.find(possible)
+        say(f"{left_out} units left out: {store.humans} holds no human model of their scenario")
+    done = set(store.load(possible, arguments.seeds).found)
     # The clock that the processes have, too.
     stop_at_s = deadline_s(arguments.max_minutes, time.time)
-    left = [Task(unit, store, stop_at_s, arguments.device) for unit in possible if unit not in done]
-    if left and arguments.ray:
-        ends = run_on_ray(left, arguments.ray)
+    jobs = [Job(each, store, stop_at_s, arguments.device) for each in possible if each not in done]
+    if jobs and arguments.ray:
+        ends = run_on_ray(jobs, arguments.ray)
     else:
-        ends = run_units(left, arguments.jobs or cores())
+        ends = run_here(jobs, arguments.jobs or util.cores())
     said = "".join(f", {count} {end}" for end, count in ends.items())
     print(f"{len(done)} of {len(wanted)} units were there already{said}")
-    if ends[FINISHED] < len(left):
-        print("the same command goes on")
-    if store.find(possible)[0]:
-        write = write_guidance if names == [GUIDANCE] else write_report
-        print(f"wrote {write(store, arguments.seeds)}")
-    return 1 if ends[FAILED] else 0
+    return ends, len(jobs)
+
+
+def run_here(jobs: Sequence[Job], processes: int) -> Counter[str]:
+    """Compute units in so many processes at a time; return how many ended in which way.
+
+    Each failure is one line. A process that dies takes no other unit with it, as one in an
+    executor's pool would.
+    """
+    context = multiprocessing.get_context("spawn")
+    ends: Counter[str] = Counter()
+    waiting, working = deque(jobs), dict[Any, tuple[Any, Job]]()
+    with ProgressBar("units", len(jobs)) as bar:
+        try:
+            while waiting or working:
+                while waiting and len(working) < processes:
+                    job = waiting.popleft()
+                    if time.time() > job.stop_at_s:  # a process takes seconds to find that out
+                        ends[STOPPED] += 1
+                        continue
+                    process = context.Process(target=_work, args=(job,), daemon=True)
+                    with util.interrupts_blocked():
+                        process.start()
+                    working[process.sentinel] = process, job
+                for sentinel in wait([*working]) if working else ():
+                    process, job = working.pop(sentinel)
+                    process.join()
+                    end = EXITS.get(process.exitcode, FAILED)
+                    if process.exitcode not in EXITS:
+                        say(f"failed: {job.unit}: its process died ({process.exitcode})")
+                    ends[end] += 1
+                    bar.advance({"last": str(job.unit)})
+        finally:
+            for process, _ in working.values():
+                process.kill()
+    return ends
+
+
+def say(line: str) -> None:
+    """Print one line on stderr, beside the progress bar."""
+    print(" ".join(line.split()), file=sys.stderr, flush=True)
+
+
+def _work(job: Job) -> None:
+    """Live as a process that computes a unit; the exit status tells how the unit ended."""
+    os.nice(5)  # a machine on which somebody works stays usable
+    threading.Thread(target=util.die_with_parent, daemon=True).start()
+    end, why = FAILED, ""
+    try:
+        end = compute_alone(job)
+    except UserError as error:
+        why = str(error)
+    except BaseException as error:
+        path = job.run_dir / "error.txt"
+        write_atomic(path, traceback.format_exc().encode())
+        why = f"{type(error).__name__}: {error} ({path})"
+    if end == FAILED:
+        say(f"failed: {job.unit}: {why}")
+    sys.exit(list(EXITS.values()).index(end))
+
+
+def compute_alone(job: Job) -> str:
+    """Compute a unit unless another process of this machine does."""
+    with util.held(job.run_dir, PATIENCE_S) as free:
+        if not free:
+            say(f"left to another process: {job.unit}")
+            return BUSY
+        return FINISHED if job.store.record_left(job.unit) else compute(job)
+
+
+def run_on_ray(jobs: Sequence[Job], address: str) -> Counter[str]:
+    """Compute units as Ray tasks of one processor each; return how many ended in which way.
+
+    ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
+
+    Raises UserError: Ray is not installed, or nothing answers at the address.
+    """
+    ray = _connected(address)
+    remote = ray.remote(num_cpus=1, max_retries=3)(compute_parcel)  # for nodes that die
+    ends: Counter[str] = Counter()
+    with ExitStack() as locks:
+        waiting = {}
+        for job in jobs:
+            if not locks.enter_context(util.held(job.run_dir, PATIENCE_S)):
+                ends[BUSY] += 1
+            elif job.store.record_left(job.unit):  # made elsewhere in the meantime
+                ends[FINISHED] += 1
+            else:
+                waiting[remote.remote(*pack(job))] = job
+        while waiting:
+            (ready, *_), _ = ray.wait(list(waiting))
+            job = waiting.pop(ready)
+            try:
+                end = unpack(job, *ray.get(ready))
+            except ray.exceptions.RayError as error:
+                cause = getattr(error, "cause", None) or error
+                last = str(cause).strip().splitlines()[-1:]  # a MemoryError says nothing
+                end = FAILED
+                say(": ".join((end, str(job.unit), type(cause).__name__, *last)))
+            ends[end] += 1
+            say(f"{job.unit}: {end}, {ends.total()} of {len(jobs)}")
+    return ends
+
+
+def pack(job: Job) -> tuple[Job, Files, Files]:
+    """Return a job with what a node needs for it: the human model, and what it goes on from."""
+    return job, _read(job.human_model.parent, [MODEL_FILE]), _read(job.run_dir, FILES)
+
+
+def compute_parcel(job: Job, human: Files, working: Files) -> tuple[str, Files]:
+    """Compute a unit on a node; return how it ended, and its working files."""
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        job = replace(job, store=replace(job.store, runs=root, humans=root / "humans"))
+        _write(job.human_model.parent, human)
+        _write(job.run_dir, working)
+        return compute(job), _read(job.run_dir, FILES)
+
+
+def unpack(job: Job, end: str, working: Files) -> str:
+    """Keep what a node made; return how the unit ended."""
+    _write(job.run_dir, working)
+    if end == FINISHED:
+        (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
+    return end
+
+
+def _read(directory: Path, names: Sequence[str]) -> Files:
+    """Return those of the files that are there."""
+    paths = [directory / name for name in names]
+    return {path.name: path.read_bytes() for path in paths if path.is_file()}
+
+
+def _write(directory: Path, files: Files) -> None:
+    """Write the files, each whole or not at all."""
+    make_directory(directory)
+    for name, data in files.items():
+        write_atomic(directory / name, data)
+
+
+def _connected(address: str) -> Any:
+    """Return the library, with a cluster behind it."""
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
+    if not ray.is_initialized():
+        import bridge
+        import edge_runtime
+        import trainer
+
+        # Nodes need the libraries; our own code is sent to them.
+        modules = {"py_modules": [edge_runtime, bridge, trainer]}
+        try:
+            ray.init(address=address, runtime_env=modules, log_to_driver=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise UserError(f"--ray {address}: no cluster answers: {error}") from error
+    return ray

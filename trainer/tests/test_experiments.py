@@ -1,0 +1,509 @@
+import json
+import multiprocessing
+import re
+import signal
+import threading
+import time
+from dataclasses import asdict, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bridge.outcomes import COLLISION, GOAL
+from edge_runtime.util import UserError
+from hil_tests.testing.commands import call, refusal
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
+from trainer.environments import CONDITIONS
+from trainer.experiments import command, compute, figures, plan, records, report
+from trainer.experiments.compute import FAILED, FINISHED, STOPPED, Job
+from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit
+from trainer.experiments.records import ALONE, RECORD_FILE, SUCCESS, Store
+from trainer.human.config import MODEL_FILE, HumanModelConfig
+from trainer.human.model import HumanModel
+from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
+from trainer.training.run import TrainingRun
+
+ROOT = Path(__file__).parents[2]
+TINY = replace(
+    PAPER.quick(),
+    steps=dict.fromkeys(PAPER.steps, 290),
+    learner={"batch_size": 4, "warmup_steps": 240},
+)
+UNIT = Unit("left_turn", "per_td3", "normal", 1)  # No human guides it
+GUIDED = UNIT._replace(algorithm="phil_td3")
+TIMES = ("training_s", "tests_s")
+SKILLS = {"phil_td3": 0.99, "hi_td3": 0.8, "per_td3": 0.4, plan.HUMAN_MODEL: 0.93}
+
+
+def store_in(directory, study=TINY):
+    return Store(study, directory / "results", directory / "runs", directory / "humans")
+
+
+@pytest.fixture
+def store(tmp_path):
+    return store_in(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """A unit that was never interrupted."""
+    store = store_in(tmp_path_factory.mktemp("straight"))
+    assert compute.compute(Job(UNIT, store)) == FINISHED
+    return store
+
+
+def write_human(store, scenario="left_turn", seed=1):
+    """An untrained one."""
+    directory = store.humans / scenario
+    directory.mkdir(parents=True, exist_ok=True)
+    HumanModel(HumanModelConfig(), seed).save(directory, {"scenario": scenario})
+    return directory / MODEL_FILE
+
+
+class Soon(float):
+    """A time that is still to come when it is first looked at, and over ever after."""
+
+    looked = False
+
+    def __lt__(self, other):
+        looked, self.looked = self.looked, True
+        return looked
+
+
+def record_of(store, unit=UNIT):
+    """What must be the same in a unit's record however often it was stopped."""
+    record = json.loads((store.run_dir(unit) / RECORD_FILE).read_text())
+    record["units"] = {name: it for name, it in record["units"].items() if name not in TIMES}
+    return record
+
+
+def validated(*shares):
+    """The column of a validation every ninth episode: these successes, then the last one on."""
+    column = [None] * 100
+    column[8::9] = [*shares, *[shares[-1]] * 11][:11]
+    return {"validation_success": column}
+
+
+def made_up(unit, digest):
+    """The record of a unit that learns to its skill, the more skilled the sooner."""
+    skill = SKILLS.get(unit.algorithm, 0.9)
+    random = np.random.default_rng([unit.seed, *"".join(unit[:3]).encode()])
+    full_m = plan.FULL_PATH_M.get(unit.scenario, 50.0)
+    drives = {}
+    for place, condition in enumerate(unit.conditions):
+        reached = random.random(60) < skill - 0.03 * place
+        drives[condition] = {
+            "outcome": [GOAL if arrived else COLLISION for arrived in reached],
+            "distance_m": np.where(reached, full_m + 0.2, full_m * random.random(60)).tolist(),
+            "reward": np.where(reached, 10.0, -10.0).tolist(),
+            **{name: random.gamma(2.0, 0.1, 60).tolist() for name in records.ARRIVED_ONLY},
+        }
+    tests = [records.summarise_tests(unit.scenario, *each) for each in drives.items()]
+    own = {"digest": digest, "bfloat16": unit.seed > 1, "gpu": "H100" if unit.seed > 2 else None}
+    record: dict[str, Any] = {"tests": {name: [row[name] for row in tests] for name in tests[0]}}
+    if Line(*unit[1:3]) in plan.BOXED:
+        record["drives"] = compute.arrivals(drives, plan.BOXES[unit.scenario])
+    if unit.algorithm == plan.CONSTANT:
+        own |= {"action": 0.1, "searched": 39, "search_success": 0.3}
+    if unit.trained:
+        own |= {"period_s": 0.1, "updates": 6000, "training_s": 300 + unit.seed}
+        ends = np.arange(60, 6_060, 60)
+        learned = skill * (1.0 - np.exp(-ends * skill / 900.0))
+        record["episodes"] = {
+            "end_step": ends.tolist(), "return": (20.0 * learned - 10.0).tolist(),
+            "distance_m": (full_m * learned).tolist(), "takeovers": [1] * len(ends),
+            "outcome": np.where(random.random(len(ends)) < learned, GOAL, COLLISION).tolist(),
+            "human_steps": [3] * len(ends), **validated(*learned[8::9]),
+            "validation_distance_m": learned.tolist(), "validation_reward": learned.tolist(),
+        }  # fmt: skip
+    return {**record, "units": {name: [value] for name, value in own.items()}}
+
+
+def leave(store, units, **columns):
+    """Write the made-up records of these units, with columns of some tables changed."""
+    for unit in units:
+        record = made_up(unit, store.study.digest(unit))
+        for table, values in columns.items():
+            record[table].update(values(unit) if callable(values) else values)
+        store.run_dir(unit).mkdir(parents=True, exist_ok=True)
+        (store.run_dir(unit) / RECORD_FILE).write_text(json.dumps(record))
+    return store.load(units, 5)
+
+
+class TestUnit:
+    def test_it_ends_as_a_record_and_an_actor(self, straight):
+        (unit,) = straight.load([UNIT], 1).numbers.to_dict("records")
+        rows = {name: pd.read_csv(straight.results / f"{name}.csv.xz")
+                for name in ("units", "episodes", "tests")}  # fmt: skip
+        assert set(rows["tests"].condition) == set(CONDITIONS)
+        assert set(rows["tests"].drives) == {TINY.test_runs}
+        assert rows["episodes"].end_step.iloc[-1] == unit["steps"] >= TINY.steps["left_turn"]
+        validated = rows["episodes"].dropna(subset="validation_success")
+        assert unit["tested_actor_at_step"] in set(validated.end_step)
+        assert (unit["human_steps"], unit["takeovers"]) == (0, 0)
+        assert pd.isna(unit["human_model"])
+        assert json.loads(unit["config"]) == TINY.config(UNIT)
+        assert {path.name for path in straight.run_dir(UNIT).iterdir()} >= {BEST_FILE, RECORD_FILE}
+        assert not (straight.run_dir(UNIT) / CHECKPOINT_FILE).exists()
+        assert str(straight.runs) not in (straight.run_dir(UNIT) / RECORD_FILE).read_text()
+
+    def test_a_killed_one_is_a_failure_and_goes_on_to_the_same_record(self, store, straight):
+        ends = []
+        working = threading.Thread(
+            target=lambda: ends.append(command.run_here([Job(UNIT, store)], 1))
+        )
+        working.start()
+        while not (store.run_dir(UNIT) / CHECKPOINT_FILE).exists():
+            assert working.is_alive()
+            time.sleep(0.02)
+        (process,) = multiprocessing.active_children()
+        process.kill()
+        working.join()
+        assert ends == [{FAILED: 1}]
+        assert not store.load([UNIT], 1).found
+        assert compute.compute(Job(UNIT, store)) == FINISHED
+        assert record_of(store) == record_of(straight)
+
+    def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(self, store, straight):
+        """Stopped before its time began, in a process and on a node."""
+        assert compute.compute(Job(UNIT, store, stop_at_s=1.0)) == STOPPED
+        assert compute.compute(Job(UNIT, store, stop_at_s=Soon(1e18))) == STOPPED
+        for stop_at_s, end in ((Soon(1e18), STOPPED), (1e18, FINISHED)):
+            job = Job(UNIT, store, stop_at_s)
+            assert CHECKPOINT_FILE in command.pack(job)[2]
+            assert command.unpack(job, *command.compute_parcel(*command.pack(job))) == end
+        assert record_of(store) == record_of(straight)
+        assert CHECKPOINT_FILE not in command.pack(job)[2]
+
+    def test_tests_that_change_are_driven_with_the_actor_that_is_there(self, straight, monkeypatch):
+        monkeypatch.setattr(TrainingRun, "train", lambda *_: pytest.fail("trained again"))
+        more = replace(straight, study=replace(TINY, test_runs=5))
+        before = record_of(straight)
+        assert more.record_left(UNIT) is None
+        assert compute.compute(Job(UNIT, more)) == FINISHED
+        after = record_of(straight)
+        assert after["tests"]["drives"] == [5] * len(CONDITIONS)
+        assert after["episodes"] == before["episodes"]
+        assert compute.compute(Job(UNIT, straight)) == FINISHED
+
+    def test_one_that_another_process_has_is_left_to_it(self, store, monkeypatch):
+        monkeypatch.setattr(command, "PATIENCE_S", 0.0)
+        with command.util.held(store.run_dir(UNIT)):
+            assert command.compute_alone(Job(UNIT, store)) == compute.BUSY
+
+    def test_a_foreign_task_is_learned_and_reported_beside_its_expert(self, tmp_path, one_thread):
+        store = store_in(tmp_path, GUIDANCE.quick())
+        units = [Unit("hill", name, "good", seed) for name, seed in (("expert", 0), ("ia_td3", 1))]
+        for unit in units:
+            assert compute.compute(Job(unit, store)) == FINISHED
+        found = store.load(units, 1)
+        expert, learned = (found.of("hill", Line(unit.algorithm, "good")).iloc[0] for unit in units)
+        assert expert["success nominal"] == 1.0
+        assert learned.human_s == pytest.approx(learned.human_steps / 30)
+        page = report.write_page(store, found).read_text()
+        assert (store.results / "guidance.png").stat().st_size > 1000
+        assert "| IA-TD3 | hill | 1 | never |" in page
+
+
+def test_a_failure_is_one_units_and_one_line(store, capfd):
+    write_human(store)
+    bad = GUIDED._replace(scenario="congestion")
+    write_human(store, bad.scenario).write_bytes(b"no human")
+    units = [bad, UNIT._replace(algorithm=plan.HUMAN_MODEL, seed=0)]
+    assert command.run_here([Job(unit, store) for unit in units], 2) == {FINISHED: 1, FAILED: 1}
+    found = store.load(units, 1)
+    assert found.found == units[1:]
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
+    assert str(bad) in line
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head without a processor of its own and two nodes of one each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    for _ in range(2):
+        cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.mark.ray
+def test_a_cluster_computes_all_units_but_the_one_that_fails(store, cluster):
+    units = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
+    store.run_dir(units[0]).mkdir(parents=True)
+    (store.run_dir(units[0]) / CHECKPOINT_FILE).write_bytes(b"no checkpoint")
+    ends = command.run_on_ray([Job(unit, store) for unit in units], cluster.address)
+    assert ends == {FAILED: 1, FINISHED: 2}
+    assert store.load(units, 3).found == units[1:]
+
+
+class TestTables:
+    UNITS = (UNIT, GUIDED, UNIT._replace(seed=2))
+
+    def test_records_join_those_that_are_there_and_come_back_as_they_were(self, store):
+        first, second = (leave(store, units) for units in (self.UNITS[:1], self.UNITS))
+        assert (*first.found, *second.found) == (UNIT, *self.UNITS)
+        own = made_up(GUIDED, "")
+        rows = second.tables["episodes"].loc[[tuple(GUIDED)]]
+        for column, values in own["episodes"].items():
+            assert rows[column].dropna().tolist() == [each for each in values if each is not None]
+
+    def test_a_kill_while_tables_are_written_loses_nothing(self, store, monkeypatch):
+        leave(store, self.UNITS[:1])
+        write = records.write_atomic
+        with monkeypatch.context() as patch:
+            patch.setattr(records, "write_atomic", lambda path, data: (
+                write(path, data) if "episodes" in path.name else signal.raise_signal(signal.SIGINT)
+            ))  # fmt: skip
+            with pytest.raises(KeyboardInterrupt):
+                leave(store, self.UNITS)
+        found = store.load(self.UNITS, 2)
+        assert tuple(found.found) == self.UNITS
+        assert (
+            not found.tables["episodes"].reset_index().duplicated([*records.KEY, "end_step"]).any()
+        )
+
+    @pytest.mark.parametrize("damage", [b"", b"no table", b"\xfd7zXZ\x00"])
+    def test_damage_is_refused_in_one_line(self, store, damage):
+        leave(store, self.UNITS)
+        path = store.results / "tests.csv.xz"
+        path.write_bytes(damage)
+        with pytest.raises(UserError, match=re.escape(str(path))) as refused:
+            store.load(self.UNITS, 1)
+        assert "\n" not in str(refused.value)
+
+    def test_records_of_another_version_are_left_out(self, store, monkeypatch):
+        leave(store, self.UNITS)
+        monkeypatch.setattr(plan, "RESULTS_VERSION", 99)
+        found = store.load(self.UNITS, 2)
+        assert (found.found, found.stale) == ([], [*self.UNITS])
+
+    @pytest.mark.parametrize("study", plan.STUDIES.values(), ids=plan.STUDIES)
+    def test_what_is_kept_is_complete_and_current(self, study, tmp_path):
+        store = Store(study, ROOT / "results" / study.name, tmp_path, ROOT / "results/humans/paper")
+        wanted, found = study.units(5), store.load(study.units(5), 5)
+        assert (found.found, found.stale) == (wanted, [])
+        assert len(found.tables["units"]) == len(wanted)
+        assert set(found.tables["episodes"].index) == {tuple(u) for u in wanted if u.trained}
+        assert len(found.tables["tests"]) == sum(len(unit.conditions) for unit in wanted)
+
+
+class TestPlan:
+    def test_what_decides_changes_the_digest_and_nothing_else_does(self, monkeypatch):
+        def digest(unit=GUIDED, **changes):
+            return replace(TINY, **changes).digest(unit)
+
+        assert digest() == digest(checkpoint_every=7) == digest(together=2)
+        digests = [
+            digest(), digest(UNIT), digest(GUIDED._replace(seed=2)),
+            digest(GUIDED._replace(setting="biased")), digest(GUIDED._replace(setting="printed")),
+            digest(steps={"left_turn": 300}), digest(evaluation_runs=3), digest(test_runs=4),
+            digest(learner={"tau": 0.5}),
+        ]  # fmt: skip
+        monkeypatch.setattr(plan, "RESULTS_VERSION", 99)
+        assert len({*digests, digest()}) == len(digests) + 1
+        # Tests do not name the training.
+        assert replace(TINY, test_runs=9).run_name(UNIT) == TINY.run_name(UNIT)
+        assert plan.digest({"a": 1, "b": {"x": 1, "y": 2}}) == plan.digest(
+            {"b": {"y": 2, "x": 1}, "a": 1}
+        )
+
+    def test_every_experiment_is_computed_by_all_line_by_line_and_seed_by_seed(self):
+        units = PAPER.units(5)
+        assert len(set(units)) == len(units) == 274
+        for name in plan.EXPERIMENTS:
+            assert set() < set(PAPER.units(5, None, [name])) <= set(units)
+        assert {unit.algorithm for unit in units[:4]} == set(plan.TESTED_ONLY)
+        assert [unit.seed for unit in units[4:44]] == sorted(unit.seed for unit in units[4:44])
+        assert units[44].setting == "biased"
+
+    def test_the_settings_are_what_they_say(self, store):
+        of = {
+            name: compute.run_config(
+                Job(GUIDED._replace(setting=name), replace(store, study=PAPER))
+            )
+            for name in plan.SETTINGS
+        }
+        assert of["one_frame"].learner.frames == 1
+        assert of["printed"].learner == PRINTED_LEARNER
+        assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
+        assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
+        assert {each.steps for each in of.values()} == {PAPER.steps["left_turn"]}
+
+    def test_the_table_of_guidance_has_every_row_with_every_human(self, store):
+        units = GUIDANCE.units(5)
+        assert len(set(units)) == len(units) == 482
+        lines = {unit[1:3] for unit in units if unit.trained}
+        rows, humans = set(plan.ROWS), set(plan.HUMANS)
+        assert lines == {*product(rows - {"per_td3"}, humans), ("per_td3", "good")}
+        assert {unit.scenario for unit in units} == set(plan.TASKS)
+        assert not set(units) & set(PAPER.units(5))
+        for unit in filter(lambda unit: unit.trained, units):
+            config = compute.run_config(Job(unit, replace(store, study=GUIDANCE)))
+            model = str(store.humans / unit.scenario)
+            assert config.human == (model if unit.setting == "model" else unit.scripted_human)
+            row = {**ALGORITHMS[unit.algorithm].settings, **plan.TUNED.get(unit.algorithm, {})}
+            assert row.items() <= asdict(config.learner).items()
+
+
+GOOD_UNITS = [Unit(*each) for each in product(
+    ("left_turn", "congestion"), ("phil_td3", "hi_td3"), ["good"], range(1, 6)
+)]  # fmt: skip
+
+
+class TestNumbers:
+    def test_what_it_took_is_counted_until_the_validation_that_shows_it(self, store):
+        found = leave(
+            replace(store, study=PAPER), [GUIDED],
+            episodes={**validated(0.4, 0.8, *[1.0] * 7, 0.9, 0.8),
+                      "outcome": [COLLISION] * 5 + [GOAL] * 95},
+        )  # fmt: skip
+        (row,) = found.numbers.to_dict("records")
+        assert (row["steps_to_90%"], row["episodes_to_90%"], row["failures_to_90%"]) == (
+            1620,
+            27,
+            5,
+        )
+        assert row["human_s_to_98%"] == pytest.approx(8.1)
+        assert (row["steps"], row["human_steps"], row["failures"]) == (6000, 300, 5)
+        assert row["unlearned"] == pytest.approx(0.1)  # the mean of 1.0, 0.9 and 0.8
+        given = found.human_s(GUIDED, found.grid("left_turn"))
+        assert given[:2] == pytest.approx([2.4, 4.8])
+
+    def test_a_seed_that_never_learned_costs_more_than_any_other(self, store):
+        units = [GUIDED._replace(seed=seed) for seed in (1, 2, 3)]
+        found = leave(store, units, episodes=lambda unit: validated(
+            *(float(unit.seed < 3 and n >= unit.seed) for n in range(12))
+        )).of("left_turn", Line("phil_td3"))  # fmt: skip
+        cell = report.until(0.9, "steps")
+        assert cell(found) == "1,620 [1,080, ∞] (2 of 3)"
+        assert cell(found[1:]) == "∞ [1,620, ∞] (1 of 2)"
+        assert cell(found[2:]) == "never"
+        assert report.spread([-0.3, -3.0, np.inf]) == "0 [-3, ∞]"
+
+    def test_tests_are_summed_up_by_what_arrives_and_distances_end_at_the_goal(self):
+        drives: dict[str, Any] = {
+            "outcome": [GOAL] * 50 + [COLLISION] * 50, "distance_m": [21.4] * 50 + [1.0] * 50,
+            "reward": [1.0] * 100, "time_s": [4.0] * 50 + [1.0] * 50,
+            records.LATERAL: [None] * 100, records.LONGITUDINAL: [0.5] * 100,
+        }  # fmt: skip
+        row = records.summarise_tests("left_turn", "noise", drives)
+        assert (row["success"], row["paper_success"], row["distance_m"]) == (0.5, 1.0, 11.0)
+        assert (row["paper_distance_m"], row["paper_distance_sd_m"]) == (21.0, 0.0)
+        assert (row["time_s"], row[records.LATERAL]) == (4.0, None)
+
+    @pytest.mark.parametrize(
+        ("cheaper", "behind", "default"),
+        [(10, 0, "HI"), (9, 0, "HI"), (8, 0, "PHIL"), (10, 1, "PHIL")],
+    )
+    def test_a_row_becomes_the_default_that_costs_less_and_is_nowhere_behind(
+        self, store, monkeypatch, cheaper, behind, default
+    ):
+        ours = [unit for unit in GOOD_UNITS if unit.algorithm == "hi_td3"]
+
+        def steps(unit):
+            cost = [2 if unit in ours[:cheaper] else 3] * 100
+            return {"human_steps": cost, **validated(0.0, 1.0)}
+
+        def tests(unit):
+            fails = unit in ours and behind and unit.scenario == "congestion"
+            return {"success": [1.0, 1.0, 0.0 if fails else 1.0, 1.0]}
+
+        monkeypatch.setattr(plan, "RIVALS", ("hi_td3",))
+        found = leave(store, GOOD_UNITS, episodes=steps, tests=tests)
+        assert report.verdict(found) == f"By the rule the default is {default}-TD3."
+        assert report.less_in(report.pairs(found, "hi_td3")) == f"{cheaper} of 10"
+
+    def test_pairs_of_which_none_learns_are_not_compared(self, store):
+        found = leave(store, GOOD_UNITS[:10], episodes=lambda unit: validated(
+            float(unit.algorithm == "phil_td3")
+        ))  # fmt: skip
+        (row,) = [line for line in report.place(found).splitlines() if line.startswith("| HI-TD3")]
+        assert row.endswith("| ∞ [∞, ∞] | 0 of 5 |")
+        other = replace(store, results=store.results / "other")
+        found = leave(other, GOOD_UNITS[:10], episodes=validated(0.0))
+        assert report.place(found).splitlines()[-1].endswith("| – | 0 of 5 |")
+
+    def test_a_row_forgives_a_human_beside_whom_it_still_succeeds(self, store):
+        units = [Unit("left_turn", *each, 1) for each in product(
+            ("phil_td3", "hi_td3"), ("good", "slower")
+        )]  # fmt: skip
+        found = leave(store, units, episodes=validated(1.0), tests=lambda unit: {
+            "success": [0.6 if unit[1:3] == ("hi_td3", "slower") else 0.9] * 4
+        })  # fmt: skip
+        assert report.forgives(found) == "PHIL-TD3. Less beside some: HI-TD3 (slower 60.0)."
+        assert report.learns(found).startswith("all rows but IA-TD3, vanilla TD3, ")
+
+    def test_a_row_is_held_against_the_human_that_guided_it(self, store):
+        rewards = {("phil_td3", "slower", 1): 5.0, ("phil_td3", "late", 1): 5.0,
+                   ("expert", "slower", 0): 3.0, ("expert", "good", 0): 9.0}  # fmt: skip
+        units = [Unit("left_turn", *each) for each in rewards]
+        found = leave(store, units, tests=lambda unit: {"reward": [rewards[unit[1:]]] * 4})
+        cell = report.outcomes(found)["return over the human's, nominal"]
+        cells = [cell(found.of("left_turn", Line(*unit[1:3]))) for unit in units]
+        assert cells == ["2.00", "-4.00", "-6.00", "0.00"]
+
+    def test_a_coachs_curves_are_the_medians_of_the_seeds_that_a_human_guided(
+        self, store, tmp_path
+    ):
+        units = [each._replace(seed=seed) for each in (UNIT, GUIDED) for seed in (1, 2, 3)]
+        found, path = leave(replace(store, study=PAPER), units), tmp_path / "typical.json"
+        report.write_typical([found], path)
+        (curve,) = json.loads(path.read_text())["left_turn"].values()
+        given, alone = zip(*curve["points"], strict=True)
+        assert (curve["human"], curve["seeds"], given[-1]) == ("normal", 3, 30.0)
+        ends = [found.curve(u, ALONE, SUCCESS, found.grid("left_turn"))[-1] for u in units[3:]]
+        assert alone[-1] == pytest.approx(np.median(ends), abs=1e-3)
+
+
+class TestCommand:
+    def test_a_page_is_made_of_the_tables_alone(self, tmp_path, capsys, monkeypatch):
+        store = store_in(tmp_path, PAPER)
+        write_human(store)
+        leave(store, PAPER.units(2, "left_turn", ["fig9", "fig7", "floor"]))
+        write = figures.write
+        monkeypatch.setattr(figures, "write", lambda figure, path: (
+            write(figure, path) if path.name == "fig10.png" else path.touch()  # pixels take long
+        ))  # fmt: skip
+        places = ("--results", store.results, "--runs", tmp_path, "--humans", store.humans)
+        assert call(capsys, "experiment", "report", "--seeds", 2, *places)[0] == 0
+        page = (store.results / "README.md").read_text()
+        assert (store.results / "fig10.png").stat().st_size > 1000
+        assert all((store.results / name).exists() for name in re.findall(r"\((\w+\.png)\)", page))
+        anchors = {f"#{re.sub('[^a-z0-9 -]', '', line[3:].lower()).replace(' ', '-')}"
+                   for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
+        assert set(re.findall(r"\((#[^)]*)\)", page)) <= anchors
+        assert "4 float32, 4 bfloat16" in page
+        assert str(tmp_path) not in page
+        last = call(capsys, "experiment", "status", "--seeds", 2, *places)[1].splitlines()[-1]
+        assert last == "10 of 112 units done; 0 records of other settings"
+
+    def test_what_is_missing_is_computed_and_reported(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setitem(figures.FIGURES, "paper", {})
+        more = ("--quick", "--scenario", "left_turn", "--runs", tmp_path)
+        status, out, _ = call(capsys, "experiment", "floor", *more)
+        results = tmp_path / "quick/results"
+        assert (status, out.splitlines()[-1]) == (0, f"wrote {results / 'README.md'}")
+        assert "constant actions in the left turn is" in (results / "README.md").read_text()
+        assert "1 of 1 units were there already" in call(capsys, "experiment", "floor", *more)[1]
+
+    def test_stopping_soon_leaves_it_to_the_same_command(self, tmp_path, capsys):
+        more = ("--quick", "--max-minutes", 1e-4, "--humans", tmp_path, "--runs", tmp_path)
+        status, out, err = call(
+            capsys, "experiment", "fig7", "--scenario", "left_turn", "--seeds", 1, *more
+        )
+        assert (status, "the same command goes on" in out) == (0, True)
+        assert "3 units left out" in err  # without their human
+        assert not (tmp_path / "quick/results").exists()
+
+    @pytest.mark.parametrize("names", ["status report", "guidance fig7", "typical all"])
+    def test_names_that_do_not_go_together_are_refused(self, capsys, names):
+        refusal(capsys, "experiment", *names.split())
