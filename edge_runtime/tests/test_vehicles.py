@@ -4,7 +4,7 @@ import math
 import sys
 import threading
 import time
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
@@ -38,9 +38,6 @@ class Cart(MockVehicle):
 class Half(Vehicle):
     def enable(self, now_s): ...
 
-class Boundless(Cart):
-    limits = {"pedal": (-1.0, 1.0)}  # no ActionLimit
-
 class Exits(Cart):
     def __init__(self):
         raise SystemExit(0)
@@ -49,11 +46,6 @@ class Raises(Cart):
     @property
     def limits(self):
         raise OSError("not connected")
-
-class Unknown(Cart):
-    @classmethod
-    def limits_of(cls, settings, manifest):
-        return None
 
 number = 3
 """
@@ -79,39 +71,29 @@ WHOLE = msgspec.structs.asdict(CAR)
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
-        ("tank", {}, r"'tank' is not known; choose from none, mock, hunter, ros2, milk_cart, or a"),
-        ("nowhere:Cart", {}, "'nowhere:Cart' cannot be loaded: .*No module named 'nowhere'"),
-        ("broken_cart:Cart", {}, "cannot be loaded: .*nowhere_to_be_found"),
-        ("carts:Wagon", {}, "cannot be loaded: .*Wagon"),
-        ("carts:", {}, "cannot be loaded"),
-        ("carts:number", {}, "carts:number is no edge_runtime.vehicles.base.Vehicle"),
-        ("carts:Half", {}, "no whole Vehicle: it lacks brake, close, command, feedback"),
-        ("carts:Boundless", {}, "cart: its limits must be like {'pedal': ActionLimit.*not {"),
-        ("carts:Exits", {}, "carts:Exits cannot be opened: SystemExit"),
-        ("carts:Raises", {}, "cart cannot be opened: OSError: not connected"),
-        ("milk_cart", {"speed": 3}, "settings of cart: .*'speed'; known are wheels, port"),
-        ("milk_cart", {"port": "ttyS9"}, "milk_cart cannot be opened: .*no such port"),
-        ("mock", {"mass": 3}, "vehicle.mock: .*unknown field `mass`; known are dead_time_s"),
-        ("mock", {"time_constant_s": 0.0}, "vehicle.mock.: time_constant_s 0.0 .*above 0"),
-        ("mock", {"slew_per_s": -1.0}, "slew_per_s -1.0 .*above 0"),
-        ("mock", {"dead_time_s": float("inf")}, "dead_time_s inf .*above 0"),
-        ("hunter", {"speed": 3}, "vehicle.hunter: .*unknown field `speed`; known are model, scale"),
-        ("hunter", {"bus": "can0"}, "bus 'can0'.*INTERFACE:CHANNEL"),
-        ("hunter", {"model": "3.0"}, "vehicle.hunter.model '3.0'.*2.0, se"),
-        ("hunter", {"profile": "v9"}, "vehicle.hunter.profile 'v9'.*v2, manual"),
-        ("hunter", {"scale": 0.0}, "scale 0.0.*above 0"),
-        ("hunter", {"scale": float("nan")}, "scale nan.*above 0"),
-        ("hunter", {"car": {"throttle_mps2": 1.0}}, "vehicle.hunter.car: .*brake_mps2"),
-        ("hunter", {"car": {**WHOLE, "mass": 1.0}}, "vehicle.hunter.car: .*unknown field `mass`"),
-        ("hunter", {"car": {**WHOLE, "full_steering_rad": 2.0}}, "2.0 is not valid: .*below 1.5"),
-        ("ros2", {"topic": 1}, "vehicle.ros2: .*unknown field `topic`; known are .*listen,"),
+        ("tank", {}, "'tank' is not known; choose from none, mock, hunter, ros2, milk_cart"),
+        ("broken_cart:Cart", {}, "nowhere_to_be_found"),
+        ("carts:Wagon", {}, "Wagon"),
+        ("carts:number", {}, "carts:number is no"),
+        ("carts:Half", {}, "lacks brake, close, command, feedback"),
+        ("carts:Exits", {}, "SystemExit"),
+        ("carts:Raises", {}, "not connected"),
+        ("milk_cart", {"speed": 3}, "'speed'; known are wheels, port"),
+        ("milk_cart", {"port": "ttyS9"}, "no such port"),
+        ("mock", {"mass": 3}, "unknown field `mass`"),
+        ("mock", {"time_constant_s": 0.0}, "time_constant_s 0.0"),
+        ("mock", {"dead_time_s": float("inf")}, "dead_time_s inf"),
+        ("hunter", {"bus": "can0"}, "bus 'can0'"),
+        ("hunter", {"model": "3.0"}, "model '3.0'"),
+        ("hunter", {"profile": "v9"}, "profile 'v9'"),
+        ("hunter", {"scale": float("nan")}, "scale nan"),
+        ("hunter", {"car": {"throttle_mps2": 1.0}}, "brake_mps2"),
+        ("hunter", {"car": {**WHOLE, "full_steering_rad": 2.0}}, "full_steering_rad 2.0"),
         ("ros2", {"connect": "tls/h:1"}, "plain text"),
-        ("ros2", {"listen": "tcp/h:1", "connect": "tcp/h:1"}, "give one of them"),
-        ("ros2", {"connect": "nowhere"}, "endpoint 'nowhere'"),
+        ("ros2", {"listen": "tcp/h:1", "connect": "tcp/h:1"}, "listen and connect"),
         ("ros2", {"twist_topic": ""}, "no topic to command by"),
         ("ros2", {"odometry_topic": ""}, "no odometry_topic"),
-        ("ros2", {"odometry_topic": "/cmd_vel"}, "a topic twice: cmd_vel, cmd_vel"),
-        ("ros2", {"twist_topic": "a b"}, "topic 'a b'"),
+        ("ros2", {"odometry_topic": "/cmd_vel"}, "a topic twice"),
         ("ros2", {"namespace": "9"}, "namespace '9'"),
         ("ros2", {"twist_angular": "degrees"}, "yaw_rate, steering"),
     ],
@@ -123,82 +105,67 @@ def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words
             read(name, {table: settings}, a_manifest())
 
 
-def test_the_limits_are_known_without_opening_anything():
-    opens = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
-    for name, settings in opens.items():
-        assert vehicle_limits(name, {name: settings}, a_manifest())
-    with pytest.raises(UserError, match="settings of cart"):
-        vehicle_limits("milk_cart", {"milk_cart": {"speed": 3}}, a_manifest())
-
-
 @pytest.mark.parametrize(
     "limit",
     [
-        (math.nan, 1.0), (-1.0, math.inf), (None, 1.0), ("-1", 1.0), (1.0, -1.0), (True, 1.0),
-        (-1.0, 1.0, math.nan), (-1.0, 1.0, None), (-1.0, 1.0, -2.0), (-1.0, 1.0, 0.0),
+        (math.nan, 1.0), (-1.0, math.inf), (None, 1.0), (1.0, -1.0), (True, 1.0),
+        (-1.0, 1.0, math.nan), (-1.0, 1.0, 0.0),
     ],
 )  # fmt: skip
 def test_limits_that_bound_nothing_are_refused_wherever_they_are_read(limit, monkeypatch):
     find_vehicle("carts:Cart")
-    monkeypatch.setattr(sys.modules["carts"].Cart, "limits", {"pedal": ActionLimit(*limit)})
-    for read in (make_vehicle, vehicle_limits):
-        with pytest.raises(UserError, match="limits"):
-            read("carts:Cart", {}, a_manifest())
-    with pytest.raises(UserError, match="limits"):
-        vehicle_limits("carts:Unknown", {}, a_manifest())
+    for limits in ({"pedal": ActionLimit(*limit)}, {"pedal": limit}, None):
+        monkeypatch.setattr(sys.modules["carts"].Cart, "limits", limits)
+        for read in (make_vehicle, vehicle_limits):
+            with pytest.raises(UserError, match="limits"):
+                read("carts:Cart", {}, a_manifest())
 
 
-def test_a_driver_of_another_package_gets_its_own_table():
+def test_a_driver_of_another_package_gets_its_own_table_and_its_limits_open_nothing():
     tables = {"milk_cart": {"wheels": 3}, "cart": {"wheels": 2}, "other": {"speed": 1}}
     for name, wheels in (("milk_cart", 3), ("carts:Cart", 2)):
         vehicle: Any = make_vehicle(name, tables, a_manifest())
         assert (vehicle.name, vehicle.wheels) == ("cart", wheels)
-        assert vehicle_limits(name, tables, a_manifest()) == MockVehicle.limits
-    assert find_vehicle("carts:Cart").name == "cart"
     # A recording has the name that it calls itself by.
     assert (installed_as("cart"), installed_as("mock")) == ("milk_cart", "mock")
     assert vehicle_limits("none", tables, a_manifest()) == {}
+    shut = {"milk_cart": {"port": "ttyS9"}, "hunter": {"bus": "socketcan:nowhere"}}
+    assert vehicle_limits("milk_cart", shut, a_manifest()) == MockVehicle.limits
+    assert vehicle_limits("hunter", shut, a_manifest())
 
 
-@pytest.mark.parametrize(
-    ("name", "table", "own"),
-    [("hunter", "Hunter", "hunter"), ("hunter", "huntr", "hunter"), ("carts:Cart", "crt", "cart")],
-)
-def test_a_misspelt_table_leaves_no_cap_at_its_default(name, table, own):
-    words = rf"\[vehicle.{table}\] is no table of {name}; did you mean \[vehicle.{own}\]"
+@pytest.mark.parametrize(("name", "table"), [("hunter", "huntr"), ("carts:Cart", "crt")])
+def test_a_misspelt_table_leaves_no_cap_at_its_default(name, table):
     for asked in (make_vehicle, vehicle_limits):
-        with pytest.raises(UserError, match=words):
+        with pytest.raises(UserError, match=table):
             asked(name, {table: {"scale": 0.05}, "mock": {}}, a_manifest())
     # Somebody else's, who is not asked for and not installed here, may stand beside it.
     assert vehicle_limits("mock", {table: {}}, a_manifest()) == MockVehicle.limits
 
 
-def test_a_robot_follows_the_manifests_car_or_that_of_the_settings():
-    for name in ("hunter", "ros2"):
-        known = vehicle_limits(name, {}, a_manifest(CAR))
-        assert known == vehicle_limits(name, {name: {"car": WHOLE}}, a_manifest())
-        assert known != vehicle_limits(name, {}, a_manifest())
-        with pytest.raises(UserError, match=rf"'parking'.* set car in \[vehicle.{name}\]"):
-            vehicle_limits(name, {}, a_manifest(None))
+@pytest.mark.parametrize("name", ["hunter", "ros2"])
+def test_a_robot_follows_the_manifests_car_or_that_of_the_settings(name):
+    known = vehicle_limits(name, {}, a_manifest(CAR))
+    assert known == vehicle_limits(name, {name: {"car": WHOLE}}, a_manifest())
+    assert known != vehicle_limits(name, {}, a_manifest())
+    with pytest.raises(UserError, match="'parking'"):
+        vehicle_limits(name, {}, a_manifest(None))
 
 
-def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, capsys):
+def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy):
     signed, endpoint, until = make_policy(value=1.0), free_endpoint(), threading.Event()
 
     class EmptyVehicle(BrokenVehicle):
         def __len__(self):  # Of its passengers, say: it is a driver all the same.
             return 0
 
-    vehicle, ended = EmptyVehicle(), []
-    settings = {"public_key": str(signed.public_key), "vehicle_id": "cart7", "log_level": "error"}
-
-    def drive():
-        call = edge_runtime.drive(
-            signed.path, connect=endpoint, vehicle=vehicle, until=until, **settings
-        )
-        ended.append(call)
-
-    thread = threading.Thread(target=drive)
+    vehicle = EmptyVehicle()
+    settings = {"public_key": str(signed.public_key), "vehicle_id": "cart7", "until": until}
+    thread = threading.Thread(
+        target=edge_runtime.drive,
+        args=(signed.path,),
+        kwargs={"connect": endpoint, "vehicle": vehicle, **settings},
+    )
     with Simulator(endpoint, "cart7") as simulator:
         thread.start()
         simulator.wait_for_edge()
@@ -209,16 +176,16 @@ def test_drive_from_python_moves_a_driver_until_it_is_told_to_end(make_policy, c
         wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps > 0.1, "it to move")
         until.set()
         thread.join(20.0)
-    assert (ended, "close" in vehicle.asked) == ([True], True)
-    assert "ready vehicle_id=cart7 vehicle=mock" in capsys.readouterr().out
+    assert not thread.is_alive()
+    assert "close" in vehicle.asked
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"speed": 3}, "unknown field `speed`; known are policy, connect"),
-        ({"cpus": "all"}, "cpus: Expected `array`"),
+        ({"speed": 3}, "unknown field `speed`"),
         ({"vehicle": "tank"}, "'tank' is not known"),
+        ({"vehicle": BrokenVehicle}, "is no edge_runtime.vehicles.base.Vehicle"),
         ({}, "absent.onnx does not exist"),
     ],
 )
@@ -227,19 +194,10 @@ def test_drive_refuses_what_run_refuses_and_closes_the_driver(settings, words, t
     with pytest.raises(UserError, match=words):
         edge_runtime.drive(tmp_path / "absent.onnx", **{"vehicle": vehicle, **settings})
     assert vehicle.asked == ["close"] * ("vehicle" not in settings)
-    vehicle.limits = None  # type: ignore[assignment]
-    for wrong, words in (
-        (BrokenVehicle, "is no edge_runtime.vehicles.base.Vehicle"),
-        (vehicle, "limits"),
-    ):
-        with pytest.raises(UserError, match=words):
-            edge_runtime.drive(tmp_path / "absent.onnx", vehicle=cast(Any, wrong))
-    with pytest.raises(AttributeError, match="no attribute 'drivee'"):
-        _ = edge_runtime.drivee
 
 
 def test_a_module_on_the_path_drives_a_run(make_policy, carts):
     (carts / "edge.toml").write_text("[vehicle]\ndriver = 'carts:Cart'\n[vehicle.cart]\nmass = 1\n")
     ended = run_command("run", *make_policy().flags, "--config", "edge.toml", cwd=carts)
-    words = "error: settings of cart: got an unexpected keyword argument 'mass'; known are wheels"
-    assert (ended.returncode, ended.stderr) == (2, f"{words}, port\n")
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "settings of cart: got an unexpected keyword argument 'mass'" in ended.stderr
