@@ -1,12 +1,12 @@
 """The driver on a real python-can bus within this process, its threads running."""
 
 import contextlib
+import os
 import socket
 import sys
 import threading
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -106,15 +106,9 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     assert chassis.heard == []
     enable(vehicle)
     drive(chassis, vehicle)
-    report = vehicle.feedback(time.monotonic())
-    assert report.speed_mps > 0.1
-    assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
+    assert vehicle.feedback(time.monotonic()).speed_mps > 0.1
     vehicle.brake(time.monotonic())
     wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
-    vehicle.command(PEDAL, time.monotonic())
-    count = len(chassis.speeds)
-    wait_until(lambda: len(chassis.speeds) > count + 5, "the stream going on")
-    assert set(chassis.speeds[count:]) == {0.0}
     enable(vehicle)
     drive(chassis, vehicle)
     vehicle.close()
@@ -126,18 +120,15 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
 
 
 def test_commands_that_cease_latch_a_stop_before_the_next_period(chassis, vehicle, monkeypatch):
-    for period_s in (stream.PERIOD_S, 3.0):
-        enable(vehicle)
-        drive(chassis, vehicle)
-        monkeypatch.setattr(stream, "PERIOD_S", period_s)
-        time.sleep(0.05)  # one more period of before
-        commanded_s = time.monotonic()
-        vehicle.command(PEDAL, commanded_s)
-        wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its own stop")
-        wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
-        assert time.monotonic() - commanded_s < 1.5
-        if period_s < 3.0:  # in which nothing is heard of the chassis
-            assert vehicle.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
+    enable(vehicle)
+    drive(chassis, vehicle)
+    monkeypatch.setattr(stream, "PERIOD_S", 3.0)
+    time.sleep(0.05)  # one more period of before
+    commanded_s = time.monotonic()
+    vehicle.command(PEDAL, commanded_s)
+    wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its own stop")
+    wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
+    assert time.monotonic() - commanded_s < 1.5
 
 
 def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle):
@@ -200,29 +191,18 @@ BUSES = {
     "slcan:/dev/ttyACM0": BusName("slcan", "/dev/ttyACM0", 500_000),
     "slcan:/dev/ttyACM0:250000": BusName("slcan", "/dev/ttyACM0", 250_000),
     "udp_multicast:": BusName("udp_multicast", hunter.GROUP, None, hunter.PORT),
-    "udp_multicast:239.1.2.3": BusName("udp_multicast", "239.1.2.3", None, hunter.PORT),
     "udp_multicast:239.1.2.3:7": BusName("udp_multicast", "239.1.2.3", None, 7),
-    **dict.fromkeys(("", "can0", ":can0", "slcan:a:fast", "slcan:a:0", "socketcan:")),
-    "socketcan:can0:500000": None,  # `ip link` sets it
-    **dict.fromkeys(f"udp_multicast:{group}" for group in ("10.0.0.1", "239.1.2:3", "ff15::1")),
-    **dict.fromkeys(f"udp_multicast:239.1.2.3:{port}" for port in ("0", "70000", "x", "")),
+    **dict.fromkeys(("can0", ":can0", "slcan:a:0", "socketcan:", "socketcan:can0:500000")),
+    **dict.fromkeys(f"udp_multicast:{group}" for group in ("10.0.0.1", "239.1.2.3:0")),
 }
 
 
-@pytest.mark.parametrize("text", BUSES)
-def test_names_of_buses(text):
-    with contextlib.nullcontext() if BUSES[text] else pytest.raises(UserError, match="write it as"):
-        assert parse_bus(text) == BUSES[text]
-
-
-def test_buses_that_cannot_be_opened_are_one_line(caplog, monkeypatch):
-    for text, words in (
-        ("socketcan:can97", "bus socketcan:can97 cannot be opened"),
-        ("nosuch:can0", "bus nosuch:can0 cannot be opened"),
-        ("slcan:/dev/nothing", "/dev/nothing.*manual"),
-        ("kvaser:0", "bus kvaser:0 cannot be opened"),
-    ):
-        with pytest.raises(UserError, match=f"^.*{words}.*$"):
+def test_buses_by_name_and_those_that_cannot_be_opened_are_one_line(caplog, monkeypatch):
+    for text, name in BUSES.items():
+        with contextlib.nullcontext() if name else pytest.raises(UserError, match="write it as"):
+            assert parse_bus(text) == name
+    for text in ("socketcan:can97", "nosuch:can0", "slcan:/dev/nothing", "kvaser:0"):
+        with pytest.raises(UserError, match=f"^.*{text} cannot be opened.*$"):
             open_bus(parse_bus(text))
     assert caplog.records == []  # a line of a library would be a second one
     monkeypatch.setitem(sys.modules, "can", None)
@@ -230,42 +210,24 @@ def test_buses_that_cannot_be_opened_are_one_line(caplog, monkeypatch):
         open_bus(parse_bus(DEFAULT_BUS))
 
 
-@pytest.fixture
-def port():
-    return int(free_endpoint("udp").rsplit(":", 1)[1])
-
-
-def sent_packets():
-    """Packets sent by each interface but the loopback's own."""
-    rows = (row.split(":") for row in Path("/proc/net/dev").read_text().splitlines()[2:])
-    return sum(int(values.split()[9]) for name, values in rows if name.strip() != "lo")
-
-
-def test_frames_reach_the_other_end_and_no_network(port):
-    name = f"udp_multicast:{hunter.GROUP}:{port}"
-    count = 300
-    with open_bus(parse_bus(name)) as near, open_bus(parse_bus(name)) as far:
-        before = sent_packets()
-        for number in range(count):
-            data = number.to_bytes(8, "big")
-            near.send(can.Message(arbitration_id=0x111, data=data, is_extended_id=False))
-            received = far.recv(1.0)
-            assert received is not None
-            assert (received.arbitration_id, bytes(received.data)) == (0x111, data)
-        time.sleep(0.02)
-        # The machine's own traffic goes on beside us; a frame each would be 300 and more.
-        assert sent_packets() - before < count / 2
-
-
-def test_what_is_sent_through_a_networks_device_is_not_heard(port):
-    """As a neighbour's frames come: the kernel loops them back from the device they leave by."""
-    with open_bus(parse_bus(f"udp_multicast:{hunter.GROUP}:{port}")) as far, socket.socket(
+def test_frames_reach_the_other_end_and_neither_leave_the_machine_nor_come_in():
+    """A neighbour's frames: the kernel loops them back from the device they leave by."""
+    port = int(free_endpoint("udp").rsplit(":", 1)[1])
+    name = parse_bus(f"udp_multicast:{hunter.GROUP}:{port}")
+    frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
+    with open_bus(name) as near, open_bus(name) as far, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
     ) as stranger, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        near.send(frame)
+        received = far.recv(1.0)
+        assert received is not None
+        assert (received.arbitration_id, bytes(received.data)) == (0x111, bytes(8))
+        with socket.socket(fileno=os.dup(near.fileno())) as same:
+            bound = same.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+            assert bound.rstrip(b"\0") == b"lo"
         asked.connect(("192.0.2.1", 9))  # our address on a network; nothing is sent
         device = socket.inet_aton(asked.getsockname()[0])
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, device)
-        frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
         stranger.sendto(pack_message(frame), (hunter.GROUP, port))
         assert far.recv(0.2) is None

@@ -32,16 +32,16 @@ def started():
         yield make
 
 
-def test_it_sends_fifty_times_a_second(started):
-    _, sent = started()
-    wait_until(lambda: len(sent) > 25, "half a second of sending")
+def test_it_sends_fifty_times_a_second_and_after_a_pause_once_for_all_missed_periods(started):
+    _, sent = started(pause_s=0.3)
+    wait_until(lambda: len(sent) > 21, "0.4 s of sending")
     # A machine that pauses loses periods; nothing may make it send more often than asked.
-    assert sent[25] - sent[0] > 0.45
+    assert sent[21] - sent[1] > 0.33
 
 
 def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(started, monkeypatch):
     monkeypatch.setattr(stream, "PERIOD_S", 60.0)
-    late_s = time.monotonic() + 0.3
+    late_s = time.monotonic() + 0.2
     running, sent = started(lambda: late_s if time.monotonic() < late_s else math.inf)
     wait_until(lambda: len(sent) == 2, "one more, at the command's end")
     assert sent[1] >= late_s
@@ -50,25 +50,7 @@ def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(start
 
 
 def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
-    monkeypatch.setattr(stream, "PERIOD_S", 1.0)
-    _, sent = started(pause_s=1.25)
+    monkeypatch.setattr(stream, "PERIOD_S", 0.6)
+    _, sent = started(pause_s=0.7)
     wait_until(lambda: len(sent) >= 2, "the next")
-    assert sent[1] - sent[0] < 1.9  # the next period would have come 2 s after the first
-
-
-def test_after_a_pause_it_sends_once_and_not_for_each_missed_period(started):
-    _, sent = started(pause_s=0.3)
-    wait_until(lambda: len(sent) > 10, "ten more")
-    assert sent[10] - sent[1] > 0.12
-
-
-def test_it_streams_until_the_condition_holds_and_never_longer_than_the_limit(started):
-    running, sent = started()
-    running.run_until(lambda: len(sent) > 5, limit_s=60.0)
-    assert len(sent) > 5
-    running.run_until(lambda: False, limit_s=0.05)
-    running.stop()
-    assert not running._thread.is_alive()
-    began_s = time.monotonic()
-    running.run_until(lambda: False, limit_s=60.0)
-    assert time.monotonic() - began_s < 30.0
+    assert sent[1] - sent[0] < 1.1  # the next period would have come 1.2 s after the first

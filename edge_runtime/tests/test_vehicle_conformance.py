@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from hil_tests.testing.policies import T
-from hil_tests.testing.vehicles import CAR, CARS, PEDAL, HunterRig, MockRig, Ros2Rig, a_manifest
+from hil_tests.testing.vehicles import CAR, PEDAL, HunterRig, MockRig, Ros2Rig, a_manifest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -50,9 +50,9 @@ class VehicleConformance:
 
     @pytest.mark.parametrize("latch", [True, False])
     def test_a_stop_brakes_and_lasts_until_enable_or_the_next_command(self, rig, latch):
-        rig.driving().core.brake(rig.now_s, latch)
+        rig.driving().step(50, {**PEDAL, "steering": 0.5}).core.brake(rig.now_s, latch)
         assert not self.moves(rig.step(200))
-        assert rig.report.action["pedal"] == pytest.approx(-1.0, abs=0.01)
+        assert rig.report.action == pytest.approx({"pedal": -1.0, "steering": 0.5}, abs=0.01)
         rig.step(50, PEDAL)
         assert self.moves(rig) != latch
         rig.core.brake(rig.now_s, latch)
@@ -104,38 +104,15 @@ class TestMock(VehicleConformance):
         rig.core.command(PEDAL, rig.now_s)
         assert rig.step(5).report.action["pedal"] == pytest.approx(-1.0 + 0.2)
 
-    @pytest.mark.parametrize(("manifests", "ours", "car"), [
-        (CAR, None, CAR), (None, None, CARS["left_turn"]), (CARS["congestion"], CAR, CAR),
-    ])  # fmt: skip
-    def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(
-        self, manifests, ours, car
-    ):
-        names = ("throttle_mps2", "brake_mps2", "max_speed_mps") if ours else ()
-        settings = {name: getattr(ours, name) for name in names}
-        vehicle = make_vehicle("mock", {"mock": settings}, a_manifest(manifests))
-        vehicle.control_period_s = T
-        vehicle.enable(0.0)
-        speeds = []
-        for tick in range(400):
-            vehicle.command({"pedal": 1.0 if tick < 300 else -1.0}, tick * 0.1)
-            speeds.append(vehicle.feedback(tick * 0.1).speed_mps)
-        assert max(speeds) == car.max_speed_mps
-        changes = [(after - before) / 0.1 for before, after in zip(speeds, speeds[1:])]
-        assert max(changes) == pytest.approx(car.throttle_mps2, rel=0.01)
-        assert min(changes) == pytest.approx(-car.brake_mps2, rel=0.01)
-
-    def test_it_holds_a_command_for_two_periods_of_the_policy_and_its_steering_in_a_stop(self):
-        rig = MockRig().driving()
-        for period_s in (T, 0.5):
-            rig.core.control_period_s = period_s
-            rig.core.command({"pedal": 1.0, "steering": 0.5}, rig.now_s)
-            late_s = rig.now_s + 2 * period_s
-            assert not rig.core.feedback(late_s - 1e-6).self_braking
-            assert rig.core.feedback(late_s + 0.01).self_braking
-            rig.now_s = late_s + 0.01
-        stopped = rig.core.feedback(rig.now_s + 10.0)
-        assert stopped.speed_mps == 0.0
-        assert stopped.action == pytest.approx({"pedal": -1.0, "steering": 0.5}, abs=1e-3)
+    def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(self):
+        fast = {"max_speed_mps": 8.0, "throttle_mps2": 2.0}
+        for car, ours, most in ((CAR, {}, 5.0), (None, {}, 6.0), (CAR, fast, 8.0)):
+            vehicle = make_vehicle("mock", {"mock": ours}, a_manifest(car))
+            vehicle.control_period_s = T
+            vehicle.enable(0.0)
+            for tick in range(100):
+                vehicle.command(PEDAL, tick * 0.1)
+            assert vehicle.feedback(10.0).speed_mps == most
 
     @pytest.mark.parametrize("brakes", [False, True])
     def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it(self, brakes):
