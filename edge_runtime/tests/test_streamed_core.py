@@ -1,21 +1,13 @@
 """What holds for every streamed vehicle, in made-up time: enabling, commands, stops, the table."""
 
 import math
-from pathlib import Path
 
 import pytest
-from hil_tests.testing.commands import render_table
 from hil_tests.testing.vehicles import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-import edge_runtime
-from edge_runtime.vehicles.core import (
-    LEADS_TO,
-    Speeds,
-    VehicleEvent,
-    VehicleState,
-)
+from edge_runtime.vehicles.core import LEADS_TO, Speeds, VehicleEvent, VehicleState
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import Fault, Finding
 
@@ -80,23 +72,12 @@ def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig
     assert rig.core.state is VehicleState.ENABLING
 
 
-def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
-    rig.driving(1.0)
-    rig.obeys, rig.speed_mps = False, 0.7
-    rig.step(130, {"pedal": -1.0})
-    assert rig.core.cause is Fault.STUCK
-    rig.enabled().step(40, {"pedal": -1.0})
-    assert rig.core.state is VehicleState.ENABLED
-    rig.step(30, {"pedal": -1.0})
-    assert rig.core.cause is Fault.STUCK
-
-
 TOLERANCE_RAD = 0.1 * SPEC.centre_rad(SPEC.max_inner_steering_rad)
 FOUND_WITHIN_S = 0.7
 """0.4 s to follow, 0.1 s of deviation, and 46 mrad at 1 rad/s, as for one that came from there."""
 
 
-@pytest.mark.parametrize("steering", [0.0, 0.1, -0.79, 0.79, 1.0])
+@pytest.mark.parametrize("steering", [0.0, -0.79, 1.0])
 @pytest.mark.parametrize("jammed", [-0.570, 0.570, 0.0, "asked"])
 @pytest.mark.parametrize("excess", [0.95, 1.05])
 def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
@@ -114,15 +95,6 @@ def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
     rig.step(round(FOUND_WITHIN_S / STREAM_S), {"steering": steering}, scenario_speed_mps=4.0)
     assert rig.core.cause is (Fault.STEERING_STUCK if wrong else None)
     assert rig.core.set_point.speed_mps == 0.0 if wrong else rig.speed_mps > 0.9
-
-
-def test_a_wheel_need_not_turn_before_it_is_to_drive(rig):
-    rig.jammed_rad = 0.5
-    rig.enabled().step(200, {"pedal": -1.0, "steering": -1.0})
-    assert rig.core.state is VehicleState.ENABLED
-    rig.step(60, PEDAL)
-    assert rig.core.cause is Fault.STEERING_STUCK
-    assert 0.0 < max(rig.speeds()) < 0.75
 
 
 @pytest.mark.parametrize(("speed_mps", "pedal"), [(0.0, 1.0), (0.1, -1.0)])
@@ -174,7 +146,6 @@ def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
     assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
     assert report.commanded_speed_mps == pytest.approx(report.speed_mps, abs=0.002)
     assert report.action["pedal"] == pytest.approx(1.0, abs=0.05)
-    assert (report.faults, report.self_braking) == ([], False)
     assert report.battery_v == rig.battery_v
     rig.step(20, {"pedal": -0.5})
     assert rig.report.action["pedal"] == pytest.approx(-0.5, abs=0.05)
@@ -182,9 +153,6 @@ def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
     assert rig.core.set_point.speed_mps == SPEC.max_speed_mps
     assert rig.report.scenario_speed_mps == pytest.approx(6.0)
     assert rig.report.action["pedal"] == pytest.approx(0.0, abs=0.01)
-    rig.step(50, {"pedal": -1.0})
-    assert rig.speed_mps == pytest.approx(0.5, abs=0.08)
-    assert rig.report.action["pedal"] == pytest.approx(-1.0, abs=0.15)
 
 
 def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(make):
@@ -195,9 +163,6 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(m
     assert similarity.centre_rad(-1.0) > 0  # -1 turns left
     assert rig.inner_rad == pytest.approx(SPEC.inner_rad(similarity.centre_rad(-1.0)), abs=1e-3)
     assert rig.report.action["steering"] == pytest.approx(-1.0, abs=0.02)
-    rig.step(100, {"steering": 1.0}, scenario_speed_mps=0.0)
-    assert rig.speed_mps == 0.0
-    assert rig.inner_rad < -0.05
 
 
 def fall_silent(rig):
@@ -262,13 +227,8 @@ def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
     assert rig.words == []
 
 
-def after(state, event):
-    return LEADS_TO[event].get(state, state)
-
-
 def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
     ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
-    assert all(before is not then for _, before, then in ways)
     assert {event for event, _, then in ways if then is VehicleState.ENABLED} == {
         VehicleEvent.CONFIRMED
     }
@@ -276,27 +236,18 @@ def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
     assert out_of_stopped == {VehicleEvent.ENABLE, VehicleEvent.CLOSE}
 
 
-def test_the_readme_shows_the_table():
-    readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
-    assert render_table(LEADS_TO, VehicleState, after) in readme
-
-
 @pytest.mark.parametrize("state", VehicleState)
 @pytest.mark.parametrize("event", LEADS_TO)
 def test_the_core_goes_where_the_table_says(rig, state, event):
     core = rig.core
-    core.state = state
-    core.set_point.speed_mps = 1.0
-    core._wish = core_wish = wish_of(PEDAL, None)
+    core.state, core.set_point.speed_mps = state, 1.0
+    core._wish = wish = wish_of(PEDAL, None)
     core._apply(Finding(event, "why"), rig.now_s)
-    leads_to = after(state, event)
-    assert core.state is leads_to
-    if leads_to is VehicleState.STOPPED and state is not VehicleState.STOPPED:
+    assert core.state is LEADS_TO[event].get(state, state)
+    assert core._wish is (wish if core.state is state else None)
+    assert core.set_point.speed_mps == (1.0 if core.state is state else 0.0)
+    if core.state is VehicleState.STOPPED and state is not VehicleState.STOPPED:
         assert (core.cause, core.words) == (event, "why")
-        assert core.set_point.speed_mps == 0
-        assert core._wish is None
-    elif leads_to is state:
-        assert core._wish is core_wish
 
 
 DRIVES: list = [("enable",), ("tick", 6), ("command", 1.0, 0.0, None), ("tick", 1)]
