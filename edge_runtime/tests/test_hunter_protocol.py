@@ -30,7 +30,7 @@ def test_golden_vectors():
 
 def test_feedback_by_hand():
     status = decode(0x211, bytes.fromhex("02 01 00 F5 02 C1 01 FF"))
-    assert status == protocol.SystemStatus(2, 1, pytest.approx(24.5), 0x02C1, 1, 255)
+    assert status == pytest.approx((2, 1, 24.5, 0x02C1, 1, 255))
     moving = decode(0x221, bytes.fromhex("FF 6A 00 00 00 00 00 C8"))
     assert moving == pytest.approx((-0.15, 0.2))
     fast = decode(0x253, bytes.fromhex("FF FF 00 0A FF FF FF FE"))

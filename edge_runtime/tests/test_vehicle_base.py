@@ -154,17 +154,10 @@ def test_a_stop_brakes_whatever_number_is_the_policys(vehicle, runner):
         assert runner.now() in ("", SILENT)  # a busy machine may pause; it is never stuck
 
 
-def test_an_enable_that_fails_ends_the_start_and_one_that_waits_for_an_operator_is_not_made(
-    vehicle, runner
-):
+def test_an_enable_that_fails_ends_the_start_and_is_a_fault_until_one_succeeds(vehicle, runner):
     vehicle.raises = {"enable": RuntimeError("no control of the gearbox")}
     with pytest.raises(UserError, match="vehicle mock cannot be enabled: no control"):
         NotingRunner(vehicle).start()
-    waiting = NotingRunner(BrokenVehicle())
-    waiting.start(armed=False)
-    waiting.wait_for_reports()
-    assert waiting._vehicle.asked == []
-    waiting.close()
     runner.enable()
     wait_until(lambda: runner.faults and "no control" in runner.now(), "the fault")
     assert runner.standing_fault(time.monotonic()) == ""  # to try again is how it ends

@@ -37,12 +37,9 @@ ARROWS = {
 EDGE_LIBRARIES = {
     "numpy", "onnxruntime", "zenoh", "msgspec", "cryptography", "tomli", "typing_extensions",
 }  # fmt: skip
-DOORS = {
-    "can": ROOT / "edge_runtime/vehicles/hunter/__init__.py",
-    "pycdr2": ROOT / "edge_runtime/vehicles/ros2/__init__.py",
-}
+DOORS = {"can": ROOT / "edge_runtime/vehicles/hunter/__init__.py"}
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""
-ELSEWHERE = {"ray", "pycdr2", "av", "pyarrow", "foxglove"}
+ELSEWHERE = {"ray", "av", "pyarrow", "foxglove"}
 ELSEWHERE |= {"stable_baselines3", "pytest", "hypothesis"}
 """Extras, and what the peers' environment has."""
 ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer", "bridge"}}

@@ -5,35 +5,21 @@ the session and two threads around it. The stream's thread publishes what `tick`
 driver makes a frame of each message, and has no stream of its own. Zenoh's thread hands every
 odometry to `hear`.
 
-Field names, order and types are those of the packages' .msg files (common_interfaces and
+A message is CDR behind a header of four bytes that says plain CDR (XCDR version 1), little-endian:
+`00 01 00 00`; a big-endian one is read, too. Each field is aligned to its size, counted from behind
+the header. Types and order of fields are those of the packages' .msg files (common_interfaces and
 ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
-the left, positive steering and yaw to the left (REP 103). On the wire they are CDR behind a header
-of four bytes that says plain CDR (XCDR version 1), little-endian: `00 01 00 00`; a big-endian one
-is read, too. Safe with several threads: pycdr2's own buffer, one for each type, is not used.
-
-No `from __future__ import annotations` here: pycdr2 reads the annotations, also on Python 3.8.
+the left, positive steering and yaw to the left (REP 103).
 """
+
+from __future__ import annotations
 
 import math
 import re
 import struct
 import time
 from collections import Counter
-from dataclasses import dataclass, field, is_dataclass
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Callable,
-    ClassVar,
-    Dict,
-    Iterator,
-    List,
-    NamedTuple,
-    Optional,
-    Type,
-    TypeVar,
-    Union,
-)  # fmt: skip
+from typing import Any, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type, Union
 
 import zenoh
 
@@ -46,15 +32,6 @@ from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
 from edge_runtime.vehicles.stream import StreamedVehicle
 from edge_runtime.wire import Reason
-
-try:
-    from pycdr2 import IdlStruct
-
-    # Private, but in the signature of `serialize`; the package is pinned, and a test would notice.
-    from pycdr2._support import Buffer, Endianness
-    from pycdr2.types import array, float32, float64, int32, uint32
-except ImportError:
-    raise UserError("ROS 2 messages need the package pycdr2: pip install pycdr2") from None
 
 # Beside our own 7447, where a bridge listens by default, too; and of this machine only.
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
@@ -95,174 +72,90 @@ class Motion(NamedTuple):
 
 PUBLISHER, SUBSCRIBER = "MP", "MS"
 _SLASH = "\u00a7"  # The bridge's replacement for a slash inside one chunk of a token.
+TWIST, ODOMETRY = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"
+DRIVE = "ackermann_msgs/msg/AckermannDriveStamped"
+# The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery.
 TYPES: Dict[str, str] = {
-    "ackermann_msgs/msg/AckermannDriveStamped": (
-        "48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf"
-    ),
-    "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
-    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    DRIVE: "48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf",
+    TWIST: "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
 }
-"""The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery."""
 
-HEADER_BYTES = 4
 MAX_PAYLOAD_BYTES = 1024 * 1024
+_ORDERS = {b"\0\0": ">", b"\0\1": "<"}  # the header's first two bytes: the order of bytes
+_LITTLE_ENDIAN = b"\0\1\0\0"
 _ALIGNMENT = 4  # DDS fills a message up to this.
-# What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
-_DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
-if TYPE_CHECKING:
-    Covariance = List[float]
-else:
-    Covariance = array[float64, 36]
+# Of an odometry: a position, a quaternion, their covariance; two vectors of speed, theirs.
+_DOUBLES = 3 + 4 + 36 + 6 + 36
+_LINEAR_X, _ANGULAR_Z = 43, 48
 
 
-@dataclass
-class RosTime(IdlStruct, typename="builtin_interfaces/msg/Time"):
-    sec: int32 = 0
-    nanosec: uint32 = 0
+class Odometry(NamedTuple):
+    """What is read of a nav_msgs/Odometry: its stamp (0: none), and its twist (m/s, rad/s)."""
+
+    stamp_ns: int
+    linear_x: float
+    angular_z: float
 
 
-@dataclass
-class Header(IdlStruct, typename="std_msgs/msg/Header"):
-    stamp: RosTime = field(default_factory=RosTime)
-    frame_id: str = ""
-
-
-@dataclass
-class AckermannDrive(IdlStruct, typename="ackermann_msgs/msg/AckermannDrive"):
-    """`steering_angle` (rad) of a wheel at the centre of the front axle; `speed` in m/s.
-
-    Zero in `acceleration` (m/s2), `jerk` and `steering_angle_velocity` means as quick as can be.
-    """
-
-    steering_angle: float32 = 0.0
-    steering_angle_velocity: float32 = 0.0
-    speed: float32 = 0.0
-    acceleration: float32 = 0.0
-    jerk: float32 = 0.0
-
-
-@dataclass
-class AckermannDriveStamped(IdlStruct, typename="ackermann_msgs/msg/AckermannDriveStamped"):
-    header: Header = field(default_factory=Header)
-    drive: AckermannDrive = field(default_factory=AckermannDrive)
-
-
-@dataclass
-class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
-    """Three numbers; as a Point of the same layout, a place in metres."""
-
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-
-
-@dataclass
-class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-    w: float64 = 1.0
-
-
-@dataclass
-class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
-    linear: Vector3 = field(default_factory=Vector3)
-    angular: Vector3 = field(default_factory=Vector3)
-
-
-@dataclass
-class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
-    position: Vector3 = field(default_factory=Vector3)
-    orientation: Quaternion = field(default_factory=Quaternion)
-
-
-@dataclass
-class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
-    """A pose, and the covariance of x, y, z and the rotations about them."""
-
-    pose: RosPose = field(default_factory=RosPose)
-    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
-
-
-@dataclass
-class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
-    twist: Twist = field(default_factory=Twist)
-    covariance: Covariance = field(default_factory=lambda: [0.0] * 36)  # unknown
-
-
-@dataclass
-class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
-    """A pose in the frame `header.frame_id`, and the velocity in the frame `child_frame_id`."""
-
-    header: Header = field(default_factory=Header)
-    child_frame_id: str = ""
-    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
-    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
-
-
-_M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry)
-
-
-def encode(message: IdlStruct) -> bytes:
-    """Return little-endian CDR. Raises struct.error for a number that its field cannot hold."""
-    return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
-
-
-def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Reason]:
-    """Return a message of the kind with finite numbers, or why it is none. Never raises."""
+def read_odometry(payload: bytes) -> Union[Odometry, Reason]:
+    """Return an odometry whose numbers are all finite, or why it is none. Never raises."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         return Reason.OVERSIZED
-    if len(payload) < HEADER_BYTES:
+    if len(payload) < len(_LITTLE_ENDIAN):
         return Reason.MALFORMED
-    if payload[:2] not in (b"\0\0", b"\0\1"):  # big-endian, little-endian
+    order = _ORDERS.get(payload[:2])
+    if order is None:
         return Reason.SCHEMA
-    buffer = Buffer(payload, align_offset=HEADER_BYTES)
     try:
-        # A buffer of our own in place of the bytes, to see where the message ends.
-        message: _M = kind.deserialize(buffer)  # type: ignore[arg-type]
-    except _DECODE_ERRORS:
+        sec, nanosec, length = struct.unpack_from(f"{order}iII", payload, 4)
+        child = 16 + _aligned(length, 4)  # behind the name of the frame
+        (length,) = struct.unpack_from(f"{order}I", payload, child)
+        begin = 4 + _aligned(child + length, 8)  # behind the name of the child frame
+        numbers = struct.unpack_from(f"{order}{_DOUBLES}d", payload, begin)
+    except struct.error:
         return Reason.MALFORMED
-    # pycdr2 takes a text or data that is cut off for a short one; and the type is not in the
-    # payload: what is left over is the mark of another one.
-    if not 0 <= len(payload) - buffer.tell() < _ALIGNMENT:
+    # The type is not in the payload: what is left over is the mark of another one.
+    if len(payload) - begin - 8 * _DOUBLES >= _ALIGNMENT:
         return Reason.MALFORMED
-    return message if all(map(math.isfinite, _floats(message))) else Reason.NOT_FINITE
+    if not all(map(math.isfinite, numbers)):
+        return Reason.NOT_FINITE
+    return Odometry(sec * 10**9 + nanosec, numbers[_LINEAR_X], numbers[_ANGULAR_Z])
 
 
-def _floats(value: Any) -> Iterator[float]:
-    if isinstance(value, float):
-        yield value
-    elif isinstance(value, (list, tuple)):  # a covariance
-        yield from value
-    elif is_dataclass(value):
-        for part in vars(value).values():
-            yield from _floats(part)
+def _aligned(place: int, size: int) -> int:
+    return -(-place // size) * size
 
 
-def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
-    """Return `linear.x` in m/s, and `angular.z` as yaw rate (rad/s) or steering angle (rad).
+def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> bytes:
+    """Return a Twist: `linear.x` in m/s, `angular.z` as yaw rate (rad/s) or steering angle (rad).
 
     A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
     """
     z = motion.centre_rad
     if angular != STEERING:
         z = motion.speed_mps * math.tan(motion.centre_rad) / wheelbase_m
-    return Twist(linear=Vector3(x=motion.speed_mps), angular=Vector3(z=z))
+    return _LITTLE_ENDIAN + struct.pack("<6d", motion.speed_mps, 0.0, 0.0, 0.0, 0.0, z)
 
 
-def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
-    """Return speed and centre angle; no acceleration: the speed is a ramp already."""
-    return AckermannDriveStamped(
-        header=Header(RosTime(*divmod(time_ns, 10**9)), "base_link"),
-        drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
-    )
+def drive_of(motion: Motion, time_ns: int) -> bytes:
+    """Return an AckermannDriveStamped of speed (m/s) and centre angle (rad).
+
+    No acceleration (0: as quick as can be): the speed is a ramp already.
+    """
+    frame = b"base_link\0"
+    header = struct.pack("<iII10s2x", *divmod(time_ns, 10**9), len(frame), frame)
+    # Angle, its rate, speed, acceleration, jerk.
+    return _LITTLE_ENDIAN + header + struct.pack(
+        "<5f", motion.centre_rad, 0.0, motion.speed_mps, 0.0, 0.0
+    )  # fmt: skip
 
 
 def member_token(zid: str) -> str:
     return f"@/{zid}/@ros2_lv"
 
 
-def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
+def topic_token(zid: str, role: str, key: str, kind: str) -> str:
     """Return the token of a PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
@@ -272,8 +165,8 @@ def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
     reader would never hear a best-effort writer, as sensors are. No key, no old messages for late
     readers, and the last ten kept.
     """
-    names = (name.replace("/", _SLASH) for name in (key, kind.__idl_typename__))
-    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind.__idl_typename__]};"
+    names = (name.replace("/", _SLASH) for name in (key, kind))
+    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind]};"
     return "/".join((member_token(zid), role, *names, qos))
 
 
@@ -291,31 +184,30 @@ class Ros2Node:
         self._declared: List[Any] = []
         self._announce(member_token(self._zid))
 
-    def publisher(self, topic: str, kind: Type[_M]) -> Callable[[_M], None]:
-        """Return what publishes messages of a kind on a topic. It never waits for a subscriber."""
+    def publisher(self, topic: str, kind: str) -> Callable[[bytes], None]:
+        """Return what publishes on a topic. It never waits for a subscriber."""
         key = topic_key(self._namespace, topic)
-        publisher = self._session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.DROP
-        )
+        drop = zenoh.CongestionControl.DROP
+        publisher = self._session.declare_publisher(key, congestion_control=drop)
         self._declared.append(publisher)
         self._announce(topic_token(self._zid, PUBLISHER, key, kind))
-        return lambda message: publisher.put(encode(message))
+        return publisher.put
 
-    def subscribe(self, topic: str, kind: Type[_M], take: Callable[[_M], None]) -> None:
-        """Call `take` with each message, in Zenoh's thread; what cannot be read is counted."""
+    def subscribe(self, topic: str, take: Callable[[Odometry], None]) -> None:
+        """Call `take` with each odometry, in Zenoh's thread; what cannot be read is counted."""
         key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            message: Union[_M, Reason] = Reason.OVERSIZED
+            read: Union[Odometry, Reason] = Reason.OVERSIZED
             if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
-                message = decode(sample.payload.to_bytes(), kind)
-            if isinstance(message, Reason):
-                self.rejected[message.value] = self.rejected.get(message.value, 0) + 1
+                read = read_odometry(sample.payload.to_bytes())
+            if isinstance(read, Reason):
+                self.rejected[read.value] = self.rejected.get(read.value, 0) + 1
             else:
-                take(message)
+                take(read)
 
         self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
-        self._announce(topic_token(self._zid, SUBSCRIBER, key, kind))
+        self._announce(topic_token(self._zid, SUBSCRIBER, key, ODOMETRY))
 
     def close(self) -> None:
         while self._declared:
@@ -450,11 +342,11 @@ class Ros2Vehicle(StreamedVehicle):
             self._node = node = Ros2Node(self._session, settings.namespace)
             self._twist = self._drive = None
             if settings.twist_topic:
-                self._twist = node.publisher(settings.twist_topic, Twist)
+                self._twist = node.publisher(settings.twist_topic, TWIST)
             if settings.ackermann_topic:
-                self._drive = node.publisher(settings.ackermann_topic, AckermannDriveStamped)
+                self._drive = node.publisher(settings.ackermann_topic, DRIVE)
             self._angular = settings.twist_angular
-            node.subscribe(settings.odometry_topic, Odometry, self._hear)
+            node.subscribe(settings.odometry_topic, self._hear)
         except BaseException:
             self._session.close()  # an open session would hang the process at its exit
             raise
@@ -472,10 +364,8 @@ class Ros2Vehicle(StreamedVehicle):
             self._session.close()
 
     def _hear(self, odometry: Odometry) -> None:
-        stamp, twist = odometry.header.stamp, odometry.twist.twist
-        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         with self._lock:
-            self._core.hear(stamp_ns, twist.linear.x, twist.angular.z, time.monotonic())
+            self._core.hear(*odometry, time.monotonic())
 
     def _send_due(self) -> bool:
         with self._lock:
