@@ -146,9 +146,10 @@ def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle
         assert crowd.recv(5.0) is not None  # it sends as soon as it can
 
 
-def test_of_foreign_frames_bus_off_stops_it_and_it_listens_on(chassis, vehicle, monkeypatch):
+def test_foreign_frames_are_none_bus_off_stops_it_and_a_dead_bus_is_left(
+    chassis, vehicle, monkeypatch
+):
     enable(vehicle)
-    drive(chassis, vehicle)
     for kind in ("is_error_frame", "is_extended_id", "is_remote_frame", "is_fd"):
         foreign: Any = {"arbitration_id": 0x111, "is_extended_id": False, kind: True}
         vehicle._hear(can.Message(**foreign))
@@ -156,11 +157,11 @@ def test_of_foreign_frames_bus_off_stops_it_and_it_listens_on(chassis, vehicle, 
     vehicle._hear(can.Message(arbitration_id=0x40, is_error_frame=True))
     assert vehicle.feedback(time.monotonic()).faults == ["the CAN bus fails: bus-off"]
     enable(vehicle)
+    down = Mock(side_effect=OSError("Network is down"))
     with monkeypatch.context() as patch:
-        patch.setattr(vehicle._bus, "recv", Mock(side_effect=OSError("Network is down")))
+        patch.setattr(vehicle._bus, "recv", down)
         wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its stop")
-    enable(vehicle)
-    monkeypatch.setattr(Gate, "send", Mock(side_effect=OSError("Network is down")))
+    monkeypatch.setattr(Gate, "send", down)
     vehicle.close()  # raises nothing, and leaves the bus
     with pytest.raises(can.CanOperationError, match="closed"):
         vehicle._bus.recv(0.0)

@@ -27,16 +27,6 @@ def test_steering_by_hand():
     assert SPEC.inner_rad(-centre) == -SPEC.inner_rad(centre)
 
 
-@pytest.mark.parametrize("scenario", CARS)
-@given(steering=unit, scale=st.floats(0.01, 2.0), curvature=st.floats(-1e6, 1e6))
-def test_steering_there_and_back(scenario, steering, scale, curvature):
-    similarity = similarity_to(CARS[scenario], SPEC, scale)
-    assert similarity.scale == scale
-    centre_rad = similarity.centre_rad(steering)
-    assert similarity.steering(centre_rad) == pytest.approx(steering, abs=1e-9)
-    assert math.isfinite(similarity.car.steering(curvature))  # none is too much for the inverse
-
-
 def pedal_to_speed(set_point, pedal, measured=None):
     measured = set_point if measured is None else measured
     return LEFT_TURN.pedal_to_speed(set_point, pedal, 0.1, measured)
@@ -64,17 +54,6 @@ def test_a_vehicle_that_is_held_up_does_not_wind_up():
     assert speed == pytest.approx(0.75 * mapping.LEAD_S)
     assert pedal_to_speed(0.0, 0.5, measured=1.0) == pytest.approx(1.0 - 0.375)
     assert pedal_to_speed(0.0, -0.5, measured=1.0) == 0.0  # a brake that does not bite
-
-
-def test_without_a_pedal_it_follows_the_scenarios_car_within_its_accelerations():
-    speed = 0.0
-    for _ in range(100):
-        after = CONGESTION.follow_speed(speed, 5.0, 0.02)
-        assert after - speed <= 0.75 * 0.02 + 1e-12
-        speed = after
-    assert speed == pytest.approx(5.0 / 4)
-    assert CONGESTION.follow_speed(speed, 0.0, 0.02) == pytest.approx(speed - 0.02)
-    assert CONGESTION.follow_speed(MOST, 100.0, 0.1) == MOST
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)

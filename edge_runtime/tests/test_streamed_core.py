@@ -165,22 +165,9 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(m
     assert rig.report.action["steering"] == pytest.approx(-1.0, abs=0.02)
 
 
-def fall_silent(rig):
-    rig.talks = False
-    rig.step(12, PEDAL)
-    rig.talks = True
-    return rig.silence
-
-
 def command_no_more(rig):
     rig.step(18)
     return "no command for 0.24 s"
-
-
-def brake(rig):
-    rig.core.brake(rig.now_s)
-    assert rig.report.commanded_speed_mps == 0.0  # before the next tick, too
-    return ""
 
 
 def lie(rig):
@@ -207,33 +194,20 @@ def be_astray(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Fault.SILENT), (command_no_more, VehicleEvent.COMMAND_LATE),
-        (brake, VehicleEvent.BRAKE),
-        (lie, Fault.LYING), (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
+        (command_no_more, VehicleEvent.COMMAND_LATE), (lie, Fault.LYING),
+        (be_stuck, Fault.STUCK), (be_astray, Fault.STEERING_STUCK),
     ],
 )  # fmt: skip
 def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
     words = stop(rig.driving())
     assert rig.core.cause is cause
-    assert rig.words[0].startswith(words) if words else not rig.words
+    assert rig.words[0].startswith(words)
     assert rig.report.self_braking
-    # All is well again, and commands come: it stands nevertheless.
-    count = len(rig.asked)
-    rig.step(100, PEDAL)
+    count = len(rig.asked)  # all is well again, and commands come: it stands nevertheless
+    rig.step(20, PEDAL)
     assert set(rig.speeds(count)) == {0.0}
     assert rig.report.standing == []
-    rig.enabled().step(50, PEDAL)
-    assert rig.speed_mps > 0.5
-    assert rig.words == []
-
-
-def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop():
-    ways = {(event, *way) for event in LEADS_TO for way in LEADS_TO[event].items()}
-    assert {event for event, _, then in ways if then is VehicleState.ENABLED} == {
-        VehicleEvent.CONFIRMED
-    }
-    out_of_stopped = {event for event, before, _ in ways if before is VehicleState.STOPPED}
-    assert out_of_stopped == {VehicleEvent.ENABLE, VehicleEvent.CLOSE}
+    assert rig.enabled().step(50, PEDAL).speed_mps > 0.5
 
 
 @pytest.mark.parametrize("state", VehicleState)

@@ -112,13 +112,12 @@ def test_a_driver_that_hangs_holds_nobody_and_later_obeys_no_old_drive(
     runner.command(make_command(mode=SAFE_STOP))
     runner.command(make_command(1, mode=newest))
     wait_until(lambda: runner.now() == SILENT, "the fault")
-    time.sleep(T)  # it was silent before the command came
+    time.sleep(2 * T)  # now the drive is too old
     vehicle.go_on()
     runner.wait_for_reports(2)
     assert vehicle.asked == asked
-    vehicle.asked.clear()
     runner.command(make_command(2), scenario_speed_mps=4.5)
-    wait_until(lambda: vehicle.asked == ["command"], "a fresh one to be obeyed")
+    wait_until(lambda: vehicle.asked == [*asked, "command"], "a fresh one to be obeyed")
     assert vehicle.scenario_speed_mps == 4.5
 
 
@@ -215,8 +214,7 @@ def test_a_driver_that_hangs_is_left_in_time_and_braked_when_it_comes_back(
 def test_a_driver_is_closed_in_the_end_whatever_its_brake_raises(vehicle, started):
     runner = NotingRunner(vehicle)
     if started:
-        runner.start()
-    vehicle.asked.clear()
+        runner.start(armed=False)  # an operator is to enable it
     vehicle.raises = {"brake": SystemExit(3)}
     assert runner.close()
     assert vehicle.asked == ["brake", "close"]
