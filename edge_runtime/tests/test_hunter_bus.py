@@ -135,8 +135,7 @@ def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle
     with can.Bus(interface="virtual", channel=channel, rx_queue_size=3) as crowd:
         vehicle.enable(time.monotonic())
         wait_until(lambda: vehicle.state is VehicleState.STOPPED, "its stop")
-        assert "the CAN bus fails: Could not send" in vehicle.feedback(time.monotonic()).faults[0]
-        assert vehicle.feedback(time.monotonic()).standing
+        assert "the CAN bus fails" in vehicle.feedback(time.monotonic()).faults[0]
         began_s = time.monotonic()
         vehicle.command(PEDAL, time.monotonic())
         vehicle.brake(time.monotonic())

@@ -211,16 +211,16 @@ def test_the_steering_comes_back_from_the_odometry(angular):
 def test_commands_by_hand_in_the_second_librarys_bytes():
     """1 m/s on a circle of 2 m: 0.5 rad/s, and an angle of atan(0.65 / 2) as hunter_ros2 has it."""
     motion = Motion(1.0, math.atan(0.65 / 2.0))
-    for ours, kind in (
-        (twist_of(motion, YAW_RATE, 0.65), TWIST),
-        (drive_of(motion, 3 * 10**9 + 4), DRIVE),
-    ):
-        assert bytes(STORE.serialize_cdr(STORE.deserialize_cdr(ours, kind), kind)) == ours
-    twist = STORE.deserialize_cdr(twist_of(motion, YAW_RATE, 0.65), TWIST)
+
+    def read(ours, kind):
+        theirs = STORE.deserialize_cdr(ours, kind)
+        assert bytes(STORE.serialize_cdr(theirs, kind)) == ours
+        return theirs
+
+    twist = read(twist_of(motion, YAW_RATE, 0.65), TWIST)
     assert (twist.linear.x, twist.angular.z) == pytest.approx((1.0, 0.5))
-    twist = STORE.deserialize_cdr(twist_of(motion, STEERING, 0.65), TWIST)
-    assert twist.angular.z == motion.centre_rad
-    stamped = STORE.deserialize_cdr(drive_of(motion, 3 * 10**9 + 4), DRIVE)
+    assert read(twist_of(motion, STEERING, 0.65), TWIST).angular.z == motion.centre_rad
+    stamped = read(drive_of(motion, 3 * 10**9 + 4), DRIVE)
     assert (stamped.header.stamp.sec, stamped.header.stamp.nanosec) == (3, 4)
     drive = stamped.drive
     assert (drive.speed, drive.steering_angle) == pytest.approx((1.0, motion.centre_rad))
@@ -303,15 +303,12 @@ def test_both_kinds_of_command_below_a_namespace_their_tokens_and_what_is_no_odo
         assert hunter.drives[-1].drive.steering_angle > 0  # -1 turns left
         chunks = sorted("/".join(token.split("/")[3:5]) for token in hunter.tokens)
         assert chunks == ["", "MP/robot§ackermann_cmd", "MP/robot§cmd_vel", "MS/robot§odom"]
-        bad, rejected = (
-            (b"", b"\0\7\0\0", bytes(ros2.MAX_PAYLOAD_BYTES + 1)),
-            vehicle._node.rejected,
-        )
+        rejected = vehicle._node.rejected
+        bad = (b"", b"\0\7\0\0", bytes(ros2.MAX_PAYLOAD_BYTES + 1))
         wait_until(lambda: any(map(hunter.put, bad)) or len(rejected) == 3, "the rejections")
         for _ in range(2):
             vehicle.close()  # Zeros go out until it stands.
         wait_until(lambda: not hunter.tokens, "the tokens to go")
-        assert hunter.speed_mps < 0.1
         assert [twist.linear.x for twist in hunter.twists[-5:]] == [0.0] * 5
         vehicle.enable(time.monotonic())
         assert vehicle.state is VehicleState.DISABLED

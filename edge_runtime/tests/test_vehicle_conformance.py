@@ -90,7 +90,7 @@ class TestRos2(VehicleConformance):
 class TestMock(VehicleConformance):
     latches_silence = False
 
-    def test_lag_and_rate_limit_by_hand(self):
+    def test_lag_by_hand(self):
         """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
         rig = MockRig(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9).enabled()
         rig.core.command({"pedal": 1.0, "steering": 1.0}, rig.now_s)
@@ -100,9 +100,6 @@ class TestMock(VehicleConformance):
         pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
         speed_mps = sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005
         assert after.speed_mps == pytest.approx(speed_mps)
-        rig = MockRig(dead_time_s=0.0, time_constant_s=1e-9, slew_per_s=2.0).enabled()
-        rig.core.command(PEDAL, rig.now_s)
-        assert rig.step(5).report.action["pedal"] == pytest.approx(-1.0 + 0.2)
 
     def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(self):
         fast = {"max_speed_mps": 8.0, "throttle_mps2": 2.0}
