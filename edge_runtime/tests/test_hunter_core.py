@@ -190,6 +190,12 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
     assert words in driving.words[0]
 
 
+def test_no_more_steering_is_reported_than_the_wheels_reach():
+    rig = HunterRig("congestion", scale=0.02)
+    rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(0.1, -0.7))
+    assert rig.report.action["steering"] == rig.core.similarity.limits()["steering"].high < 0.6
+
+
 @pytest.mark.parametrize(
     ("counters", "alive"),
     [
