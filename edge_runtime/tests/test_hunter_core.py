@@ -231,6 +231,14 @@ def test_how_long_feedback_may_be_silent():
         assert words in str(reports.silence(-math.inf, now_s))
 
 
+def test_the_brake_is_locked_though_the_fault_goes_on(driving):
+    driving.status, driving.obeys = OK._replace(faults=0x1000), False
+    driving.step(50, PEDAL)
+    assert LOCK not in driving.frames()
+    driving.step(6, PEDAL)
+    assert LOCK in driving.frames()
+
+
 @pytest.mark.parametrize(("missing", "after_ticks"), [("0x221", 12), ("0x211", 20)])
 def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked(driving, missing, after_ticks):
     driving.talks = False
