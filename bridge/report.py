@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,13 @@ from edge_runtime.util import counted, printable
 from edge_runtime.wire import Command, Feedback
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
+QUANTITIES = {
+    "surviving_distance_m": "distance_m",
+    "episode_reward": "reward",
+    "episode_time_s": "time_s",
+    **{name: name for name in ACCELERATIONS},
+}
+"""Key of the report to field of `EpisodeResult`."""
 
 
 @dataclass
@@ -49,20 +57,12 @@ def summarise(
     """Settle the outcomes of `results` and return the contract's summary.
 
     `std` is over the episodes (population, ddof 0). Mean and deviation are None for a quantity that
-    no episode reports. Raises ValueError for no episode.
+    no episode reports.
     """
-    if not results:
-        raise ValueError("no episode to summarise")
     for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
-    fields = {
-        "surviving_distance_m": "distance_m",
-        "episode_reward": "reward",
-        "episode_time_s": "time_s",
-        **{name: name for name in ACCELERATIONS},
-    }
-    columns = {key: [getattr(result, name) for result in results] for key, name in fields.items()}
+    columns = {key: [getattr(row, name) for row in results] for key, name in QUANTITIES.items()}
     return {
         "scenario": scenario,
         "condition": condition,
@@ -195,29 +195,24 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterat
 
 
 def summary_line(report: Mapping[str, Any]) -> str:
-    """Return the report in one line for a terminal.
-
-    Ticks without a new command are left out: safe stops and latency show them.
-    """
+    """Return the report in one line for a terminal."""
     latency = report["latency_ms"]
     times = "no command came"
     if latency["p50"] is not None:
-        times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
-    episodes = report["episodes"]
+        times = "latency p50 {p50:.1f} ms, p99 {p99:.1f} ms".format(**latency)
     if report["success_rate"] is None:
         ends = "return {mean:.1f} +- {std:.1f}".format(**report["episode_reward"])
     else:
         outcomes = Counter({GOAL: 0})
         outcomes.update(row["outcome"] for row in report["per_episode"])
-        shares = (f"{count} {name} ({count / episodes:.0%})" for name, count in outcomes.items())
-        ends = ", ".join(shares)
+        ends = ", ".join(f"{count} {name}" for name, count in outcomes.items())
     stops = Counter(event["reason"] for event in report["safe_stop_events"])
-    parts = [f"{counted(episodes, 'episode')}: {ends}", times, _reasons("safe stop", stops)]
-    parts.append(_reasons("rejected message", report["rejected"]))
-    if vehicle := report["vehicle"]:
-        told = {name: lag for name, lag in vehicle["lag_ms"].items() if lag is not None}
-        lags = ", ".join(f"{name} {lag:.0f} ms" for name, lag in told.items())
-        parts.append(f"{vehicle['name']}: lag {lags or 'not measured'}")
+    parts = (
+        f"{counted(report['episodes'], 'episode')}: {ends}",
+        times,
+        _reasons("safe stop", stops),
+        _reasons("rejected message", report["rejected"]),
+    )
     return printable("; ".join(parts))
 
 
@@ -225,11 +220,9 @@ def episode_line(
     number: int, episodes: int, result: EpisodeResult, stops: Sequence[SafeStopEvent]
 ) -> str:
     """Return what became of an episode, as in "episode 2 of 5: goal after 12.3 s"."""
-    reasons = Counter(event.reason for event in stops)
-    braked = f"; {_reasons('safe stop', reasons)}" if reasons else ""
-    return printable(
-        f"episode {number} of {episodes}: {result.outcome} after {result.time_s:.1f} s{braked}"
-    )
+    braked = f"; {_reasons('safe stop', Counter(e.reason for e in stops))}" if stops else ""
+    told = f"episode {number} of {episodes}: {result.outcome} after {result.time_s:.1f} s"
+    return printable(told + braked)
 
 
 def _reasons(noun: str, counts: Mapping[str, int]) -> str:
@@ -267,11 +260,10 @@ class Series:
         return self.reached - values[np.searchsorted(self.asked_s, at_s, side="right")]
 
 
-def _columns(rows: Rows, start_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _columns(rows: Rows, start_ns: int) -> NDArray[np.float64]:
     """Return times (s) and values, ascending even where a clock was set."""
-    times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
-    times_s = np.array([(time_ns - start_ns) / 1e9 for time_ns in times_ns])
-    return times_s, np.array(values, np.float64)
+    ordered = sorted(rows, key=itemgetter(0))
+    return np.array([((stamp - start_ns) / 1e9, value) for stamp, value in ordered]).T
 
 
 def errors(series: Sequence[Series]) -> dict[str, float | None]:
@@ -342,9 +334,9 @@ class TrackingLog:
             self._episodes[-1][1].append(feedback)
 
     def report(self, action_names: Sequence[str]) -> dict[str, Any]:
-        """Return errors and lags; ``action_names`` in the order of a command's action.
+        """Return errors and lags, None where nothing was measured.
 
-        None stands wherever nothing was measured: a vehicle that takes no speed has no set-point.
+        ``action_names`` are in the order of a command's action.
         """
         speed = []
         actions: dict[str, list[Series]] = {name: [] for name in action_names}
@@ -356,14 +348,12 @@ class TrackingLog:
                 asked = [(c.sent_ns, c.action[index]) for c in commands]
                 reached = [(f.sent_ns, f.action[index]) for f in feedback]
                 actions[name].append(Series(asked, reached, held=True))
+        lags = {"speed": speed, **actions}
         return {
             "name": self.vehicle,
             "samples": sum(len(feedback) for _, feedback in self._episodes),
             "speed_error_mps": errors(speed),
             "action_error": {name: errors(series) for name, series in actions.items()},
-            "lag_ms": {
-                "speed": lag_ms(speed),
-                **{name: lag_ms(series) for name, series in actions.items()},
-            },
+            "lag_ms": {name: lag_ms(series) for name, series in lags.items()},
             "faults": dict(self.faults),
         }

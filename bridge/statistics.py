@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,26 +21,21 @@ class Estimate(NamedTuple):
     size: int  # Values behind it
 
     def times(self, factor: float) -> Estimate:
-        """Multiply the number and its interval."""
-        low, high = sorted((factor * self.low, factor * self.high))
-        return Estimate(factor * self.value, low, high, self.size)
+        """Multiply the number and its interval by a positive factor."""
+        return Estimate(factor * self.value, factor * self.low, factor * self.high, self.size)
 
     def as_share(self) -> str:
         """Return a share in percent, with the interval cut off at 0 and 100."""
-        if self.size < 2:
-            return self.times(100.0).text(1)
-        held = self._replace(low=max(self.low, 0.0), high=min(self.high, 1.0))
-        return held.times(100.0).text(1)
+        low, high = max(self.low, 0.0), min(self.high, 1.0)
+        shown = self if self.size < 2 else self._replace(low=low, high=high)
+        return shown.times(100.0).text(1)
 
     def text(self, digits: int = 2) -> str:
-        """Return "0.97 [0.93, 0.99]"; a dash for no values, the interval alone for NaN."""
-        bounded = np.isfinite([self.low, self.high]).any()
-        if not self.size or (np.isnan(self.value) and not bounded):
+        """Return "0.97 [0.93, 0.99]"; without an interval the value, a dash without values."""
+        if not self.size:
             return "–"
-        shown, low, high = (f"{number:.{digits}f}" for number in self[:3])
-        if not bounded:
-            return shown
-        return f"{shown} [{low}, {high}]".replace("nan ", "").replace("inf", "∞")
+        value, low, high = (f"{number:.{digits}f}" for number in self[:3])
+        return f"{value} [{low}, {high}]" if np.isfinite(self.low) else value
 
 
 NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
@@ -54,22 +49,12 @@ def mean_estimate(values: Iterable[float]) -> Estimate:
         return NOTHING
     mean = float(numbers.mean())
     if len(numbers) == 1:
-        return Estimate(mean, float("-inf"), float("inf"), 1)
+        return NOTHING._replace(value=mean, size=1)
     reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1) * stats.sem(numbers))
     return Estimate(mean, mean - reach, mean + reach, len(numbers))
 
 
 def success_estimate(successes: int, count: int) -> Estimate:
     """Return the share of successes with Wilson's interval."""
-    if count == 0:
-        return NOTHING
     interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(successes / count, float(interval.low), float(interval.high), count)
-
-
-def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
-    """Return ``point`` with the interval of its resampled values, which may be infinite."""
-    if size < 2:
-        return Estimate(point, float("-inf"), float("inf"), size)
-    ends = np.quantile(values, (TAIL, 1.0 - TAIL), method="inverted_cdf")
-    return Estimate(point, float(ends[0]), float(ends[1]), size)
