@@ -48,20 +48,17 @@ from edge_runtime.util import UserError, counted
 FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 CHUNK_BYTES = 1 << 20
-NOT_COPIED = (
-    "observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal",
-)  # fmt: skip
+NOT_COPIED = {"observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal"}
 """Fields that no viewer plots."""
 ENCODING, SCHEMA_ENCODING = "json", "jsonschema"
 INFO, WARNING = 2, 3  # Of ``foxglove.Log.level``
-NEVER_OVER = "choose another name: no recording is lost"
 
 
 def new_recording(path: str) -> str:
     """Return the absolute path; UserError where no recording could be begun there."""
     check_writable(path)
     if Path(path).exists():
-        raise UserError(f"{path} exists; {NEVER_OVER}")
+        raise UserError(f"{path} exists; choose another name: no recording is lost")
     return str(Path(path).absolute())
 
 
@@ -69,8 +66,9 @@ def _add_record_arguments(parser: Any) -> None:
     out = "the recording, which must not exist yet"
     parser.add_argument("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    help_text = "record this vehicle only (otherwise all)"
-    add_options(parser, "--vehicle-id", default=None, help=help_text)
+    add_options(
+        parser, "--vehicle-id", default=None, help="record this vehicle only (otherwise all)"
+    )
     linger = "longest wait for a simulator that has gone to come back, in s"
     parser.add_argument(
         "--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger
@@ -88,13 +86,13 @@ def _run_record(arguments: Any) -> int:
     ):
         try:
             print(f"recording {path}", flush=True)
-            # A signal is the ordinary way to end a recording: it must not cut a message in two.
             ended = threading.Event()
 
             def end() -> bool:
                 ended.set()
                 return True
 
+            # A signal is the ordinary way to end a recording: it must not cut a message in two.
             with quit_on_signals(end):
                 _listen(listener, writer, arguments, ended)
                 writer.finish(listener.dropped)
@@ -137,18 +135,15 @@ class ViewerCopies:
             who = "edge runtime" if heard.topic == "alive" else "simulator"
             what = "is here" if heard.payload == b"\x01" else "has gone"
             self._event(heard, INFO, f"{who} {what}")
-        elif heard.size > len(heard.payload):
+            return
+        if heard.size > len(heard.payload):
             self._event(heard, WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
-        else:
-            self._view(heard)
-
-    def _view(self, heard: Heard) -> None:
-        message = decode(heard)
+            return
+        message, vehicle = decode(heard), _vehicle_id(heard)
         if isinstance(message, wire.Rejection):
             self._event(heard, WARNING, f"unreadable {heard.topic}: {message.detail}")
             return
         self._copy(heard, heard.topic, message)
-        vehicle = _vehicle_id(heard)
         if isinstance(message, Scene):
             self._layouts[vehicle] = Layout(message.task) if message.task else None
         elif isinstance(message, wire.State) and (layout := self._layouts.get(vehicle)) is not None:
@@ -158,15 +153,14 @@ class ViewerCopies:
         if layout.refusal(state.observation) is not None:
             return
         for name, array in layout.arrays(state.observation).items():
-            images = images_of(array)
-            if images is None:
+            if (images := images_of(array)) is None:
                 continue
             # They lie one after the other: in memory that is one picture, so many times as high.
             count, height, width, colours = images.shape
             encoding = "rgb8" if colours == 3 else "mono8"
             size = (width, count * height, encoding, width * colours)
-            data, at = images.tobytes(), _stamp(heard.arrived_ns)
-            self._copy(heard, name, RawImage(at, *size, data, _vehicle_id(heard)))
+            image = RawImage(_stamp(heard.arrived_ns), *size, images.tobytes(), _vehicle_id(heard))
+            self._copy(heard, name, image)
 
     def _event(self, heard: Heard, level: int, text: str) -> None:
         self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
@@ -184,7 +178,6 @@ class RecordingWriter:
     """Writes one recording. Not thread-safe; any call raises OSError where the disk is full."""
 
     def __init__(self, path: Path) -> None:
-        """Make the file; UserError where it exists already."""
         self.messages = 0
         self._copies = ViewerCopies(self._add_copy)
         self._file, self._mcap = new_recording_at(path)
@@ -198,7 +191,7 @@ class RecordingWriter:
         is_kept = heard.size == len(heard.payload)
         if heard.topic in TOKEN_TOPICS:
             text = b'{"here": true}' if heard.payload == b"\x01" else b'{"here": false}'
-            self._add(heard.key, "json", heard.arrived_ns, text)
+            self._add(heard.key, ENCODING, heard.arrived_ns, text)
         elif is_kept:
             self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
         if with_view or heard.topic in TOKEN_TOPICS or not is_kept:
@@ -210,8 +203,8 @@ class RecordingWriter:
 
     def finish(self, dropped: int) -> None:
         """Write the index; ``dropped`` is how many messages came too fast to be written."""
-        counts = {"messages": str(self.messages), "dropped": str(dropped)}
         self._mcap.flush()
+        counts = {"messages": str(self.messages), "dropped": str(dropped)}
         self._mcap.add_metadata(METADATA, counts)
         self._mcap.finish()
         self._file.close()
@@ -234,24 +227,16 @@ def _vehicle_id(heard: Heard) -> str:
 
 
 def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
-    """Begin a new MCAP file, in chunks with checksums.
-
-    UserError, and no file, where one exists already, or it cannot be made.
-    """
+    """Begin a new MCAP file, in chunks with checksums; UserError, and no file, on a full disk."""
     make_directory(path.parent)
+    stream = path.open("xb")
     try:
-        stream = path.open("xb")
-        try:
-            writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
-            writer.start(profile="", library=f"phil-hil {__version__}")
-            writer.flush()  # Before anybody is told of the file, it is an MCAP file.
-        except OSError:
-            close_torn(stream)
-            path.unlink()
-            raise
-    except FileExistsError:
-        raise UserError(f"{path} exists; {NEVER_OVER}") from None
+        writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+        writer.start(profile="", library=f"phil-hil {__version__}")
+        writer.flush()  # Before anybody is told of the file, it is an MCAP file.
     except OSError as error:
+        close_torn(stream)
+        path.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None
     return stream, writer
 

@@ -15,7 +15,7 @@ import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -52,13 +52,6 @@ LANDMARK_BYTES = 45
 BLOCK_BYTES = 1 << 16
 
 
-class Stored(NamedTuple):
-    """One message of a recording."""
-
-    channel: Channel
-    message: Message
-
-
 class Recording:
     """One MCAP file; what is missing of it is known once ``messages`` has come to the end."""
 
@@ -84,16 +77,13 @@ class Recording:
 
     def trouble(self) -> str:
         """Return what is wrong with the file, as a verb with its object; empty: nothing."""
-        places = counted(self.damaged_places, "damaged place")
-        messages = counted(self.nameless_messages, "message")
-        parts = {
-            f"{places} of {counted(self.damaged_bytes, 'byte')}": self.damaged_places,
-            f"{messages} whose topic was in a damaged place": self.nameless_messages,
-            f"a torn end of {counted(self.torn_bytes, 'byte')}": self.torn_bytes,
-        }
-        missing = ", ".join(part for part, count in parts.items() if count)
-        what = "is damaged" if self.is_damaged else "was cut off" if self.cut_off else ""
-        return f"{what} ({missing})" if missing else what
+        if not (self.is_damaged or self.cut_off):
+            return ""
+        lost = counted(self.damaged_bytes + self.torn_bytes, "byte")
+        what = "was cut off"
+        if self.is_damaged:
+            what = f"has {counted(self.damaged_places, 'damaged place')}"
+        return f"{what} ({lost} and {counted(self.nameless_messages, 'message')} lost)"
 
     def say_trouble(self, taken: str = "") -> None:
         """Print the trouble, if any, in one line on stderr, with how much is taken."""
@@ -108,8 +98,8 @@ class Recording:
             left_out = f"left out: {counted(self.invalid_messages, 'message')} not valid"
             print(f"{self.path}: {left_out}", file=sys.stderr, flush=True)
 
-    def messages(self) -> Iterator[Stored]:
-        """Yield the messages in the order of the file, which is that of their arrival.
+    def messages(self) -> Iterator[tuple[Channel, Message]]:
+        """Yield the messages, with their channels, in the order of the file, that of arrival.
 
         UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
         reading than its size accounts for.
@@ -130,7 +120,7 @@ class Recording:
                         if isinstance(other, Channel):
                             channels.setdefault(other.id, other)
                 if channel := channels.get(record.channel_id):
-                    yield Stored(channel, record)
+                    yield channel, record
                 else:
                     self.nameless_messages += 1
 
@@ -184,10 +174,8 @@ class Recording:
         """Count the bytes read; UserError for more than damage explains."""
         self._work_bytes += count
         if self._work_bytes > MAX_RECORD_BYTES + MAX_WORK * self._size:
-            raise UserError(
-                f"recording {self.path} is refused: reading it takes more than"
-                f" {MAX_WORK} times its size"
-            )
+            what = f"reading it takes more than {MAX_WORK} times its size"
+            raise UserError(f"recording {self.path} is refused: {what}")
 
 
 def _parts(record: McapRecord, size: int, said: int) -> list[McapRecord]:
@@ -223,7 +211,7 @@ def _find_landmark(stream: BinaryIO, at: int) -> int:
 
 def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
     """Return the vehicle of that id, or the only vehicle; UserError where that fails."""
-    there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
+    there = {_wire_topic(channel)[0] for channel, _ in recording.messages()} - {""}
     names = ", ".join(sorted(there)) or "none"
     if vehicle_id is not None and vehicle_id not in there:
         raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
@@ -234,11 +222,11 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
     """Yield the wire's messages of one vehicle as a listener would have heard them."""
-    for stored in recording.messages():
-        vehicle, topic = _wire_topic(stored)
+    for channel, message in recording.messages():
+        vehicle, topic = _wire_topic(channel)
         if vehicle == vehicle_id:
-            message, key = stored.message, stored.channel.topic
-            yield Heard(key, topic, message.data, message.log_time, len(message.data))
+            data = message.data
+            yield Heard(channel.topic, topic, data, message.log_time, len(data))
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
@@ -253,9 +241,9 @@ def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Hear
                 yield heard, message
 
 
-def _wire_topic(stored: Stored) -> tuple[str, str]:
+def _wire_topic(channel: Channel) -> tuple[str, str]:
     """Return vehicle and topic of a wire message; empty for a copy for viewers."""
-    parts = stored.channel.topic.split("/")
-    if stored.channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
+    parts = channel.topic.split("/")
+    if channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
         return "", ""
     return parts[1], parts[2]

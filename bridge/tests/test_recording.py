@@ -21,7 +21,7 @@ import zenoh
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Chunk, ChunkIndex, Header, Message
+from mcap.records import Channel, Chunk, ChunkIndex, Header, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -29,7 +29,7 @@ from bridge import recording as records
 from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import Log, RawImage, RecordingWriter, _listen, describe
-from bridge.recording import Recording, Stored
+from bridge.recording import Recording
 from bridge.replay import RecordedDrive, replay
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
@@ -38,14 +38,7 @@ from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import (
-    MAX_STATE_BYTES,
-    Command,
-    Health,
-    State,
-    decode_state,
-    encode,
-)
+from edge_runtime.wire import MAX_STATE_BYTES, Command, Health, State, decode_state, encode
 from hil_tests.processes import wait_until
 from hil_tests.testing.drives import (
     LEFT_TURN,
@@ -69,29 +62,36 @@ ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[],
 ODD_SIZE = msgspec.structs.replace(TASK, observation={"frames": Entry(dtype="uint8", shape=[2])})
 
 
-def told(stored: Stored) -> tuple[str, int, bytes]:
-    return stored.channel.topic, stored.message.log_time, stored.message.data
+def told(stored: tuple[Channel, Message]) -> tuple[str, int, bytes]:
+    channel, message = stored
+    return channel.topic, message.log_time, message.data
 
 
 def told_in(path: Path) -> list[tuple[str, int, bytes]]:
     return list(map(told, Recording(path).messages()))
 
 
-def test_the_picture_is_what_the_policy_saw(tmp_path):
+def test_the_picture_is_what_the_policy_saw_and_may_have_the_name_of_a_message(tmp_path):
     frames = bytes(range(256)) * (SIZE // 256) + bytes(SIZE % 256)
-    path = tmp_path / "runs" / "a.mcap"
-    with writing(path) as writer:
-        told = encode_scene({}, Scene(episode=0, step=3, sim_time_s=0.3, task=TASK))
-        writer.write(heard("scene", told))  # it says how to read the states
-        other = encode_scene({}, Scene(episode=0, step=3, sim_time_s=0.3, task=ODD_SIZE))
+    place: dict[str, Any] = {"episode": 0, "step": 3, "sim_time_s": 0.3}
+    task = msgspec.structs.replace(TASK, observation={"state": TASK.observation["frames"]})
+    with writing(tmp_path / "runs" / "a.mcap") as writer:
+        # It says how to read the states.
+        writer.write(heard("scene", encode_scene({}, Scene(**place, task=task))))
+        other = encode_scene({}, Scene(**place, task=ODD_SIZE))
         writer.write(Heard("phil/w/scene", "scene", other, 2, len(other)))  # another vehicle's
-        state = encode(make_state(3, observation={"frames": frames}))
+        state = encode(make_state(3, observation={"state": frames}))
         writer.write(heard("state", state, arrived_ns=5 * 10**9 + 7))
-    (data,) = (data for topic, _, data in told_in(path) if topic == "view/v/frames")
-    image = msgspec.json.decode(data, type=RawImage)
+    with (tmp_path / "runs" / "a.mcap").open("rb") as stream:
+        found = {
+            schema.name: message.data
+            for schema, channel, message in make_reader(stream).iter_messages()
+            if schema is not None and channel.topic == "view/v/state"
+        }
+    assert set(found) == {"foxglove.RawImage", "phil.State"}
+    image = msgspec.json.decode(found["foxglove.RawImage"], type=RawImage)
     assert (image.width, image.height, image.step, image.encoding) == (80, 90, 80, "mono8")
-    assert (image.timestamp.sec, image.timestamp.nsec) == (5, 7)
-    assert image.data == frames
+    assert (image.timestamp.sec, image.timestamp.nsec, image.data) == (5, 7, frames)
 
 
 def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
@@ -153,16 +153,14 @@ def drive(tmp_path_factory):
 def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
     recording, report = drive
     steps = report["per_episode"][0]["steps"]
-    counts: collections.Counter[str] = collections.Counter()
     with recording.open("rb") as stream:
-        for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
-            counts[channel.topic] += 1
-    name = "hunter01"
+        found = make_reader(stream, validate_crcs=True).iter_messages()
+        counts = collections.Counter(channel.topic for _, channel, _ in found)
     for topic in ("phil/{}/state", "phil/{}/scene", "view/{}/frames", "view/{}/scene"):
-        assert counts[topic.format(name)] == steps + 1
-    for topic, least in (("command", steps), ("health", 1), ("alive", 1)):  # The last: it came.
-        assert counts[f"phil/{name}/{topic}"] >= least
-    assert counts[f"phil/{name}/simulator"] == 2  # It came, and it went.
+        assert counts[topic.format("hunter01")] == steps + 1
+    # The last: it came, and it came and went.
+    for topic, least in {"command": steps, "health": 1, "alive": 1, "simulator": 2}.items():
+        assert counts[f"phil/hunter01/{topic}"] >= least
     assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
 
 
@@ -202,7 +200,7 @@ def test_a_kill_loses_little(tmp_path):
     assert [state.step for _, state in states] == list(range(len(states)))
 
 
-@pytest.mark.parametrize("keep", [0.2, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("keep", [0.2, 0.9, 0.999])
 def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
     recording, _ = drive
     torn = tmp_path / "torn.mcap"
@@ -267,22 +265,6 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     assert [topic for topic, _, _ in told_in(path)] == ["phil/v/state", "view/v/state"]
 
 
-def test_a_picture_may_have_the_name_of_a_message(tmp_path):
-    frames = Entry(dtype="uint8", shape=[2, 45, 80])
-    task = msgspec.structs.replace(TASK, observation={"state": frames})
-    scene = Scene(episode=0, step=3, sim_time_s=0.3, task=task)
-    with writing(tmp_path / "a.mcap") as writer:
-        writer.write(heard("scene", encode_scene({}, scene)))
-        writer.write(heard("state", encode(make_state(3, observation={"state": bytes(SIZE)}))))
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        found = [
-            (channel.topic, schema.name)
-            for schema, channel, _ in make_reader(stream).iter_messages()
-            if schema is not None and channel.topic == "view/v/state"
-        ]
-    assert sorted(name for _, name in found) == ["foxglove.RawImage", "phil.State"]
-
-
 def test_a_feed_that_falls_behind_drops_and_counts():
     feed, endpoint = WireListener(), free_endpoint()
     with contextlib.closing(open_session(listen=endpoint, mode="router")) as session:
@@ -307,9 +289,6 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
     with writing(tmp_path / "drive.mcap") as writer:
         _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=0.05), Event())
     assert writer.messages > 0
-    began_s = time.monotonic()
-    assert list(listener.until_gone(4.0))  # a view's
-    assert 1.5 < time.monotonic() - began_s < 3.9
 
 
 @pytest.fixture
@@ -319,24 +298,23 @@ def copy(tmp_path):
     return path
 
 
-def messages_of(path: Path, chunk: ChunkIndex) -> int:
-    """How many messages a chunk of an undamaged file holds."""
-    with path.open("rb") as stream:
-        stream.seek(chunk.chunk_start_offset)
-        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
-    assert isinstance(record, Chunk)
+def messages_of(index: ChunkIndex) -> int:
+    """How many messages a chunk of the undamaged file holds."""
+    with LEFT_TURN.open("rb") as stream:
+        stream.seek(index.chunk_start_offset)
+        record: Any = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
     return sum(isinstance(part, Message) for part in breakup_chunk(record, True))
 
 
 def without_chunk(number: int) -> list[tuple[str, int, bytes]]:
     """The messages of the undamaged file but those of one chunk."""
-    sizes = [messages_of(LEFT_TURN, index) for index in chunks(LEFT_TURN)]
+    sizes = list(map(messages_of, chunks(LEFT_TURN)))
     first, whole = sum(sizes[:number]), told_in(LEFT_TURN)
     return whole[:first] + whole[first + sizes[number] :]
 
 
-@pytest.mark.parametrize("number", [0, 3, -1], ids=["first", "middle", "last"])
-@pytest.mark.parametrize("damage", ["contents", "length", "opcode", "all zero, as a disk does"])
+@pytest.mark.parametrize("number", [0, 3, -1])
+@pytest.mark.parametrize("damage", ["contents", "length", "opcode", "all zero"])
 def test_only_the_broken_chunk_is_lost(copy, damage, number):
     index = chunks(copy)[number]
     start, size = index.chunk_start_offset, index.chunk_length
@@ -349,9 +327,6 @@ def test_only_the_broken_chunk_is_lost(copy, damage, number):
     recording = Recording(copy)
     assert [told(stored) for stored in recording.messages()] == without_chunk(number)
     assert (recording.damaged_places, recording.cut_off) == (1, False)
-    whole = Recording(LEFT_TURN)
-    list(whole.messages())
-    assert recording.metadata == whole.metadata
 
 
 def test_bytes_that_are_gone_take_no_more_with_them(copy):
@@ -366,8 +341,7 @@ def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_count
     copy.write_bytes(data[: chunks(copy)[20].chunk_start_offset])
     flip(copy, 300)
     recording = Recording(copy)
-    left = collections.Counter(stored.channel.topic for stored in recording.messages())
-    assert left
+    assert list(recording.messages())
     assert recording.nameless_messages > 0
     assert recording.is_damaged
 
@@ -394,14 +368,13 @@ def small(tmp_path_factory):
 
 def test_no_change_of_bytes_makes_a_message_or_loses_more_than_a_chunk(small):
     data, path, whole = small.read_bytes(), small.with_name("changed.mcap"), told_in(small)
-    halves = [whole[:2], whole[2:]]
-    for at in range(len(MCAP0_MAGIC), len(data) - 9, 23):
+    for at in range(len(MCAP0_MAGIC), len(data) - 9, 37):
         flipped = bytes(byte ^ 0xFF for byte in data[at : at + 10])
         for new in (flipped, bytes(10), flipped[: at % 9 + 1]):
             path.write_bytes(data[:at] + new + data[at + len(new) :])
             recording = Recording(path)
             found = list(map(told, recording.messages()))
-            assert found in (whole, *halves), at
+            assert found in (whole, whole[:2], whole[2:]), at
             assert found == whole or recording.is_damaged, at
 
 
@@ -411,7 +384,7 @@ def test_no_flipped_bit_of_a_records_own_header_loses_anything_unsaid(small):
     at = len(MCAP0_MAGIC)
     while at < len(data) - len(MCAP0_MAGIC):
         length = int.from_bytes(data[at + 1 : at + 9], "little")
-        for bit in range(at % 13, 8 * min(60, 9 + length), 13):
+        for bit in range(at % 29, 8 * min(60, 9 + length), 29):
             flipped = bytearray(data)
             flipped[at + bit // 8] ^= 1 << bit % 8
             path.write_bytes(flipped)
