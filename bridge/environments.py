@@ -51,8 +51,7 @@ RENDERED = "rgb_array"
 
 def scenarios() -> dict[str, str]:
     """Return scenario word -> ``module:id`` of its environment, of all installed packages."""
-    found = importlib.metadata.entry_points(group=SCENARIO_GROUP)
-    return {each.name: each.value for each in found}
+    return {word.name: word.value for word in importlib.metadata.entry_points(group=SCENARIO_GROUP)}
 
 
 def make_environment(name: str, condition: str = NOMINAL) -> Environment:
@@ -109,9 +108,8 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(last.filename).name}, line {last.lineno}"
-            what = f"{type(error).__name__}: {error} ({where})"
-            name = name_of(self)
-            raise UserError(f"environment {name} failed in {call.__name__}: {what}") from error
+            what = f"{call.__name__}: {type(error).__name__}: {error} ({where})"
+            raise UserError(f"environment {name_of(self)} failed in {what}") from error
 
 
 def _make_quietly(environment_id: str, **options: Any) -> Environment:
@@ -181,13 +179,9 @@ def describe(
         car = msgspec.convert(offered(environment, "car"), Car | None)
     except msgspec.ValidationError as error:
         raise UserError(f"environment {name!r}: its car is not valid: {error}") from None
-    task = Task(
-        task=name,
-        observation=_entries(environment, name),
-        action=_actions(environment, name),
-        control_period_s=period_s or _period_s(environment, name, unknown_s),
-        car=car,
-    )
+    seen, action = _entries(environment, name), _actions(environment, name)
+    period_s = period_s or _period_s(environment, name, unknown_s)
+    task = Task(task=name, observation=seen, action=action, control_period_s=period_s, car=car)
     check_task(task)
     return task
 
@@ -234,18 +228,21 @@ def _actions(environment: Environment, name: str) -> list[Action]:
     space = environment.action_space
     if not isinstance(space, Box) or not np.all(np.isfinite([space.low, space.high])):
         raise UserError(f"environment {name!r} acts in {space}; the wire carries a Box with bounds")
-    low, high = space.low.ravel().tolist(), space.high.ravel().tolist()
-    count = len(low)
-    names, empty = [f"action_{number}" for number in range(count)], [""] * count
-    defaults = {"action_names": names, "action_meanings": empty, "action_units": empty}
-    said: dict[str, Any] = {k: offered(environment, k) or kept for k, kept in defaults.items()}
-    said["brake_action"] = known_stops(environment) or [None] * count
+    count = space.low.size
+    said: dict[str, Any] = {
+        "name": offered(environment, "action_names") or [f"action_{n}" for n in range(count)],
+        "meaning": offered(environment, "action_meanings") or [""] * count,
+        "unit": offered(environment, "action_units") or [""] * count,
+        "stop": known_stops(environment) or [None] * count,
+        "low": space.low.ravel().tolist(),
+        "high": space.high.ravel().tolist(),
+    }
     for key, values in said.items():
         if len(values) != count:
-            raise UserError(f"environment {name!r}: {key} has {len(values)} entries, not {count}")
-    rows = zip(*said.values(), low, high, strict=True)
-    fields = ("name", "meaning", "unit", "stop", "low", "high")
-    return [Action(**dict(zip(fields, row, strict=True))) for row in rows]
+            what = f"the {key} of {len(values)} actions, and has {count}"
+            raise UserError(f"environment {name!r} gives {what}")
+    rows = zip(*said.values(), strict=True)
+    return [Action(**dict(zip(said, row, strict=True))) for row in rows]
 
 
 def known_stops(environment: Environment) -> list[float | None] | None:
@@ -284,13 +281,10 @@ def _positive(value: Any) -> float | None:
 
 def finite(name: str, value: Any) -> float:
     """Return the number; UserError for one that no wire or report carries."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise UserError(f"the environment's {name} is {value!r}, no number") from None
-    if not math.isfinite(number):
-        raise UserError(f"the environment's {name} is {number}, not a finite number")
-    return number
+    with contextlib.suppress(TypeError, ValueError):
+        if math.isfinite(number := float(value)):
+            return number
+    raise UserError(f"the environment's {name} is {value!r}, no finite number")
 
 
 def scene_of(environment: Environment) -> dict[str, Any] | None:
@@ -330,10 +324,8 @@ class Adapter:
         """
         if not isinstance(observation, Mapping):
             observation = {next(iter(self.task.observation)): observation}
-        return {
-            name: _fitting(observation, name, entry)
-            for name, entry in self.task.observation.items()
-        }
+        entries = self.task.observation.items()
+        return {name: _fitting(observation, name, entry) for name, entry in entries}
 
     def pack(self, observation: Any) -> dict[str, bytes]:
         """Return an observation as a state carries it."""
@@ -347,8 +339,7 @@ class Adapter:
 
     def stop(self) -> np.ndarray:
         """Return the action of a safe stop."""
-        own = offered(self.env, "brake_action")
-        if own is not None:
+        if (own := offered(self.env, "brake_action")) is not None:
             return self.within(own)
         pairs = zip(self.task.action, self.last.ravel().tolist(), strict=True)
         return self.within([last if row.stop is None else row.stop for row, last in pairs])
@@ -374,7 +365,6 @@ def _fitting(observation: Mapping[str, Any], name: str, entry: Entry) -> np.ndar
         raise UserError(f"the observation {name} is {array.shape}, not {tuple(entry.shape)}")
     # A float may come as any number; of whole numbers none may change.
     if array.dtype.kind != "f" and not (given.dtype.kind in "iub" and np.array_equal(array, given)):
-        value = given.ravel()[np.argmax(array != given)]
-        found = f"{value} ({given.dtype}); it is to be {array.dtype}"
-        raise UserError(f"the observation {name} holds {found}")
+        found = f"{given.ravel()[np.argmax(array != given)]} ({given.dtype})"
+        raise UserError(f"the observation {name} holds {found}; it is to be {array.dtype}")
     return array

@@ -43,8 +43,6 @@ FIRST = FILE.format(chunk_index=0, file_index=0)
 SAMPLED_PIXELS = 256  # Of each picture, for the statistics
 ENCODER = {"crf": "10", "g": "2", "bf": "0"}
 """Hardly any loss; every second picture stands alone: a training jumps about in the video."""
-MOST_IN_STATE = 400_000
-"""Of a state, without its pictures: nine statistics of each are kept as text."""
 QUANTILES = (1, 10, 50, 90, 99)
 Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of its pixels
 
@@ -91,9 +89,6 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
         if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
             raise UserError(f"the observation {name!r} cannot be the name of a feature")
     plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
-    if sum(math.prod(task.observation[name].shape) for name in plain) > MOST_IN_STATE:
-        most = f"more than {MOST_IN_STATE} numbers that are no picture"
-        raise UserError(f"{drive.recording.path}: a state holds {most}: too many for a data set")
     folder.mkdir(parents=True)
     rate = Fraction(1 / task.control_period_s).limit_denominator(1000)
     columns, bounds = _numbers(drive, task, rate)

@@ -131,11 +131,6 @@ def read_scene(scene: Mapping[str, Any]) -> SeenScene:
     return seen
 
 
-def period_of(state: wire.State) -> float:
-    """Return the control period in seconds that a state implies; 0 for an episode's first."""
-    return state.sim_time_s / state.step if state.step else 0.0
-
-
 def is_picture(entry: Entry) -> bool:
     """Return whether an entry is drawn as a picture: bytes in two dimensions or more."""
     return entry.dtype == "uint8" and len(entry.shape) > 1

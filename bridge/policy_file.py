@@ -10,7 +10,7 @@ import argparse
 import json
 import re
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,7 @@ FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
-    change = "set action.N.stop (a number, or null to hold the last action), slew_per_s, unit or"
-    change += " meaning of an action; may be repeated"
+    change = "action.N.stop (a number, or null to hold the last action), slew_per_s, unit, meaning"
     add("model", metavar="MODEL.onnx", type="path", help="the model, in one file")
     add("--env", metavar="ENV", required=True, help=env)
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
@@ -88,9 +87,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> None:
     """Raise UserError where nobody has said what a safe stop of each action is."""
-    if known_stops(environment) is not None:
-        return
-    for number, row in enumerate(task.action):
+    unknown = task.action if known_stops(environment) is None else []
+    for number, row in enumerate(unknown):
         place = f"action.{number}.stop="
         if not any(change.startswith(place) for change in changes):
             ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
@@ -107,13 +105,11 @@ def changed(task: Task, changes: Sequence[str]) -> Task:
     for change in changes:
         match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)=(.*)", change)
         if match is None or int(match[1]) >= len(actions):
-            most = len(actions) - 1
-            form = f"action.N.stop=VALUE, or slew_per_s, meaning, unit, with N from 0 to {most}"
-            raise UserError(f"--set {change}: expected {form}")
-        try:
-            value = json.loads(match[3])
-        except ValueError:
-            value = match[3]
+            form = "action.N.stop=VALUE, or slew_per_s, meaning, unit"
+            raise UserError(f"--set {change}: expected {form}, N from 0 to {len(actions) - 1}")
+        value: Any = match[3]
+        with suppress(ValueError):
+            value = json.loads(value)
         row = msgspec.to_builtins(actions[int(match[1])]) | {match[2]: value}
         try:
             actions[int(match[1])] = msgspec.convert(row, Action)
@@ -139,15 +135,11 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
         _rename(graph.graph, inputs[0], next(iter(task.observation)))
     if len(graph.graph.output) == 1:
         _rename(graph.graph, graph.graph.output[0].name, OUTPUT)
-    manifest = Manifest(
-        **msgspec.structs.asdict(task),
-        algorithm=algorithm,
-        training=training,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    about: dict[str, Any] = {"algorithm": algorithm, "training": training, "created": created}
+    manifest = Manifest(**msgspec.structs.asdict(task), **about)
     del graph.metadata_props[:]
-    told = msgspec.json.encode(manifest).decode()
-    graph.metadata_props.add(key=MANIFEST_KEY, value=told)
+    graph.metadata_props.add(key=MANIFEST_KEY, value=msgspec.json.encode(manifest).decode())
     return graph.SerializeToString()
 
 
@@ -168,25 +160,21 @@ def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.nda
     Raises UserError for an action that the environment cannot take.
     """
     actions: list[np.ndarray] = []
-    space: Any = environment.action_space
-    space.seed(0)
-    adapter = Adapter(environment, policy.manifest)
-    episode, over = 0, True
+    environment.action_space.seed(0)
+    adapter, episode, over = Adapter(environment, policy.manifest), 0, True
     seen: Any = None
     while len(actions) < REAL_OBSERVATIONS:
         if over:
             seen, _ = environment.reset(seed=episode)
             episode += 1
-        packed = adapter.pack(seen)
+        observed = policy.layout.arrays(adapter.pack(seen))
         try:
-            action = policy.act(policy.layout.arrays(packed))
-        except UserError:
-            raise
+            action = policy.act(observed)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
             raise UserError(f"onnxruntime does not run it: {error}") from None
         check_answer(action, policy.manifest, "a real observation")
         actions.append(action)
-        wanted = space.sample() if episode % 2 == 0 else action
+        wanted = environment.action_space.sample() if episode % 2 == 0 else action
         seen, _, terminated, truncated, _ = environment.step(adapter.within(wanted))
         over = terminated or truncated
     return np.min(actions, axis=0), np.max(actions, axis=0)

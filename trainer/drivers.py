@@ -102,11 +102,11 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
         return expert_of(env, policy), policy
     if policy.startswith(CONSTANT):
         try:
-            action, size = float(policy.removeprefix(CONSTANT)), env.action_space.shape[0]
-            return constant_driver(action, size), policy
+            action = float(policy.removeprefix(CONSTANT))
+            return constant_driver(action, env.action_space.shape[0]), policy
         except ValueError:
-            message = f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5"
-            raise UserError(message) from None
+            expected = f"expected an action from -1 to 1, as in {CONSTANT}0.5"
+            raise UserError(f"{policy}: {expected}") from None
     path = Path(policy)
     if path.suffix == ".onnx":
         driver, wanted = OnnxDriver(path, public_key), task_of(env).text
@@ -141,15 +141,11 @@ def load_actor(run_dir: Path, env: Any = None) -> tuple[Actor, dict[str, Any]]:
     with fitting(f"{path} is not a checkpoint of this project"):
         networks = state if path.name == BEST_FILE else state["learning"]["learner"]
         weights = networks[state.get("kept_actor", "actor")]
-        if "known_latency" in state:  # Of an earlier version
-            raise UserError(f"{run_dir} was trained with delay_known, which is gone")
-        keys = ("scenario", "algorithm", "seed", "episode")
-        label: dict[str, Any] = msgspec.convert(
-            {key: state[key] for key in keys}, dict[str, str | int]
-        )
-        env = env or make_environment(
-            name_in_file(label["scenario"], f"{run_dir} was trained in", "--scenario")
-        )
+        told = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
+        label: dict[str, Any] = msgspec.convert(told, dict[str, str | int])
+        if env is None:
+            said = f"{run_dir} was trained in"
+            env = make_environment(name_in_file(label["scenario"], said, "--scenario"))
         check_trained_in(env, run_dir, label["scenario"])
         first = next((w for name, w in weights.items() if name.endswith("conv1.weight")), None)
         frames = 2 if first is None else first.shape[1]

@@ -40,11 +40,10 @@ class Condition(NamedTuple):
     meaning: str
 
 
+NOISY = "Gaussian noise of 5 % of the control domain on the command"
 CONDITIONS = {
     "nominal": Condition("nominal", 0.0, bridge.CONDITIONS["nominal"]),
-    "noise": Condition(
-        "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
-    ),
+    "noise": Condition("nominal", COMMAND_NOISE, NOISY),
     "variant": Condition("variant", 0.0, bridge.CONDITIONS["variant"]),
     "dense": Condition("dense", 0.0, bridge.CONDITIONS["dense"]),
 }
@@ -139,8 +138,7 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
     """
     if ":" not in human:
         if env.expert is None:
-            hint = "module:Class may name another one"
-            raise UserError(f"{env.scenario} offers no expert(); {hint}")
+            raise UserError(f"{env.scenario} offers no expert(); name one as module:Class")
         return env.expert()
     try:
         own = EntryPoint(human, human, "").load()(env.unwrapped)
@@ -190,8 +188,7 @@ class Adapted(bridge.Adapter):
         self.key_rate_per_s = float(bridge.offered(env, "key_rate_per_s", 5.0))
         self.expert = self._expert if bridge.offered(env, "expert") else None
         if env.spec is None or env.spec.max_episode_steps is None:
-            most = f"an episode ends after {MOST_STEPS} steps at the latest"
-            bridge.say_once(f"{name} has no limit of its own: {most}")
+            bridge.say_once(f"{name} has no limit of its own: {MOST_STEPS} steps are taken")
             self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)
         self._last_action = self.rest_action
 
@@ -207,14 +204,12 @@ class Adapted(bridge.Adapter):
         """Drive for one control period."""
         self._last_action = np.asarray(action, np.float32)
         own = outer(self.action_range, action).reshape(self._space.shape)
-        observation, reward, terminated, truncated, info = self.env.step(
-            own.astype(self._space.dtype)
-        )
+        seen, reward, terminated, truncated, info = self.env.step(own.astype(self._space.dtype))
         info = _known(info)
         if terminated or truncated:
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
         reward = bridge.finite("reward", reward)
-        return self._seen(observation), reward, bool(terminated), bool(truncated), info
+        return self._seen(seen), reward, bool(terminated), bool(truncated), info
 
     def close(self) -> None:
         """Close the environment: of some simulators only one may live in a process."""
@@ -261,8 +256,7 @@ class Adapted(bridge.Adapter):
             (seen[name] if seen.dtype.names else seen)[...] = array
             largest = np.abs(array).max() if array.dtype.kind in "fi" else 0.0
             if not np.isfinite(largest):
-                what = "holds a number that is not finite"
-                raise UserError(f"an observation of {self.scenario} {what}")
+                raise UserError(f"{self.scenario} observes a number in {name} that is not finite")
             if largest > BEARABLE:
                 what = f"numbers beyond {BEARABLE:g}, of which no network learns: scale them"
                 bridge.say_once(f"{self.scenario} observes in {name} {what}")

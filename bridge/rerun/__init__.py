@@ -118,8 +118,7 @@ def add_sink(parser: argparse.ArgumentParser) -> Any:
 
 def has_display() -> bool:
     """Whether a window can be opened here; on Linux the environment says so."""
-    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return bool(named) or not sys.platform.startswith("linux")
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def check_sink(sink: str | None, port: int | None = None) -> str:
@@ -127,17 +126,17 @@ def check_sink(sink: str | None, port: int | None = None) -> str:
 
     Raise UserError for any other, and where nothing can be shown there. ``port``: of the page.
     """
-    sink = SPAWN if sink is None else sink
+    sink = sink or SPAWN
     if port is not None and sink != SERVE:
         raise UserError(f"--port is that of a page: --{SERVE}")
-    if sink.endswith(SUFFIX):
-        return str(check_writable(sink))
-    if sink not in (SPAWN, SERVE):
-        raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    if sink == SPAWN and not has_display():
-        raise UserError("no display for a window here: serve a page, or save a file")
     if sink == SERVE:
         _page_ports(port)
+    elif sink.endswith(SUFFIX):
+        return str(check_writable(sink))
+    elif sink != SPAWN:
+        raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
+    elif not has_display():
+        raise UserError("no display for a window here: serve a page, or save a file")
     return sink
 
 
@@ -228,14 +227,10 @@ class Viewer:
     def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
         command = [sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK, *options]
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the viewer writes)
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": self._said}
+        environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # As rerun's own spawn: no questions
         # A group of its own: ^C is not for it, and it ends with the child that the module starts.
-        self._process = subprocess.Popen(
-            command,
-            stdout=subprocess.DEVNULL,
-            stderr=self._said,
-            env={**os.environ, "RERUN_APP_ONLY": "true"},  # As rerun's own spawn: no questions.
-            start_new_session=True,
-        )
+        self._process = subprocess.Popen(command, env=environment, start_new_session=True, **quiet)
         end_s = time.monotonic() + START_S
         try:
             while not all(map(_answers, ports)):
@@ -284,8 +279,6 @@ def free_port() -> int:
 
 
 def _answers(port: int) -> bool:
-    try:
-        socket.create_connection((LOOPBACK, port), LOOK_S).close()
-    except OSError:
-        return False
-    return True
+    with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), LOOK_S):
+        return True
+    return False

@@ -95,15 +95,14 @@ class Canvas:
         self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene, bounds), 0.0]))
         for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
             cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
-            shapes = [shapes_of(car) for car in cars]
             half_m = [car.width_m / 2 for car in cars]
             for part, shade, radius_m, order in (
                 ("body", colour, half_m, 3.0),
                 ("outline", GLASS, 0.1, 4.0),
                 ("glass", GLASS, 0.3, 5.0),
             ):
-                path, strips = f"road/{name}/{part}", [shape[part] for shape in shapes]
-                self._strips(path, strips, shade, radius_m, order)
+                strips = [shapes_of(car)[part] for car in cars]
+                self._strips(f"road/{name}/{part}", strips, shade, radius_m, order)
 
     def _strips(self, path: str, strips: Any, colour: Colour, radii_m: Any, order: float) -> None:
         drawn = rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order)
@@ -136,11 +135,10 @@ def shapes_of(car: SeenCar) -> dict[str, list[Point]]:
 
 def view_bounds(scene: SeenScene) -> Bounds:
     """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
-    path = [(point[0], point[1]) for point in scene.path]
     cars = [(car.x, car.y) for car in scene.vehicles]
     ranges = []
     for axis, margin in enumerate(MARGIN_M):
-        known = [point[axis] for point in path] or [point[axis] for point in cars] or [0.0]
+        known = [point[axis] for point in scene.path or cars] or [0.0]
         low, high = min(known), max(known)
         near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
         ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
@@ -149,13 +147,11 @@ def view_bounds(scene: SeenScene) -> Bounds:
 
 def away_m(scene: SeenScene, bounds: Bounds) -> list[float]:
     """Return how far (x, y) the ego car is from the bounds' middle; [0, 0] where it is inside."""
-    ego = next((car for car in scene.vehicles if car.ego), None)
-    if ego is None:
-        return [0.0, 0.0]
-    place = list(zip((ego.x, ego.y), bounds, strict=True))
-    if all(low <= at <= high for at, (low, high) in place):
-        return [0.0, 0.0]
-    return [at - (low + high) / 2 for at, (low, high) in place]
+    for ego in (car for car in scene.vehicles if car.ego):
+        place = list(zip((ego.x, ego.y), bounds, strict=True))
+        if not all(low <= at <= high for at, (low, high) in place):
+            return [at - (low + high) / 2 for at, (low, high) in place]
+    return [0.0, 0.0]
 
 
 class Plot(NamedTuple):
@@ -168,13 +164,10 @@ class Plot(NamedTuple):
 
 def plot_view(plot: Plot, shown: rrb.TimeRange = WHOLE) -> rrb.TimeSeriesView:
     """The view of a plot; ``shown`` is the part of the time axis."""
-    return rrb.TimeSeriesView(
-        origin=plot.origin,
-        name=plot.title,
-        axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
-        axis_x=rrb.TimeAxis(view_range=shown),
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+    limits = None if plot.limits is None else rrb.ScalarAxis(range=plot.limits)
+    axes: Any = {"axis_x": rrb.TimeAxis(view_range=shown), "axis_y": limits}
+    legend = rrb.Corner2D.LeftTop
+    return rrb.TimeSeriesView(origin=plot.origin, name=plot.title, plot_legend=legend, **axes)
 
 
 def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
@@ -197,10 +190,9 @@ def sees_view(frames: bool = True, array: str = "") -> rrb.Horizontal:
     """What the policy sees (two frames, else a large ``array``, else lines), and the status."""
     seen: list[Any] = [plot_view(Plot("observation", "Policy sees"))]
     if frames:
+        view = rrb.Spatial2DView
         times = {"before": "t-1", "now": "t"}.items()
-        seen = [
-            rrb.Spatial2DView(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times
-        ]
+        seen = [view(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times]
     elif array:
         seen = [rrb.TensorView(origin=f"observation/{array}", name=f"Policy sees: {array}")]
     now = rrb.TextDocumentView(origin="status", name="Now")

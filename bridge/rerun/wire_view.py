@@ -16,7 +16,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import DECODERS, Heard, Pace, Scene, decode, images_of, is_picture, period_of
+from bridge.messages import DECODERS, Heard, Pace, Scene, decode, images_of, is_picture
 from bridge.ports import open_listener, wait_to_be_told
 from bridge.record import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 from bridge.recording import Recording, choose_vehicle, heard_of
@@ -46,10 +46,8 @@ APPLICATION = "phil_hil"
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    if arguments.foxglove and arguments.port:
-        raise UserError("--foxglove has its port beside it: --foxglove PORT")
-    if arguments.foxglove and arguments.recording is not None:
-        raise UserError(f"Foxglove opens {arguments.recording} by itself")
+    if arguments.foxglove and (arguments.port or arguments.recording):
+        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
     if arguments.foxglove:
         try:
             import foxglove
@@ -120,11 +118,11 @@ def _watch(
     arguments: Any, opened: contextlib.AbstractContextManager[Callable[[Heard], None]]
 ) -> int:
     """Show until there is a reason to stop."""
-    vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    tls = tls_for(arguments.tls, arguments.connect)
+    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, where)
     with (
         sigterm_as_interrupt(),
-        open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
+        open_listener(where, vehicle_id, arguments.wait_s, tls) as listener,
         opened as show,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
@@ -162,26 +160,25 @@ LINES = {
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
 MOST_LINES = 16  # Numbers of an observation that a plot can show
+COLUMNS = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the first scene fixes the ground shown (None: as rerun sees fit)."""
     shown = None if scene is None or scene.picture else scene  # A picture has its own bounds.
     seen = {} if scene is None or scene.task is None else scene.task.observation
-    many = [name for name, entry in seen.items() if math.prod(entry.shape) > MOST_LINES]
+    many = (name for name, entry in seen.items() if math.prod(entry.shape) > MOST_LINES)
     pictures = not seen or any(map(is_picture, seen.values()))
     left = rrb.Vertical(
         draw.road_view(shown, "Road from above" if shown or not seen else "From above"),
-        draw.sees_view(pictures, many[0] if many else ""),
+        draw.sees_view(pictures, next(many, "")),
         row_shares=[3, 1.4],
     )
     right = rrb.Vertical(
         draw.lanes_view("mode", "Mode, and why it does not drive"),
         *map(draw.plot_view, PLOTS),
         rrb.TextLogView(
-            origin="events",
-            name="Events: modes, rejections, episodes",
-            columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
+            origin="events", name="Events: modes, rejections, episodes", columns=COLUMNS
         ),
         row_shares=[2.2, 2, 2, 2, 1.6, 1.6, 1.8],
     )
@@ -251,7 +248,8 @@ class WireLog:
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
-        self._time.period_s = period_of(state) or self._time.period_s
+        if state.step:
+            self._time.period_s = state.sim_time_s / state.step
         self._session = state.session
         self._stand_at(place := (state.session, state.episode, state.step))
         _keep(self._sent_ns, place, state.sent_ns)

@@ -182,4 +182,4 @@ def test_a_drive_is_served_to_foxglove(tmp_path, refusal):
         run.kill()
         assert view.wait(30) == 0, view.errors  # with the simulator
     assert msgspec.json.decode(data, type=RawImage).height == 90
-    assert "by itself" in refusal("view", "a.mcap", "--foxglove")
+    assert "goes with neither" in refusal("view", "a.mcap", "--foxglove")

@@ -50,7 +50,6 @@ def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name
     "crafted",
     [
         {"seed": torch.zeros(2)},
-        {"known_latency": "delay=100ms"},
         {"kept_actor": []},
         {"actor": {"head.output.bias": torch.zeros(1), "picture.conv1.weight": torch.zeros(0)}},
     ],
