@@ -228,21 +228,21 @@ def _actions(environment: Environment, name: str) -> list[Action]:
     space = environment.action_space
     if not isinstance(space, Box) or not np.all(np.isfinite([space.low, space.high])):
         raise UserError(f"environment {name!r} acts in {space}; the wire carries a Box with bounds")
-    count = space.low.size
+    low, high = space.low.ravel().tolist(), space.high.ravel().tolist()
+    count = len(low)
     said: dict[str, Any] = {
-        "name": offered(environment, "action_names") or [f"action_{n}" for n in range(count)],
-        "meaning": offered(environment, "action_meanings") or [""] * count,
-        "unit": offered(environment, "action_units") or [""] * count,
-        "stop": known_stops(environment) or [None] * count,
-        "low": space.low.ravel().tolist(),
-        "high": space.high.ravel().tolist(),
+        "action_names": offered(environment, "action_names")
+        or [f"action_{n}" for n in range(count)],
+        "action_meanings": offered(environment, "action_meanings") or [""] * count,
+        "action_units": offered(environment, "action_units") or [""] * count,
+        "brake_action": known_stops(environment) or [None] * count,
     }
     for key, values in said.items():
         if len(values) != count:
-            what = f"the {key} of {len(values)} actions, and has {count}"
-            raise UserError(f"environment {name!r} gives {what}")
-    rows = zip(*said.values(), strict=True)
-    return [Action(**dict(zip(said, row, strict=True))) for row in rows]
+            raise UserError(f"environment {name!r}: {key} has {len(values)} entries, not {count}")
+    fields = ("name", "meaning", "unit", "stop", "low", "high")
+    rows = zip(*said.values(), low, high, strict=True)
+    return [Action(**dict(zip(fields, row, strict=True))) for row in rows]
 
 
 def known_stops(environment: Environment) -> list[float | None] | None:
