@@ -106,19 +106,10 @@ class Shared(Rover):
         return self
 
 
-class Unmoved(Rover):
-    def __deepcopy__(self, memo):
-        raise TypeError("a motor cannot be copied")
-
-
-@pytest.mark.parametrize(
-    ("kind", "why"), [(Shared, "it does not do what"), (Unmoved, "TypeError: a motor cannot")]
-)
-def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path, kind, why):
-    gymnasium.register(f"test/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")
-    name = f"{__name__}:test/{kind.__name__}-v0"
-    with pytest.raises(UserError, match=f"nothing can be foreseen in .*: {why}"):
-        train(name, out=tmp_path / "run", algorithm="ppl_td3", episodes=1)
+def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path):
+    gymnasium.register("test/Shared-v0", f"{__name__}:Shared")
+    with pytest.raises(UserError, match=r"nothing can be foreseen in .*: it does not do what"):
+        train(f"{__name__}:test/Shared-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
 
 
 def test_the_papers_networks_begin_as_ever():
@@ -164,14 +155,7 @@ def test_an_observation_is_one_array_and_an_action_has_one_scale():
 
 
 @pytest.mark.parametrize(
-    "space",
-    [
-        CAMERA,
-        Box(0, 255, (9, 7), np.uint8),
-        Box(0, 9, (3, 4)),
-        Box(0, 9, ()),
-        Rover.observation_space,
-    ],
+    "space", [CAMERA, Box(0, 255, (9, 7), np.uint8), Box(0, 9, ()), Rover.observation_space]
 )
 def test_a_learner_follows_any_observation_and_the_replay_keeps_its_bytes(space):
     env: Any = Rover()
@@ -229,29 +213,32 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
 MISSPELT = replace(PHIL, settings={"bach_size": 4})
 
 
-def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path):
-    """In Python, too, where no option's choices stand before it."""
-    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
-    for text, given, says in (
+@pytest.mark.parametrize(
+    ("text", "given", "says"),
+    [
         ("learner = 3", "", "learner"),
         ("tau = 0.1", "--preset printed", "sets tau, and so does --preset"),
         ("algorithm = 'phil_td3'\nalpha = 0.5", "--algorithm rlpd_td3", "sets alpha, and so does"),
         ("human = 'person'", "", "a person guides that run: name --human web"),
         ("late_to_s = 0.1\nlate_from_s = 0.3", "", "late_to_s 0.1 is below late_from_s 0.3"),
-    ):
-        (tmp_path / "config.toml").write_text(f"{text}\n")
-        with pytest.raises(UserError, match=says):
-            main(["train", *words, *given.split()])
-    wrongs: dict[str, Any] = {
-        "device": "gpu",
-        "threads": -1,
-        "seed": -1,
-        "preset": "mine",
-        "speed": 0.0,
-    }
-    for name, value in wrongs.items():
-        with pytest.raises(UserError, match=f"{name} (must be|= -1 is out of)"):
-            train(ROVER, out=tmp_path / "run", **{name: value})
+    ],
+)
+def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path, text, given, says):
+    (tmp_path / "config.toml").write_text(f"{text}\n")
+    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
+    with pytest.raises(UserError, match=says):
+        main(["train", *words, *given.split()])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("device", "gpu"), ("threads", -1), ("seed", -1), ("preset", "mine"), ("speed", 0.0)],
+)
+def test_what_python_asks_for_is_checked_like_options(tmp_path, name, value):
+    asked: dict[str, Any] = {name: value}
+    with pytest.raises(UserError, match=f"{name} (must be|= -1 is out of)"):
+        train(ROVER, out=tmp_path / "run", **asked)
     with pytest.raises(UserError, match=r"settings of .*:MISSPELT: .*'bach_size'"):
         train(ROVER, out=tmp_path / "run", algorithm=f"{__name__}:MISSPELT")
     assert not (tmp_path / "run").exists()
@@ -322,26 +309,29 @@ def test_a_simulator_that_lives_once_in_a_process_is_trained_evaluated_and_expor
 def test_what_a_simulator_does_to_directory_and_observations_is_found_out(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.chdir(tmp_path)
-    named = ["--scenario", odd("Wanders")]
-    words = ["train", "--algorithm", "per_td3", "--steps", "20", "--out", "run", *named]
-    assert main([*words, "--set", "warmup_steps=10"]) == 0
-    monkeypatch.chdir(tmp_path)
-    assert main(["evaluate", "run", "--runs", "1", "--out", "e.json", *named]) == 0
-    monkeypatch.chdir(tmp_path)
-    assert main(["export", "run", "--out", "p.onnx", *named]) == 0
+    for command in (
+        "train --algorithm per_td3 --steps 20 --out run --set warmup_steps=10",
+        "evaluate run --runs 1 --out e.json",
+        "export run --out p.onnx",
+    ):
+        monkeypatch.chdir(tmp_path)
+        assert main([*command.split(), "--scenario", odd("Wanders")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"run", "e.json", "p.onnx"}
     monkeypatch.chdir(tmp_path)
     bridge.say_once.cache_clear()
     with pytest.raises(UserError, match=r"holds 0\.89.* to be uint8"):
         make_environment(odd("FloatPicture")).reset(seed=0)
-    assert capsys.readouterr().err.count("no network learns") == 0
-    make_environment(odd("Huge")).reset(seed=0)
-    make_environment(odd("Huge")).reset(seed=1)
+    for seed in (0, 1):
+        make_environment(odd("Huge")).reset(seed=seed)
     assert capsys.readouterr().err.count("no network learns") == 1
 
 
 def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
+    def driven_at(scenario, policy):
+        asked = {"recording": None, "at": None, "episode": None, "vehicle_id": None, "seed": 0}
+        options: Any = SimpleNamespace(**asked, scenario=scenario, policy=policy, public_key=None)
+        return session._environment(options)[0].control_period_s
+
     for scenario in (odd("Says"), "left_turn"):
         name = tmp_path / scenario.rpartition("/")[2]
         settings = {"period_s": 0.5, "evaluate_every_steps": 0}
@@ -351,17 +341,9 @@ def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
         for policy in (run, name.with_suffix(".onnx")):
             (episode,) = evaluate(policy, scenario, runs=1).episodes
             assert episode.time_s == 0.5 * episode.steps
-        env, _ = driving._environment(drive_options(scenario, str(run.directory)))
-        assert env.control_period_s == 0.5
-        env, _ = driving._environment(drive_options(scenario, None))
-        assert env.control_period_s != 0.5
+        assert driven_at(scenario, str(run.directory)) == 0.5 != driven_at(scenario, None)
         with pytest.raises(UserError, match=r"the control period is 0\.001"):
             make_environment(scenario, period_s=0.001)
-
-
-def drive_options(scenario, policy):
-    asked = {"recording": None, "at": None, "episode": None, "vehicle_id": None, "seed": 0}
-    return SimpleNamespace(**asked, scenario=scenario, policy=policy, public_key=None)
 
 
 def test_a_limit_of_steps_is_a_timeout_where_another_episode_tells():
@@ -385,11 +367,11 @@ def test_what_a_wrapper_offers_is_found():
 
 def test_a_stop_of_no_environments_own_begins_each_episode_with_hands_off():
     env = make_environment(odd("Says"))
-    env.reset(seed=0)
-    env.step(np.ones(1, np.float32))
-    assert env.brake_action.tolist() == [1.0]
-    env.reset(seed=1)
-    assert env.brake_action.tolist() == [0.0]
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        assert env.brake_action.tolist() == [0.0]
+        env.step(np.ones(1, np.float32))
+        assert env.brake_action.tolist() == [1.0]
 
 
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
