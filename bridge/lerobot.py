@@ -48,11 +48,12 @@ Columns = dict[str, Any]  # Feature to [frames, ...]; of a video, a sample of it
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="F.mcap", help="a file of bridge record")
+    add = parser.add_argument
     form = "format of the data set: LeRobotDataset v3.0"
-    parser.add_argument("--format", choices=["lerobot"], required=True, help=form)
     out = "the directory of the data set, which must not exist yet"
-    parser.add_argument("--out", metavar="DIR", required=True, help=out)
+    add("recording", metavar="F.mcap", help="a file of bridge record")
+    add("--format", choices=["lerobot"], required=True, help=form)
+    add("--out", metavar="DIR", required=True, help=out)
     several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
 
@@ -202,7 +203,7 @@ def _write(
             row |= {f"stats/{key}/{name}": value for name, value in stats.items()}
         return row
 
-    ends = list(enumerate(pairwise(bounds)))
+    episodes = [episode(number, *ends) for number, ends in enumerate(pairwise(bounds))]
     # pandas, which reads it, is told that the text is the index.
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
@@ -210,16 +211,17 @@ def _write(
     numbers = {key: column for key, column in columns.items() if column.ndim < 3}
     for name, table in {
         f"data/{FIRST}": pa.table({key: _column(column) for key, column in numbers.items()}),
-        f"meta/episodes/{FIRST}": pa.Table.from_pylist([episode(n, *bound) for n, bound in ends]),
+        f"meta/episodes/{FIRST}": pa.Table.from_pylist(episodes),
         "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
     }.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_table(table, path)
     write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
+    count = len(episodes)
     info |= {
         "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
-        "total_episodes": len(ends), "total_tasks": 1, "splits": {"train": f"0:{len(ends)}"},
+        "total_episodes": count, "total_tasks": 1, "splits": {"train": f"0:{count}"},
         "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
         "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
     }  # fmt: skip
@@ -242,10 +244,8 @@ def _stats(columns: Columns, features: dict[str, Any], frames: slice) -> dict[st
         values, shape = columns[key][frames].astype(np.float64), feature["shape"]
         if feature["dtype"] == "video":
             values, shape = values.reshape(-1, 3) / 255, [3, 1, 1]
-        quantiles = np.quantile(values, np.array(QUANTILES) / 100, axis=0)
-        stats = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
-        stats |= {f"q{part:02d}": row for part, row in zip(QUANTILES, quantiles, strict=True)}
-        stats["std"] = values.std(0)
+        stats = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+        stats |= {f"q{part:02d}": np.percentile(values, part, axis=0) for part in QUANTILES}
         found[key] = {name: np.reshape(value, shape).tolist() for name, value in stats.items()}
         found[key]["count"] = [frames.stop - frames.start]
     return found
