@@ -6,9 +6,10 @@ holds what the environment knows and the vehicle does not, so the policy never h
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from edge_runtime import wire
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S, Entry, Task, check_task
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES
 
 MOST = 1e12  # Of metres, seconds, milliseconds and all else that is drawn
 MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
@@ -74,7 +74,7 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
     session: str
     environment: str
     condition: str
-    seed: int
+    seed: Annotated[int, msgspec.Meta(ge=0)]
     standing: bool
     clock: str
     loop: str
@@ -150,16 +150,12 @@ def images_of(array: np.ndarray) -> np.ndarray | None:
 
 def decode_scene(payload: bytes) -> Scene | wire.Rejection:
     """Decode a scene, or say why not."""
-    rejected = wire.Rejection(wire.Reason.MALFORMED, "not a scene")
-    if len(payload) > MAX_STATE_BYTES:
-        return rejected
-    try:
+    with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
         scene = _DECODER.decode(payload)
         if scene.task is not None:
             check_task(scene.task)  # Whoever sent it, a viewer reads states by it.
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, UserError):
-        return rejected
-    return rejected if scene.origin is not None and scene.origin.seed < 0 else scene
+        return scene
+    return wire.Rejection(wire.Reason.MALFORMED, "not a scene")
 
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {

@@ -63,16 +63,13 @@ def new_recording(path: str) -> str:
 
 
 def _add_record_arguments(parser: Any) -> None:
-    out = "the recording, which must not exist yet"
-    parser.add_argument("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    add_options(
-        parser, "--vehicle-id", default=None, help="record this vehicle only (otherwise all)"
-    )
+    add, one = parser.add_argument, "record this vehicle only (otherwise all)"
     linger = "longest wait for a simulator that has gone to come back, in s"
-    parser.add_argument(
-        "--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger
-    )
+    out = "the recording, which must not exist yet"
+    add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--vehicle-id", default=None, help=one)
+    add("--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger)
 
 
 def _run_record(arguments: Any) -> int:
