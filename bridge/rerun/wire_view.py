@@ -398,9 +398,10 @@ class WireLog:
     def _draw_status(self) -> None:
         lines = [f"# {self._mode or 'waiting'}", self._reason]
         if (health := self._health) is not None:
+            counts = [f"{name} {count}" for name, count in health.rejected.items() if count]
             lines += [
                 f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
-                f"states accepted {health.accepted}, rejected {sum(health.rejected.values())}",
+                f"states accepted {health.accepted}, rejected: {', '.join(counts) or 'none'}",
                 f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
                 f"link: {link_words(health.link)}",
             ]
