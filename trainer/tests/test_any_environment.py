@@ -330,7 +330,7 @@ def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
     def driven_at(scenario, policy):
         asked = {"recording": None, "at": None, "episode": None, "vehicle_id": None, "seed": 0}
         options: Any = SimpleNamespace(**asked, scenario=scenario, policy=policy, public_key=None)
-        return session._environment(options)[0].control_period_s
+        return driving._environment(options)[0].control_period_s
 
     for scenario in (odd("Says"), "left_turn"):
         name = tmp_path / scenario.rpartition("/")[2]
