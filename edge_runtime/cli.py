@@ -6,17 +6,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
 import errno
 import math
 import os
-import re
 import signal
 import sys
 import textwrap
 import time
 from importlib import import_module
-from itertools import takewhile
 from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
 
 from edge_runtime import __version__
@@ -70,23 +67,12 @@ class ArgumentParser(argparse.ArgumentParser):
         self.register("type", "path", os.path.abspath)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, and refuse empty values and, before a missing option, one that does not exist.
-
-        An unset shell variable is an empty value, which as a path is the current directory.
-        """
+        """Parse, and refuse an empty value: as a path it is the current directory."""
         given = sys.argv[1:] if args is None else list(args)
-        if self._subparsers is None:  # else the command's own parser does it
-            for before, value in zip(["", *given], given):
-                option = re.fullmatch("(--[^=]*)=", value)
-                if not value or option:
-                    place = option.group(1) if option else before
-                    self.error(f"an empty value after {place}" if place else "an empty value")
-            known = self._option_string_actions
-            for name in (value.partition("=")[0] for value in takewhile("--".__ne__, given)):
-                if name.startswith("--") and " " not in name and name not in known:
-                    near = difflib.get_close_matches(name, known, 1)
-                    guess = f"; did you mean {near[0]}?" if near else ""
-                    self.error(f"there is no option {name}{guess}")
+        pairs = [] if self._subparsers else zip(["", *given], given)
+        for before, value in pairs:  # a command's own parser does it for the words after it
+            if not value or (value.startswith("--") and value.find("=") == len(value) - 1):
+                self.error(f"an empty value after {value[:-1] or before}")
         return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -140,16 +126,12 @@ def program(
     def main(argv: List[str]) -> int:
         parser = ArgumentParser(prog=name, description=description, epilog=examples(*shown))
         parser.add_argument("--version", action="version", version=__version__)
-        word = argv[0] if argv else "--help"
-        near = difflib.get_close_matches(word, (*commands, "--help", "--version"), 1)
-        if near and near[0] != word:
-            parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
         parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
         chosen: Any = None
         for command, (place, summary) in commands.items():
             text = f"{summary[0].upper()}{summary[1:]}."
             subparser = parsers.add_parser(command, help=summary, description=text)
-            if command == word:
+            if argv[:1] == [command]:
                 chosen = _load(place)
                 subparser.epilog = chosen.EXAMPLE
                 chosen.add_arguments(subparser)
@@ -189,13 +171,11 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
         _drop_stdout()
         return BROKEN_PIPE
     except OSError as error:
-        if error.filename is not None:
-            what = printable(str(error.filename))
-        elif error.errno in _DISK_IS_FULL:
-            what = "cannot write"
+        if error.filename is None:
+            if error.errno not in _DISK_IS_FULL:
+                raise
             _drop_stdout()  # it may be stdout that takes no more
-        else:
-            raise
+        what = printable(str(error.filename or "cannot write"))
         print(f"error: {what}: {error.strerror}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
@@ -207,31 +187,21 @@ def _drop_stdout() -> None:
 
 def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """Make an option type: a whole number between two limits, both included."""
-    limits = f", at least {least}" if most == _LARGEST else f" from {least} to {most}"
-
-    def read(text: str) -> int:
-        value = least - 1
-        with contextlib.suppress(ValueError):
-            value = int(text)
-        if value > _LARGEST:
-            raise argparse.ArgumentTypeError(f"{text!r} is larger than 2**63 - 1")
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number{limits}")
-        return value
-
-    return read
+    limits = f"a whole number from {least} to {most}"
+    return _within(int, limits, lambda value: least <= value <= most)
 
 
 def number(limits: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     """Make an option type: a finite number that ``fits``; ``limits`` says in words which do."""
+    return _within(float, limits, lambda value: math.isfinite(value) and fits(value))
 
-    def read(text: str) -> float:
-        value = math.nan
+
+def _within(kind: Any, limits: str, fits: Callable[[Any], bool]) -> Callable[[str], Any]:
+    def read(text: str) -> Any:
         with contextlib.suppress(ValueError):
-            value = float(text)
-        if not (math.isfinite(value) and fits(value)):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {limits}")
-        return value
+            if fits(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"{text!r} is not {limits}")
 
     return read
 

@@ -39,10 +39,8 @@ def _check(arguments: argparse.Namespace) -> int:
     inference_ms = quantiles_ms([infer(policy, seen)[1] for seen in runs])
     limit_ms = policy.manifest.control_period_s * 1000
     if inference_ms["p99"] > limit_ms:
-        raise UserError(
-            f"policy {arguments.policy} may not drive: its inference takes"
-            f" {inference_ms['p99']:.0f} ms (p99) here, {limit_ms:.0f} ms is the limit"
-        )
+        took = f"its inference takes {inference_ms['p99']:.0f} ms (p99), over {limit_ms:.0f} ms"
+        raise UserError(f"policy {arguments.policy} may not drive: {took}")
     import onnxruntime  # Here: an operator's commands need none.
 
     report = {
@@ -111,11 +109,8 @@ def ask(
                     raise UserError(_STRANGER.format(vehicle_id))
                 return answer
     # A query without the right to it looks the same from here as a runtime that is not there.
-    hint = f"; or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
-    raise UserError(
-        f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
-        f" start one, or name it with --vehicle-id{hint}"
-    )
+    hint = f", or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
+    raise UserError(f"no edge runtime with vehicle id {vehicle_id} is connected to {connect}{hint}")
 
 
 _NOT_SHOWN = ("manifest", "schema", "sent_ns")

@@ -163,12 +163,10 @@ def convert(settings: Mapping[str, Any], kind: Type[_S], table: str = "") -> _S:
     try:
         return msgspec.convert(settings, kind)
     except msgspec.ValidationError as error:
-        sentence, _, place = str(error).partition(" - at ")
-        inner = place.strip("`").replace("$.", "").replace("$", "")
-        if "unknown field" in sentence and not inner:
-            sentence += f"; known are {', '.join(kind.__struct_fields__)}"
-        where = ".".join(filter(None, (table, inner)))
-        raise UserError(f"{where}: {sentence}" if where else sentence) from None
+        sentence = str(error).replace("`$", f"`{table}").replace("`.", "`")
+        if "unknown field" in sentence and " - at " not in sentence:
+            sentence = f"{table} {sentence}; known are {', '.join(kind.__struct_fields__)}"
+        raise UserError(sentence) from None
 
 
 def _check(config: Config) -> None:
@@ -179,8 +177,8 @@ def _check(config: Config) -> None:
     if not 0 <= config.realtime_priority <= MAX_PRIORITY:
         words = f"use 1 to {MAX_PRIORITY}, or 0 for none"
         raise UserError(f"realtime_priority {config.realtime_priority} is not valid: {words}")
-    if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
-        raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
+    if any(cpu < 0 for cpu in config.cpus):
+        raise UserError(f"cpus {config.cpus} is not valid: list processors, like [2, 3]")
 
 
 def check_choice(key: str, value: str, known: Sequence[str]) -> None:

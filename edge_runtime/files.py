@@ -21,8 +21,8 @@ from edge_runtime.util import PathLike, UserError, open_regular
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
-    A symbolic link stays, and the file behind it is written. Missing directories are made. Raises
-    UserError where that fails, and for a path that is there and is no regular file.
+    Missing directories are made; a symbolic link is replaced. Raises UserError where that fails,
+    and for a path that is there and is no regular file.
     """
     target = _checked(path)
     make_directory(target.parent)
@@ -55,11 +55,6 @@ def _temporary(target: Path) -> BinaryIO:
         fcntl.flock(stream, fcntl.LOCK_EX)
     # Another writer may have deleted it just before the lock.
     return stream if os.fstat(stream.fileno()).st_nlink else _temporary(target)
-
-
-def behind_link(path: PathLike) -> Path:
-    """Follow a symbolic link, also to a file that is not there; any other path stays."""
-    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
 
 
 def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
@@ -100,19 +95,14 @@ def write_json_out(path: Optional[PathLike], value: Any) -> None:
 def _checked(path: PathLike) -> Path:
     """Return the file to replace; UserError for a directory, a device or a pipe."""
     try:
-        mode = os.stat(path).st_mode
+        is_file = stat.S_ISREG(os.stat(path).st_mode)
     except FileNotFoundError:
-        target = behind_link(path)
-        if os.path.islink(path) and not target.parent.is_dir():  # perhaps a disk is not mounted
-            raise UserError(f"cannot write {path}: {target.parent} does not exist") from None
-        return target
+        is_file = True
     except (OSError, ValueError) as error:  # ValueError: a NUL inside the name
         raise UserError(f"cannot write {path}: {getattr(error, 'strerror', error)}") from None
-    if stat.S_ISDIR(mode):
-        raise UserError(f"{path} is a directory, not a file")
-    if not stat.S_ISREG(mode):
+    if not is_file:
         raise UserError(f"cannot write {path}: it is no regular file")
-    return behind_link(path)
+    return Path(path)
 
 
 def try_to_lock_file(descriptor: int) -> bool:

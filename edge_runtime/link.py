@@ -21,7 +21,7 @@ import zenoh
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
 from edge_runtime.reach import Listener
-from edge_runtime.transport import LEASE_MS
+from edge_runtime.transport import LEASE_MS, only_own
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health, Message, Rejection, encode, key
 
@@ -51,7 +51,6 @@ class Link:
         self._session, self._manifest = session, manifest
         self._declared: List[Any] = []
         self._presence: Optional[Presence] = None
-        self._stop: Callable[[], None] = lambda: None
         self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
             topic: session.declare_publisher(
@@ -73,9 +72,6 @@ class Link:
         """Listen to states and answer queries. Call `appear` next, when it can answer."""
 
         def state_came(sample: zenoh.Sample) -> None:
-            # Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
-            if str(sample.key_expr) != state_key:
-                return
             # One byte too many is enough to be rejected; a huge message is not copied.
             is_huge = len(sample.payload) > max_state_bytes
             on_state(bytes(max_state_bytes + 1) if is_huge else bytes(sample.payload))
@@ -94,7 +90,7 @@ class Link:
         session, state_key = self._session, key(self.vehicle_id, "state")
         rearm_key = key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(state_key, _at_once(state_came)),
+            session.declare_subscriber(state_key, _at_once(only_own(state_key, state_came))),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(rearm_key, rearm_asked),
         ]
@@ -105,13 +101,13 @@ class Link:
         It gives way to an elder one: it sends nothing more, and calls `stop`. `stop` is called,
         too, when its certificate has expired.
         """
-        self._stop = stop
 
         def give_way() -> None:
             self.gave_way = True
             stop()
 
         alive = key(self.vehicle_id, "alive")
+        self._stop = stop
         self._presence = Presence(self._session, alive, open_client, give_way, self.listener)
         self._declared.append(self._presence)
         self._presence.thread.start()
@@ -125,7 +121,7 @@ class Link:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
         if self.gave_way:
             return
-        if self.listener and time.time() >= self.listener.own_until_s:
+        if self._presence and self.listener and time.time() >= self.listener.own_until_s:
             self._stop()
         try:
             self._publishers[topic].put(encode(message))
@@ -178,15 +174,15 @@ def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
     if found:
         time.sleep(_LEFTOVER_S)
         found = _ask(open_client, selector)
-    if found:
-        raise taken(vehicle_id)
+        if found:
+            raise taken(vehicle_id)
     return found is not None
 
 
 def taken(vehicle_id: str) -> UserError:
     """Make the error of a runtime that must give way."""
-    first = "end that one first, or name this one with another --vehicle-id"
-    return UserError(f"another edge runtime is connected with vehicle id {vehicle_id}; {first}")
+    found = f"another edge runtime is connected with vehicle id {vehicle_id}"
+    return UserError(f"{found}; end that one first")
 
 
 class Presence:
@@ -263,9 +259,8 @@ class Presence:
         ]
 
     def _take_back(self) -> None:
-        tokens, self._tokens = self._tokens, []
-        for token in tokens:
-            token.undeclare()
+        while self._tokens:
+            self._tokens.pop(0).undeclare()
 
     def _seen_routers(self) -> List[str]:
         return sorted(map(str, self._session.info.routers_zid()))

@@ -6,27 +6,33 @@ the lines, so that a stalled reader of stderr cannot hold the thread that drives
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import queue
-import threading
 import time
+from logging.handlers import QueueHandler, QueueListener
 from typing import Any, Optional
+
+from edge_runtime.util import ends_within
 
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
 _WAITING_LINES = 1000
 _FLUSH_S = 0.5
+_listener: Optional[QueueListener] = None
 
 
 def configure(level: str, log_format: str = "text") -> None:
     """Send lines of at least `level` to stderr."""
+    global _listener
     stream = logging.StreamHandler()
     stream.setFormatter(_Formatter(as_json=log_format == "json"))
     close()
-    _LOGGER.handlers = [_Background(stream)]
+    lines: queue.Queue[logging.LogRecord] = queue.Queue(_WAITING_LINES)
+    _listener = _Listener(lines, stream)
+    _listener.start()
+    _LOGGER.handlers = [QueueHandler(lines)]  # drops lines while its queue is full
     _LOGGER.propagate = False
     _LOGGER.setLevel(level.upper())
     logging.raiseExceptions = False  # a closed stderr must not stop the vehicle's controller
@@ -41,37 +47,16 @@ def close() -> bool:
 
     Returns False where a reader of stderr is stalled: the interpreter's exit would wait for it.
     """
-    for handler in _LOGGER.handlers:
-        handler.close()
-    backgrounds = [one for one in _LOGGER.handlers if isinstance(one, _Background)]
-    return not any(one.thread.is_alive() for one in backgrounds)
+    global _listener
+    listener, _listener = _listener, None
+    return listener is None or ends_within(_FLUSH_S, listener.stop)
 
 
-class _Background(logging.Handler):
-    """Hands the lines to a thread; drops lines while its queue is full."""
+class _Listener(QueueListener):
+    queue: Any
 
-    def __init__(self, target: logging.Handler) -> None:
-        super().__init__()
-        self._target = target
-        self._lines: queue.Queue[Optional[logging.LogRecord]] = queue.Queue(_WAITING_LINES)
-        self.thread = threading.Thread(target=self._run, name="log", daemon=True)
-        self.thread.start()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait(record)
-
-    def close(self) -> None:
-        try:
-            self._lines.put(None, timeout=_FLUSH_S)
-        except queue.Full:
-            return
-        self.thread.join(_FLUSH_S)
-        super().close()
-
-    def _run(self) -> None:
-        for record in iter(self._lines.get, None):
-            self._target.handle(record)
+    def enqueue_sentinel(self) -> None:
+        self.queue.put(None)  # waits for room, where the library's raises Full
 
 
 class _Formatter(logging.Formatter):

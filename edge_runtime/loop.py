@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Deque, Dict, NamedTuple, Optional
+from typing import TYPE_CHECKING, Deque, Dict, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
@@ -41,26 +41,26 @@ _FLOOD_PERIOD_S = 1.0
 _HUNG_S = 2.0
 
 
-class LoopParts(NamedTuple):
-    """What a loop connects. `rearm_command` is what the log names to an operator."""
-
-    policy: Policy
-    controller: Controller
-    link: Link
-    notifier: Notifier
-    vehicle: Optional[VehicleRunner] = None
-    hold: Optional[Hold] = None
-    rearm_command: str = ""
-
-
 class ControlLoop:
-    """Answers states with commands until it is stopped."""
+    """Answers states with commands until it is stopped.
 
-    def __init__(self, parts: LoopParts) -> None:
-        self._policy, self._controller, self._link = parts.policy, parts.controller, parts.link
-        self._vehicle, self._notifier, self._hold = parts.vehicle, parts.notifier, parts.hold
-        self._rearm_command = parts.rearm_command
-        self._period_s = parts.policy.manifest.control_period_s
+    `rearm_command` is what the log names to an operator.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        controller: Controller,
+        link: Link,
+        notifier: Notifier,
+        vehicle: Optional[VehicleRunner] = None,
+        hold: Optional[Hold] = None,
+        rearm_command: str = "",
+    ) -> None:
+        self._policy, self._controller, self._link = policy, controller, link
+        self._vehicle, self._notifier, self._hold = vehicle, notifier, hold
+        self._rearm_command = rearm_command
+        self._period_s = policy.manifest.control_period_s
         self._link_quality, self._is_poor = LinkQuality(), False
         self._board = BoardWatch()
         self._latest = LatestState(self._period_s)
@@ -70,7 +70,7 @@ class ControlLoop:
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged, self._logged_wait = parts.controller.safety, False
+        self._logged, self._logged_wait = controller.safety, False
         self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
@@ -85,7 +85,7 @@ class ControlLoop:
         """Begin to listen; call `run` next."""
         self._worker.start()
         if self._vehicle is not None:
-            self._vehicle.on_fault = self._vehicle_failed
+            self._vehicle.on_fault = self._wake_watchdog
         limit = self._policy.layout.max_payload_bytes
         self._link.declare(self._on_state, self.health, self._rearm, limit)
 
@@ -179,14 +179,12 @@ class ControlLoop:
         try:
             while self._answer_next():
                 pass
-        except BaseException as error:  # whatever it is, the watchdog must know
+        except BaseException:  # whatever it is, the watchdog must know
             with self._lock:
                 self._busy_since_s = None
                 self._controller.policy_died()
                 self._timer.notify()
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            where = f"{place.filename}:{place.lineno}"
-            log.event("error", "policy_thread_dead", detail=repr(error), where=where)
+            log.event("error", "policy_thread_dead", detail=traceback.format_exc())
 
     def _answer_next(self) -> bool:
         """Wait for a state and answer it; False once the loop is stopped."""
@@ -211,17 +209,14 @@ class ControlLoop:
             order = self._controller.finish(output, inference_ns, time.monotonic())
             self._send(order)
             if order is not None:
-                took_s = time.monotonic() - received.arrived_s
-                self._commands_ns.append(int(took_s * 1e9))
+                self._commands_ns.append(int((time.monotonic() - received.arrived_s) * 1e9))
         return True
 
     def _is_hung(self, now_s: float) -> bool:
         """Return whether policy or driver keep or lost their thread: a new process may help."""
-        if not self._worker.is_alive():
-            return True
-        if self._vehicle is not None and self._vehicle.busy_s(now_s) > _HUNG_S:
-            return True
-        return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
+        driver_s = self._vehicle.busy_s(now_s) if self._vehicle is not None else 0.0
+        policy_s = now_s - self._busy_since_s if self._busy_since_s is not None else 0.0
+        return not self._worker.is_alive() or max(driver_s, policy_s) > _HUNG_S
 
     def _look_at_vehicle(self, now_s: float) -> None:
         fault = self._vehicle.fault(now_s) if self._vehicle is not None else ""
@@ -229,8 +224,7 @@ class ControlLoop:
             log.event("warning" if fault else "info", "vehicle", fault=fault)
             self._controller.vehicle_fault = fault
 
-    def _vehicle_failed(self) -> None:
-        """The vehicle's thread has seen a fault: the watchdog need not wait for its deadline."""
+    def _wake_watchdog(self) -> None:
         with self._lock:
             self._timer.notify()
 

@@ -162,9 +162,7 @@ def check_task(task: Task) -> None:
         if not (row.low < row.high and math.isfinite(row.low) and math.isfinite(row.high)):
             raise UserError(f"the {its_range} must be finite, and not empty")
         if row.stop is not None and not row.low <= row.stop <= row.high:
-            raise UserError(
-                f"the safe stop {row.stop} lies outside the {its_range} of the manifest"
-            )
+            raise UserError(f"the safe stop {row.stop} lies outside the {its_range}")
         if row.slew_per_s is not None and not 0.0 < row.slew_per_s < math.inf:
             raise UserError(f"the slew_per_s of {row.name} is {row.slew_per_s}; it must be above 0")
 
@@ -183,15 +181,11 @@ class Layout:
 
     def __init__(self, task: Task) -> None:
         self.task_text = task.text
-        self.parts = [
-            _Part(
-                name,
-                np.dtype(entry.dtype),
-                tuple(entry.shape),
-                math.prod(entry.shape) * np.dtype(entry.dtype).itemsize,
-            )
-            for name, entry in task.observation.items()
-        ]
+        self.parts = []
+        for name, entry in task.observation.items():
+            dtype = np.dtype(entry.dtype)
+            size = math.prod(entry.shape) * dtype.itemsize
+            self.parts.append(_Part(name, dtype, tuple(entry.shape), size))
         self.size = sum(part.size for part in self.parts)
         # A few names fit into half of what there is besides; many count.
         names = sum(len(name.encode()) + _HEADS_BYTES for name in task.observation)
@@ -219,10 +213,10 @@ class Layout:
             found = f"{len(observation)} arrays, not {names}"
             return Rejection(Reason.OBSERVATION, f"the observation holds {found}")
         for name, dtype, _, size in self.parts:
-            data = observation.get(name)
-            if data is None or len(data) != size:
-                found = "is missing" if data is None else f"holds {len(data)} bytes, not {size}"
-                return Rejection(Reason.OBSERVATION, f"{name} {found}")
+            data = observation.get(name, b"")
+            if len(data) != size:
+                found = f"{name} holds {len(data)} bytes, not {size}"
+                return Rejection(Reason.OBSERVATION, found)
             if dtype.kind == "f" and not np.isfinite(np.frombuffer(data, dtype)).all():
                 return Rejection(Reason.NOT_FINITE, f"{name} holds a number that is not finite")
             if dtype.kind == "b" and max(data) > 1:

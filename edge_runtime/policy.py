@@ -113,16 +113,11 @@ def policy_id_of(data: bytes) -> str:
 
 def _check_tensor(what: str, found: list, name: str, kind: str, shape: Sequence[int]) -> None:
     """Raise UserError unless one tensor is found, of this kind behind a batch that is 1 or open."""
-    fits = (
-        len(found) == 1
-        and (found[0].name, found[0].type) == (name, kind)
-        and list(found[0].shape[1:]) == list(shape)
-        and (found[0].shape[0] == 1 or not isinstance(found[0].shape[0], int))
-    )
-    if not fits:
-        shown = ", ".join(f"{each.name} {each.type} {each.shape}" for each in found)
-        dims = ", ".join(["batch", *map(str, shape)])
-        raise UserError(f"its {what} must be {name} {kind} [{dims}], it is {shown or 'none'}")
+    shown = [(each.name, each.type, *each.shape[1:]) for each in found]
+    batch = found[0].shape[0] if found and found[0].shape else 0
+    if shown != [(name, kind, *shape)] or (batch != 1 and isinstance(batch, int)):
+        has = ", ".join(f"{each.name} {each.type} {each.shape}" for each in found) or "none"
+        raise UserError(f"its {what} must be {name} {kind} {['batch', *shape]}, it is {has}")
 
 
 def open_network(data: bytes) -> onnxruntime.InferenceSession:
@@ -231,8 +226,7 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
     try:
         key.verify(signature, policy_bytes)
     except InvalidSignature:
-        changed = "the file was changed, or another key signed it"
-        raise UserError(f"the signature does not fit file and public key: {changed}") from None
+        raise UserError("the file was changed, or another key signed it") from None
 
 
 def check_trust(
@@ -249,8 +243,7 @@ def check_trust(
     if not signature_path.exists():
         if allow_unsigned:
             return UNSIGNED, None
-        help_ = f"{signature_path.name} is missing; sign it, or allow it with --allow-unsigned"
-        raise UserError(f"policy {path} is not signed: {help_}")
+        raise UserError(f"policy {path} is not signed; --allow-unsigned lets it drive all the same")
     signature = read_bytes(signature_path, "signature")
     trust, beside = VERIFIED, Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
     if public_key is None and allow_unsigned and beside.exists():
@@ -260,16 +253,13 @@ def check_trust(
     if public_key is None:
         if allow_unsigned:
             return UNVERIFIED, None
-        help_ = f"name it with --public-key, or put it at {DEFAULT_PUBLIC_KEY}"
-        raise UserError(f"no public key to verify {signature_path.name} with: {help_}")
+        raise UserError(f"no public key to verify {signature_path.name} with: use --public-key")
     key_pem = read_bytes(public_key, "public key")
     try:
         verify(policy_bytes, signature, key_pem)
     except UserError as error:
-        raise UserError(
-            f"signature {signature_path}, public key {public_key}: {error};"
-            " name the key of its signer with --public-key"
-        ) from None
+        where = f"signature {signature_path}, public key {public_key}"
+        raise UserError(f"{where}: {error}; name its signer's with --public-key") from None
     return trust, str(Path(public_key).absolute())
 
 

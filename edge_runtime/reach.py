@@ -27,17 +27,16 @@ _MOST_KEPT = 100
 def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
     """Return whether anybody answers at `endpoint`, and why there is no link; "" if one is likely.
 
-    Of udp and quic it knows nothing. Takes up to 1.3 s for each address of the host, and as long
-    as the name server does.
+    Of udp it knows nothing. Takes up to 1.3 s for each address of the host, and as long as the
+    name server does.
     """
     protocol, host, port = _parts(endpoint)
-    if _kind(protocol) != socket.SOCK_STREAM:
+    if protocol == "udp":
         return False, ""
     try:
         plain = socket.create_connection((host, port), timeout=_LOOK_S)
     except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
-        words = str(getattr(error, "strerror", None) or error).lower()
-        return False, f"port {port} of {host}: {words}"
+        return False, f"port {port} of {host}: {error}".lower()
     with contextlib.closing(plain):
         why = _why_not(plain, host, files)
     return True, why and f"{endpoint} {why}"
@@ -67,11 +66,10 @@ def _why_not(plain: socket.socket, host: str, files: Optional[TlsFiles]) -> str:
     else:
         reason, is_tls = "", True
     if files is None:
-        tls, other = "listens with TLS and wants --tls, with tls/ for tcp/", "answers, but not as"
-        return tls if is_tls else f"{other} a simulator or a router does"
+        other = "answers, but not as a simulator or a router does"
+        return "listens with TLS and wants --tls, with tls/ for tcp/" if is_tls else other
     if is_tls and reason:
-        needs = "both need one authority, and certificates that have not expired"
-        return f"refuses the certificate of {files.name} ({reason}): {needs}"
+        return f"refuses the certificate of {files.name} ({reason})"
     return reason and f"gives no TLS link to {files.name}: {reason}"
 
 
@@ -89,7 +87,7 @@ class Listener:
     """The far end of a TLS link, and until when its certificate and our own hold.
 
     Zenoh closes a link when the far end's expires, and opens it again within 0.2 s: TLS believes
-    the certificate to the end of the second, and the new link stays. One over QUIC does not.
+    the certificate to the end of the second, and the new link stays.
     """
 
     def __init__(self, endpoint: str, files: TlsFiles) -> None:
@@ -107,10 +105,7 @@ class Listener:
 
     def look(self) -> None:
         """Read the certificate that the listener shows now; one that shows none keeps its last."""
-        protocol, host, port = _parts(self._endpoint)
-        if protocol != "tls":
-            self._until_s = math.inf
-            return
+        _, host, port = _parts(self._endpoint)
         try:
             plain = socket.create_connection((host, port), timeout=_LOOK_S)
             with plain, _context(self._files).wrap_socket(plain, server_hostname=host) as link:
@@ -127,12 +122,12 @@ class Listener:
 def check_port_is_free(endpoint: str) -> None:
     """Raise UserError where nothing can listen at an endpoint."""
     protocol, host, port = _parts(endpoint)
+    kind = socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM
     try:
-        found = socket.getaddrinfo(host, port, type=_kind(protocol))
-        family, kind, _, _, target = found[0]
+        family, _, _, _, target = socket.getaddrinfo(host, port, type=kind)[0]
         with socket.socket(family, kind) as probe:
             # As the listener does: the last run's closed links are no bar.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == _kind("tcp")))
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(protocol != "udp"))
             probe.bind(target)
     except (OSError, UnicodeError) as error:
         is_busy = getattr(error, "errno", None) == errno.EADDRINUSE
@@ -143,23 +138,15 @@ def check_port_is_free(endpoint: str) -> None:
 def free_endpoint(protocol: str = "tcp") -> str:
     """Return a Zenoh endpoint on loopback that nobody listens on, for demos and tests.
 
-    A TCP port stays reserved until this process ends or has asked for a hundred more.
+    The port stays reserved until this process ends or has asked for a hundred more.
     """
-    probe = socket.socket(type=_kind(protocol))
+    probe = socket.socket()
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
     probe.bind(("127.0.0.1", 0))
-    port = probe.getsockname()[1]
-    if probe.type == socket.SOCK_STREAM:
-        _KEPT.append(probe)  # Not for ever: a long campaign would run out of open files.
-        if len(_KEPT) > _MOST_KEPT:
-            _KEPT.pop(0).close()
-    else:
-        probe.close()
-    return f"{protocol}/127.0.0.1:{port}"
-
-
-def _kind(protocol: str) -> int:
-    return socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
+    _KEPT.append(probe)
+    if len(_KEPT) > _MOST_KEPT:  # A long campaign would run out of open files.
+        _KEPT.pop(0).close()
+    return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _parts(endpoint: str) -> Tuple[str, str, int]:

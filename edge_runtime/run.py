@@ -13,14 +13,12 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 
-import zenoh
-
 from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
-from edge_runtime.link import Link, OpenClient, require_free, taken, wait_for_router
+from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.link_quality import link_words
-from edge_runtime.loop import ControlLoop, LoopParts
+from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, look
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
@@ -81,7 +79,7 @@ def drive(
             loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
             log.configure(loaded.log_level, loaded.log_format)
             stop = _StopSignal(until, undo)
-            runtime = _build(loaded, driver, unbuilt)
+            runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
             ended = runtime.run(stop)
     finally:
@@ -129,44 +127,144 @@ def _close_unless_built(vehicle: Vehicle, unbuilt: contextlib.ExitStack) -> None
     unbuilt.callback(close_in_time, vehicle)
 
 
-def _build(config: Config, vehicle: Optional[Vehicle], unbuilt: contextlib.ExitStack) -> _Runtime:
-    """Open and connect all parts. Raises UserError where one of them cannot be had."""
-    tls: Optional[TlsFiles] = None
-    access: Optional[Dict[str, Any]] = None
-    if config.tls is not None:
-        tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
-        check_name(tls.name, common_name(EDGE, config.vehicle_id))
-        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
-    if config.vehicle != NONE:
-        from edge_runtime.vehicles import find_vehicle, make_vehicle
+class _Runtime:
+    """Opens and connects all parts; `run` closes them. Raises UserError where one cannot be had."""
 
-        find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
-    service.claim_resources(config.realtime_priority, config.cpus, config.lock_memory)
-    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-    if config.vehicle != NONE:
-        vehicle = make_vehicle(config.vehicle, config.vehicle_settings, policy.manifest)
-        _close_unless_built(vehicle, unbuilt)
-    controller = _controller(config, policy, vehicle)
-    hold = None if config.hold is None else service.Hold(config.hold)
-    # Both sessions hear only what this vehicle's edge may hear.
-    connected = partial(open_session, connect=config.connect, tls=tls, access=access)
-    open_client = partial(connected, mode="client")
-    has_router = require_free(open_client, config.vehicle_id)
-    session = connected(mode="peer")
-    unbuilt.callback(session.close)  # An open one would hang the process at its exit.
-    if has_router:
-        wait_for_router(session)
-    listener = None if tls is None else Listener(config.connect, tls)
-    link = Link(session, config.vehicle_id, policy.manifest, listener)
-    runner: Optional[VehicleRunner] = None
-    if vehicle is not None:
-        from edge_runtime.vehicles.base import VehicleRunner
+    def __init__(
+        self, config: Config, vehicle: Optional[Vehicle], unbuilt: contextlib.ExitStack
+    ) -> None:
+        self._config = config
+        self._tls: Optional[TlsFiles] = None
+        access: Optional[Dict[str, Any]] = None
+        if config.tls is not None:
+            self._tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
+            name, expires = self._tls.name, self._tls.expires
+            check_name(name, common_name(EDGE, config.vehicle_id))
+            log.event("info", "certificate", of=name, expires=f"{expires:%Y-%m-%dT%H:%MZ}")
+        if config.vehicle != NONE:
+            from edge_runtime.vehicles import find_vehicle, make_vehicle
 
-        names = [row.name for row in policy.manifest.action]
-        runner = VehicleRunner(vehicle, names, partial(link.send, "feedback"))
-    rearm = rearm_command(config.connect, config.vehicle_id)
-    parts = LoopParts(policy, controller, link, service.Notifier(), runner, hold, rearm)
-    return _Runtime(config, tls, session, open_client, parts)
+            find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
+        service.claim_resources(config.realtime_priority, config.cpus, config.lock_memory)
+        self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+        manifest = self._policy.manifest
+        if config.vehicle != NONE:
+            vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
+            _close_unless_built(vehicle, unbuilt)
+        controller = _controller(config, self._policy, vehicle)
+        hold = None if config.hold is None else service.Hold(config.hold)
+        # Both sessions hear only what this vehicle's edge may hear.
+        connected = partial(open_session, connect=config.connect, tls=self._tls, access=access)
+        self._open_client = partial(connected, mode="client")
+        has_router = require_free(self._open_client, config.vehicle_id)
+        self._session = connected(mode="peer")
+        unbuilt.callback(self._session.close)  # An open one would hang the process at its exit.
+        if has_router:
+            wait_for_router(self._session)
+        listener = None if self._tls is None else Listener(config.connect, self._tls)
+        self._link = Link(self._session, config.vehicle_id, manifest, listener)
+        self._vehicle: Optional[VehicleRunner] = None
+        if vehicle is not None:
+            from edge_runtime.vehicles.base import VehicleRunner
+
+            names = [row.name for row in manifest.action]
+            self._vehicle = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
+        self._notifier = service.Notifier()
+        self._loop = ControlLoop(
+            self._policy,
+            controller,
+            self._link,
+            self._notifier,
+            vehicle=self._vehicle,
+            hold=hold,
+            rearm_command=rearm_command(config.connect, config.vehicle_id),
+        )
+        self._over = threading.Event()
+        self._failures: List[BaseException] = []
+
+    def run(self, stop: _StopSignal) -> bool:
+        """Drive until it is told to stop; returns False where a thread hangs.
+
+        Raises UserError where a vehicle cannot be enabled, and where it gave way.
+        """
+        stop.on_stop = self._loop.stop
+        # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
+        announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
+        # What is loaded stays: the collector need not look at it again in the middle of a drive.
+        gc.collect()
+        gc.freeze()
+        try:
+            if self._vehicle is not None:
+                self._vehicle.start(self._config.is_armed_at_start)
+            self._loop.start()
+            announcer.start()
+            if not stop.came:
+                self._loop.run()
+        finally:
+            ended = self._close(announcer)
+        if self._failures:
+            raise self._failures[0]
+        if self._link.gave_way:
+            raise taken(self._config.vehicle_id)
+        if self._tls is not None:
+            self._tls.require_valid(time.time())
+        return ended
+
+    def _announce(self) -> None:
+        """Show that it is there, print "ready", and log what keeps states away."""
+        config, policy = self._config, self._policy
+        try:
+            self._link.appear(self._open_client, self._loop.stop)
+            if policy.trust != VERIFIED:
+                log.event("warning", "policy_not_verified", trust=policy.trust)
+            health = self._loop.health()
+            print(
+                f"ready vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
+                f" connect={config.connect} policy_id={policy.policy_id}"
+                f" verified_by={printable(policy.public_key or 'none')}",
+                flush=True,
+            )
+            self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
+            # A runtime that is linked already has some time for its first state.
+            wait_s = _WAITING_PERIOD_S if self._session.info.routers_zid() else 0.0
+            while not self._over.wait(wait_s) and not self._loop.has_heard():
+                log.event("warning", "waiting", why=self._why_no_state())
+                wait_s = _WAITING_PERIOD_S
+        except BaseException as error:  # the main thread raises it
+            self._failures.append(error)
+            self._loop.stop()
+
+    def _why_no_state(self) -> str:
+        connect, info = self._config.connect, self._session.info
+        if not info.routers_zid() and not info.peers_zid():
+            return f"{connect}: {look(connect, self._tls)[1] or 'no link yet'}"
+        return f"{connect} is there, and has sent no state for vehicle id {self._config.vehicle_id}"
+
+    def _close(self, announcer: threading.Thread) -> bool:
+        """End the threads, brake and close the vehicle; returns False where one of them hangs."""
+        self._over.set()
+        gc.unfreeze()  # In Python another drive may follow.
+        self._notifier.tell("STOPPING=1")
+        ended = self._loop.close()
+        if self._vehicle is not None:
+            ended = self._vehicle.close() and ended
+        if announcer.ident is not None:
+            announcer.join(_ANNOUNCE_S)
+            ended = ended and not announcer.is_alive()
+        # A peer that was stopped holds it.
+        ended = ends_within(_CLOSE_S, self._link.close) and ended
+        health = self._loop.health()
+        log.event(
+            "info",
+            "ended",
+            accepted=health.accepted,
+            rejected=sum(health.rejected.values()),
+            deadline_misses=health.deadline_misses,
+            safe_stops=health.safe_stops,
+            uptime_s=round(health.uptime_s, 1),
+            link=link_words(health.link),
+        )
+        return ended
 
 
 def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> Controller:
@@ -186,127 +284,7 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
     )
 
 
-class _Runtime:
-    """Owns all parts, open and connected; `run` closes them."""
-
-    def __init__(
-        self,
-        config: Config,
-        tls: Optional[TlsFiles],
-        session: zenoh.Session,
-        open_client: OpenClient,
-        parts: LoopParts,
-    ) -> None:
-        self._config, self._tls, self._parts = config, tls, parts
-        self._session, self._open_client = session, open_client
-        self._loop = ControlLoop(parts)
-        self._over = threading.Event()
-        self._failures: List[BaseException] = []
-
-    def run(self, stop: _StopSignal) -> bool:
-        """Drive until it is told to stop; returns False where a thread hangs.
-
-        Raises UserError where a vehicle cannot be enabled, and where it gave way.
-        """
-        stop.on_stop = self._loop.stop
-        # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
-        announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
-        # What is loaded stays: the collector need not look at it again in the middle of a drive.
-        gc.collect()
-        gc.freeze()
-        try:
-            if self._parts.vehicle is not None:
-                self._parts.vehicle.start(self._config.is_armed_at_start)
-            self._loop.start()
-            announcer.start()
-            if not stop.came:
-                self._loop.run()
-        finally:
-            ended = self._close(announcer)
-        if self._failures:
-            raise self._failures[0]
-        if self._parts.link.gave_way:
-            raise taken(self._config.vehicle_id)
-        if self._tls is not None:
-            self._tls.require_valid(time.time())
-        return ended
-
-    def _announce(self) -> None:
-        """Show that it is there, print "ready", and log what keeps states away."""
-        config, policy, vehicle = self._config, self._parts.policy, self._parts.vehicle
-        try:
-            self._parts.link.appear(self._open_client, self._loop.stop)
-            if policy.trust != VERIFIED:
-                log.event("warning", "policy_not_verified", trust=policy.trust)
-            print(
-                f"ready vehicle_id={config.vehicle_id} vehicle={vehicle.name if vehicle else NONE}"
-                f" connect={config.connect} policy_id={policy.policy_id}"
-                f" verified_by={printable(policy.public_key or 'none')}",
-                flush=True,
-            )
-            self._parts.notifier.tell(f"READY=1\nSTATUS={self._loop.health().mode}")
-            # A runtime that is linked already has some time for its first state.
-            grace_s = _WAITING_PERIOD_S if self._session.info.routers_zid() else 0.0
-            why = partial(why_no_state, self._session, config.connect, config.vehicle_id, self._tls)
-            say_what_is_missing(self._loop.has_heard, why, self._over, time.monotonic() + grace_s)
-        except BaseException as error:  # the main thread raises it
-            self._failures.append(error)
-            self._loop.stop()
-
-    def _close(self, announcer: threading.Thread) -> bool:
-        """End the threads, brake and close the vehicle; returns False where one of them hangs."""
-        self._over.set()
-        gc.unfreeze()  # In Python another drive may follow.
-        self._parts.notifier.tell("STOPPING=1")
-        ended = self._loop.close()
-        if self._parts.vehicle is not None:
-            ended = self._parts.vehicle.close() and ended
-        if announcer.ident is not None:
-            announcer.join(_ANNOUNCE_S)
-            ended = ended and not announcer.is_alive()
-        # A peer that was stopped holds it.
-        ended = ends_within(_CLOSE_S, self._parts.link.close) and ended
-        health = self._loop.health()
-        log.event(
-            "info",
-            "ended",
-            accepted=health.accepted,
-            rejected=sum(health.rejected.values()),
-            deadline_misses=health.deadline_misses,
-            safe_stops=health.safe_stops,
-            uptime_s=round(health.uptime_s, 1),
-            link=link_words(health.link),
-        )
-        return ended
-
-
 def rearm_command(connect: str, vehicle_id: str) -> str:
     """Return what an operator types to let a vehicle drive again."""
     tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
-
-
-def say_what_is_missing(
-    has_heard: Callable[[], bool], why: Callable[[], str], over: threading.Event, next_s: float
-) -> None:
-    """Log what is waited for, from `next_s` on and every 5 s, until a state comes or it is over."""
-    while not over.wait(max(0.0, next_s - time.monotonic())) and not has_heard():
-        next_s = time.monotonic() + _WAITING_PERIOD_S
-        words = why()  # a name server takes time
-        if not has_heard():
-            log.event("warning", "waiting", why=words)
-
-
-def why_no_state(
-    session: zenoh.Session, connect: str, vehicle_id: str, tls: Optional[TlsFiles]
-) -> str:
-    """Say on one line what keeps states away."""
-
-    def is_linked() -> bool:
-        return bool(session.info.routers_zid() or session.info.peers_zid())
-
-    if not is_linked():
-        _, refusal = look(connect, tls)
-        if not is_linked():  # it may have come meanwhile
-            return f"{connect}: {refusal or 'no link yet'}"
-    return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

@@ -14,17 +14,14 @@ import socket
 import threading
 from pathlib import Path
 from typing import (
-    Any,
     BinaryIO,
     Callable,
     Collection,
     Dict,
-    List,
     Mapping,
     NamedTuple,
     Optional,
     Sequence,
-    Tuple,
 )
 
 import numpy as np
@@ -81,7 +78,7 @@ class Board(NamedTuple):
     rss_mb: float = 0.0
 
 
-def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -> Board:
+def look(thermal: str = "/sys/class/thermal") -> Board:
     """Read the sensors. Some take milliseconds to answer: never in the control thread."""
     temperatures_c, rss_mb = [], 0.0
     for sensor in Path(thermal).glob("thermal_zone*/temp"):
@@ -89,7 +86,8 @@ def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -
         with contextlib.suppress(OSError, ValueError):
             temperatures_c.append(int(sensor.read_text()) / 1000.0)
     with contextlib.suppress(OSError, ValueError, IndexError):
-        rss_mb = int(Path(statm).read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        rss_mb = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
     return Board(max(temperatures_c, default=None), os.getloadavg()[0], rss_mb)
 
 
@@ -123,34 +121,26 @@ def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}
 
 
-def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
+def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> None:
     """Apply the settings of priority, processors and memory (0, empty and False: no change).
 
     Call it before a thread that drives is started: the threads of Zenoh, of the policy and of the
-    vehicle inherit from the main thread. Each refusal of the system is logged; returns their keys.
+    vehicle inherit from the main thread. Each refusal of the system is logged.
     """
-    usable = ",".join(map(str, sorted(os.sched_getaffinity(0))))
-    rows: Sequence[Tuple[str, Any, Callable[[Any], None], str]] = (
-        ("realtime_priority", priority, _set_priority,
-         "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"),
-        ("cpus", cpus, _set_cpus, f"this process may use {usable}"),
-        ("lock_memory", lock_memory, _lock_memory,
-         "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"),
-    )  # fmt: skip
-    refused = []
-    for key, value, apply, words in rows:
-        try:
-            if value:
-                apply(value)
-        except (OSError, ValueError, AttributeError) as error:
-            log.event("warning", "not_permitted", key=key, value=value, detail=error, help=words)
-            refused.append(key)
-    return refused
+    if priority:  # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to others.
+        rank = os.sched_param(priority)
+        _claim("realtime_priority", priority, lambda: os.sched_setscheduler(0, os.SCHED_FIFO, rank))
+    if cpus:
+        _claim("cpus", cpus, lambda: _set_cpus(cpus))
+    if lock_memory:
+        _claim("lock_memory", lock_memory, _lock_memory)
 
 
-def _set_priority(priority: int) -> None:
-    # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to all others.
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+def _claim(key: str, value: object, apply: Callable[[], None]) -> None:
+    try:
+        apply()
+    except (OSError, ValueError, AttributeError) as error:
+        log.event("warning", "not_permitted", key=key, value=value, detail=error)
 
 
 def _set_cpus(cpus: Sequence[int]) -> None:
@@ -160,7 +150,7 @@ def _set_cpus(cpus: Sequence[int]) -> None:
     os.sched_setaffinity(0, cpus)
 
 
-def _lock_memory(_: object) -> None:
+def _lock_memory() -> None:
     """Keep every page that is ever touched; pages that nobody touches take no room."""
     soft, _hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
@@ -168,8 +158,7 @@ def _lock_memory(_: object) -> None:
         raise PermissionError(f"at most {soft // 1024} KiB may be locked")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
+        raise OSError(os.strerror(ctypes.get_errno()))
 
 
 class Hold:
@@ -186,8 +175,8 @@ class Hold:
             self._stream = open_regular(path)  # kept until it is free
         except FileNotFoundError:
             return
-        except OSError as error:
-            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+        except (OSError, ValueError) as error:
+            raise UserError(f"hold {path} cannot be read: {error}") from None
 
     def is_on(self) -> bool:
         """Return whether commands must stay here. Never waits."""

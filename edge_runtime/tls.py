@@ -84,12 +84,11 @@ def load_tls(directory: PathLike) -> TlsFiles:
         raise UserError(f"{path} was not issued by the authority in {CA_FILE} beside it") from None
     now = datetime.datetime.now(datetime.timezone.utc)
     for each, dated in certificates.items():
-        if now >= dated.not_valid_after_utc:
-            ended = f"{dated.not_valid_after_utc:%Y-%m-%d %H:%M}"
-            raise UserError(f"{each} expired at {ended} UTC; make a new one")
-        if now < dated.not_valid_before_utc:
-            begins = f"{dated.not_valid_before_utc:%Y-%m-%d %H:%M}"
-            raise UserError(f"{each} is valid from {begins} UTC on; is the clock set?")
+        begins, ends = dated.not_valid_before_utc, dated.not_valid_after_utc
+        if now >= ends:
+            raise UserError(f"{each} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
+        if now < begins:
+            raise UserError(f"{each} is valid from {begins:%Y-%m-%d %H:%M} UTC on; set the clock")
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
     paths = (str(ca_path), str(path), str(key_path))
@@ -112,8 +111,6 @@ def read_signing_key(path: PathLike) -> Ed25519PrivateKey:
     """Read the Ed25519 key that signs policies and bundles; UserError for anything else."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-    if not os.path.exists(path):
-        raise UserError(f"private key {path} does not exist; `python -m deploy keys` makes one")
     key = read_private_key(path)
     if not isinstance(key, Ed25519PrivateKey):
         raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
@@ -184,9 +181,8 @@ def check_name(name: str, *able: str) -> None:
     Zenoh would not say so: the messages would go nowhere.
     """
     if name not in able:
-        raise UserError(
-            f"--tls names the certificate of {name}; name the directory of {' or '.join(able)}"
-        )
+        right = f"name the directory of {' or '.join(able)}"
+        raise UserError(f"--tls names the certificate of {name}; {right}")
 
 
 def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:

@@ -18,27 +18,25 @@ from edge_runtime.tls import TlsFiles, load_tls
 from edge_runtime.util import PathLike, UserError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-TLS_PROTOCOLS = ("tls", "quic")
 
 # At Zenoh's default lease a peer that was stopped, or whose cable was cut, lives on for 10 s.
 LEASE_MS = 1000
 # Back within 1 s of a link's return leaves 0.5 s for this: five fresh states take the rest.
 RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1.5}
 
-_ENDPOINT = re.compile(r"(tcp|udp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
+_ENDPOINT = re.compile(r"(tcp|udp|tls)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
 
 
 def check_endpoint(endpoint: str) -> str:
     """Return the endpoint; UserError if it is not PROTOCOL/HOST:PORT."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 1 <= int(match.group(3)) <= 65535:
-        right = f"write it as {DEFAULT_ENDPOINT} (tcp or udp; tls or quic with --tls)"
-        raise UserError(f"endpoint {endpoint!r} is not valid: {right}")
+        raise UserError(f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT}")
     return endpoint
 
 
 def is_tls(endpoint: str) -> bool:
-    return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
+    return endpoint.startswith("tls/")
 
 
 def check_fits(endpoint: str, with_tls: bool) -> None:
@@ -47,8 +45,7 @@ def check_fits(endpoint: str, with_tls: bool) -> None:
         right = f"write tls/{endpoint.split('/', 1)[1]}"
         raise UserError(f"endpoint {endpoint} would send plain text despite --tls: {right}")
     if not with_tls and is_tls(endpoint):
-        where = "name a directory of `python -m deploy certs` with --tls"
-        raise UserError(f"endpoint {endpoint} needs certificates: {where}")
+        raise UserError(f"endpoint {endpoint} needs certificates: name their directory with --tls")
 
 
 def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
@@ -99,11 +96,7 @@ def open_session(
 
 
 def session_rows(
-    listens: List[str],
-    connect: Optional[str],
-    mode: str,
-    tls: Optional[TlsFiles],
-    access: Optional[Dict[str, Any]],
+    listens: List[str], connect: Optional[str], mode: str, tls: Optional[TlsFiles], access: Any
 ) -> Dict[str, Any]:
     """Return Zenoh's settings by their paths, as in `scouting/gossip/enabled`."""
     rows: Dict[str, Any] = {
@@ -126,7 +119,7 @@ def session_rows(
     if tls is not None:
         rows["transport/link/tls"] = tls.zenoh_rows()
         # A port that speaks TLS only, whatever an endpoint's metadata may ask for.
-        rows["transport/link/protocols"] = list(TLS_PROTOCOLS)
+        rows["transport/link/protocols"] = ["tls"]
     if access is not None:
         rows["access_control"] = access
     return rows

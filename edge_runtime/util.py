@@ -61,19 +61,15 @@ def printable(text: str) -> str:
 
 
 def open_regular(path: PathLike) -> BinaryIO:
-    """Open an existing regular file to read; OSError for anything else.
+    """Open an existing regular file to read; OSError for anything else, ValueError for a NUL.
 
     Opening a pipe would wait for its writer, and a device may have no end.
     """
-    if "\0" in os.fspath(path):
-        raise OSError(errno.EINVAL, "its name holds a NUL", str(path))
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     raise OSError(errno.EINVAL, "it is no regular file", str(path))
 
 
@@ -88,10 +84,9 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
             data = stream.read(limit + 1)
     except FileNotFoundError:
         raise UserError(f"{what} {path} does not exist") from None
-    except IsADirectoryError:
-        raise UserError(f"{what} {path} is a directory, not a file") from None
-    except OSError as error:
-        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", error)
+        raise UserError(f"{what} {path} cannot be read: {why}") from None
     if len(data) > limit:
         raise UserError(f"{what} {path} is larger than {most_mib} MiB")
     return data
@@ -117,12 +112,10 @@ def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
     """Read the tables of a TOML file. Raises UserError where it is none, or nested too deep."""
     import msgspec  # here: `hil_tests doctor` runs before anything is installed
 
-    data = read_bytes(path, what)
     try:
-        tables: Dict[str, Any] = msgspec.toml.decode(data)
+        return dict(msgspec.toml.decode(read_bytes(path, what)))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise UserError(f"{what} {path} is no TOML: {error}") from None
-    return tables
 
 
 def ends_within(limit_s: float, call: Callable[[], Any]) -> bool:

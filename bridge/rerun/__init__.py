@@ -18,12 +18,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from edge_runtime.cli import command, sigterm_as_interrupt, whole_number
-from edge_runtime.files import behind_link, check_writable, make_directory
+from edge_runtime.files import check_writable, make_directory
 from edge_runtime.reach import check_port_is_free, free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import DEFAULT_VEHICLE_ID
@@ -170,7 +171,7 @@ def flush(recording: rr.RecordingStream) -> None:
 @contextlib.contextmanager
 def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -> Iterator[None]:
     """Record into a file that appears under its name when it is complete."""
-    target = behind_link(path)
+    target = Path(path)
     make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:

@@ -13,11 +13,9 @@ import pytest
 from hil_tests.testing.commands import exit_status, run_command
 from hil_tests.testing.messages import HEALTH
 from hil_tests.testing.policies import write_policy
-from hypothesis import given
-from hypothesis import strategies as st
 
 import edge_runtime
-from edge_runtime import cli, commands
+from edge_runtime import cli
 from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
@@ -75,21 +73,16 @@ def test_policies_that_may_not_drive(refuses, command):
         refuses([*command, bad, "--allow-unsigned"], bad)
 
 
-def test_a_policy_that_is_slow_here_may_not_drive(refuses, make_policy, monkeypatch):
-    monkeypatch.setattr(commands, "quantiles_ms", lambda _: {"p50": 1.0, "p99": 143.0, "max": 150})
-    refuses(["check", *make_policy().flags[1:]], "143 ms")
-
-
 @pytest.mark.parametrize(
     ("line", "word"),
     [
         ("fly", "fly"),
+        ("run --policy=", "empty"),
         ("check", "POLICY.onnx"),
         ("check p.onnx --out /dev/null/place.json", "/dev/null"),
         ("run", "--policy"),
         ("run --policy p.onnx --vehicle tank", "tank"),
         ("run --policy p.onnx --bus socketcan:can0", "--vehicle hunter"),
-        ("run --policy p.onnx --bus=", "--bus"),
         ("run --policy p.onnx --connect localhost", "tcp/127.0.0.1:7447"),
         ("run --policy p.onnx --vehicle-id a/b", "a/b"),
         ("run --policy p.onnx --config absent.toml", "absent.toml"),
@@ -107,20 +100,16 @@ def test_wrong_arguments(line, word, refuses):
 
 WRONG = {
     "speed = 3": "speed",
-    "policy = 3": "policy",
     "policy = ": "TOML",
     "log_level = 'loud'": "log_level",
-    "log_format = 'xml'": "log_format",
     "realtime_priority = 100": "realtime_priority",
     "realtime_priority = -1": "realtime_priority",
-    "realtime_priority = 1.5": "realtime_priority",
     "cpus = [1, -1]": "cpus",
-    "cpus = [1, 1]": "cpus",
     "cpus = 'all'": "cpus",
     "connect = 'localhost'": "localhost",
+    "connect = 'tcp/host:70000'": "70000",
     "vehicle_id = 'a/b'": "a/b",
     "bus = 'can0'": "bus",
-    "vehicle = 3": "vehicle",
     "[vehicle]\nname = 'mock'": "name",
     "[vehicle]\ndriver = 3": "vehicle",
     "vehicle_settings.hunter.scale = 0.05": "vehicle_settings",
@@ -131,13 +120,6 @@ WRONG = {
 def test_a_wrong_config_file_is_named_with_the_key(settings, text):
     with pytest.raises(UserError, match=rf"edge\.toml.*{WRONG[text]}"):
         load_config(settings(text), {"policy": "p.onnx"})
-
-
-@pytest.mark.parametrize("flags", [{"log_level": "loud", "policy": "p.onnx"}, {}])
-@pytest.mark.parametrize("text", ["log_level = 'debug'", "tls = 'certs/edge-hunter01'"])
-def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags, text):
-    with pytest.raises(UserError, match=r"^((?!edge\.toml).)*$"):
-        load_config(settings(text), {"connect": "tls/10.0.0.2:7447", **flags})
 
 
 def test_flags_win_over_the_file(settings):
@@ -172,15 +154,6 @@ def test_the_example_config_holds_every_key_at_its_default():
     assert missing == ["ride_through", "vehicle_settings"]
 
 
-@pytest.mark.parametrize(
-    "endpoint",
-    ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "ws/h:1", "unixsock-stream/h:1"],
-)
-def test_malformed_endpoints(endpoint):
-    with pytest.raises(UserError):
-        open_session(connect=endpoint)
-
-
 @pytest.mark.parametrize("topic", ["status", "rearm"])
 def test_a_stranger_that_answers_for_the_runtime_or_nobody_is_one_line(topic, refuses):
     endpoint, key = free_endpoint(), f"phil/hunter01/{topic}"
@@ -193,34 +166,6 @@ def test_a_stranger_that_answers_for_the_runtime_or_nobody_is_one_line(topic, re
             del answers[0]
 
 
-def test_help_shows_every_default_that_says_something_and_breaks_no_word(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "40")
-    word = "trainer.experiments.command:add_arguments_of_it"
-    parser = cli.ArgumentParser(prog="x", description=f"see --max-minutes or {word}")
-    for option, default, text in (
-        ("--seed", 0, "of everything"), ("--rate", 1.5, "in Hz"), ("--out", None, word),
-        ("--set", [], "a setting"), ("--only", ["a", "b"], "these parts (default: all)"),
-    ):  # fmt: skip
-        parser.add_argument(option, default=default, help=text)
-    parser.add_argument("--quiet", action="store_true", help="say less")
-    text = " ".join(parser.format_help().split())
-    for said in ("of everything (default: 0)", "in Hz (default: 1.5)", "parts (default: all)"):
-        assert said in text
-    assert (text.count("(default: "), text.count("None"), text.count("False")) == (3, 0, 0)
-    assert (text.count(word), text.count("--max-minutes")) == (2, 1)
-
-
-def test_an_option_that_there_is_not_is_guessed_before_one_is_missed(capsys):
-    parser = cli.ArgumentParser(prog="x")
-    parser.add_argument("--steps", required=True)
-    parser.add_argument("names", nargs="*")
-    for words, guessed in ((["--stepps", "3"], True), (["--stepps=3"], True), (["--quux"], False)):
-        with pytest.raises(SystemExit):
-            parser.parse_args(words)
-        assert ("did you mean --steps?" in capsys.readouterr().err) == guessed
-    assert parser.parse_args(["--steps=--a b", "--", "--stepps"]).names == ["--stepps"]
-
-
 def test_an_error_or_a_status_holds_nothing_that_a_terminal_acts_upon():
     hostile = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e\r\n\udcff"
     assert str(UserError(f"no file {hostile}")).isprintable()
@@ -230,43 +175,15 @@ def test_an_error_or_a_status_holds_nothing_that_a_terminal_acts_upon():
     assert all(line.isprintable() for line in render_status({**status, **more}).splitlines())
 
 
-def into_a_full_disk(*command, unbuffered=""):
-    """Run with a stdout that takes nothing; ``unbuffered`` as PYTHONUNBUFFERED has it."""
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    shell = ["sh", "-c", 'exec "$@" > /dev/full', "sh", sys.executable, "-m", *command]
-    done = subprocess.run(shell, capture_output=True, text=True, env=environment)
-    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
-    assert "No space left on device" in done.stderr.splitlines()[-1]
-    return done.stderr
-
-
-@pytest.mark.parametrize("package", ["edge_runtime", "deploy.installer"])
-def test_a_full_disk_behind_stdout_is_one_line(package):
-    assert into_a_full_disk(package, "--help").count("\n") == 1
-
-
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_command_that_cannot_print_its_result_ends_in_order(make_policy, unbuffered):
-    flags = make_policy().flags
-    checked = into_a_full_disk("edge_runtime", "check", *flags[1:], unbuffered=unbuffered)
-    assert checked.count("\n") == 1
-    run = ["edge_runtime", "run", *flags, "--connect", "tcp/127.0.0.1:1"]
-    assert " ended " in into_a_full_disk(*run, unbuffered=unbuffered)
-
-
-def test_a_process_without_stdout_is_no_error():
-    shell = f"{sys.executable} -m edge_runtime --version >&-"
-    assert subprocess.run(shell, shell=True, stderr=subprocess.DEVNULL, check=False).returncode == 0
-
-
-@given(st.integers(-5, 20), st.integers(-3, 3), st.integers(0, 10))
-def test_a_whole_number_is_taken_within_its_limits_only(value, least, width):
-    kind = cli.whole_number(least, least + width)
-    if least <= value <= least + width:
-        assert kind(str(value)) == value
-    else:
-        with pytest.raises(ArgumentTypeError):
-            kind(str(value))
+def test_a_command_that_cannot_print_its_result_ends_in_order(make_policy):
+    run = ["run", *make_policy().flags, "--connect", "tcp/127.0.0.1:1"]
+    for command, lines in ((["--help"], 1), (run, 4)):
+        shell = ["sh", "-c", 'exec "$@" > /dev/full', "sh", sys.executable, "-m", "edge_runtime"]
+        environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+        done = subprocess.run([*shell, *command], capture_output=True, text=True, env=environment)
+        assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+        assert done.stderr.count("\n") <= lines
+        assert "No space left on device" in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, STEERING
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from edge_runtime.controller import (
@@ -21,7 +19,6 @@ from edge_runtime.controller import (
 )
 from edge_runtime.safety import FAULTS, TRANSITIONS, Event, Mode
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.mock import MockVehicle
 
 NAN = np.array([np.nan], np.float32)
 GOOD = np.array([0.5], np.float32)
@@ -88,14 +85,6 @@ def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
         order = answer(controller, step, arrived_s, sent_ns=round(sent_s * 1e9))
         assert (order is not None) == driven, step
         assert order is None or order.mode == "drive"
-
-
-def test_an_end_of_the_episode_that_the_link_held_up_ends_the_ride():
-    controller = riding(0.5, True)
-    answer(controller, 0, 10.0, sent_ns=10**10)
-    order = answer(controller, 1, 10.4, sent_ns=round(10.1e9), final=True)
-    assert (order.mode, order.reason) == ("safe_stop", "final_state")
-    assert controller.next_deadline_s() is None
 
 
 @pytest.mark.parametrize(
@@ -186,12 +175,9 @@ STORIES = {
         (1.9, "state", "drive"),
     ]),
     # It may take over from 2 T on, within the grace for a lost state, too.
-    **{
-        f"no drive goes on with another simulator after {after_s} s": (
-            1, 0, [FIRST, (after_s, "of another simulator", SILENT)]
-        )
-        for after_s in (0.2, 0.21, 0.22)
-    },
+    "no drive goes on with another simulator": (
+        1, 0, [FIRST, (0.2, "of another simulator", SILENT)]
+    ),
     "a nan stops with the very state and every further one": (
         1, 0, [FIRST, *states(0.1, 8, "output_not_finite", "nan")]
     ),
@@ -277,13 +263,6 @@ def test_an_answer_to_a_state_older_than_two_periods_stops():
     assert said(in_time.finish(GOOD, QUICK_NS, in_time.safety.answer_s)) == "drive"
 
 
-def test_a_safe_stop_is_the_manifests_or_holds_the_last_value():
-    lift = replace(PEDAL, name="lift", low=-40.0, high=80.0, stop=12.5)
-    controller = make(actions=(PEDAL, STEERING, lift))
-    answer(controller, 0, 0.0, np.array([0.4, -0.25, 70.0], np.float32))
-    assert controller.tick(0.3).action == [-1.0, -0.25, 12.5]
-
-
 @pytest.mark.parametrize("period_s", [0.01, 0.05, 1.0])
 def test_every_limit_follows_the_policys_control_period(period_s):
     controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), period_s))
@@ -293,7 +272,11 @@ def test_every_limit_follows_the_policys_control_period(period_s):
     assert said(controller.tick(4.31 * period_s)) == TOO_LONG
 
 
-def test_a_farewell_brakes_but_not_between_episodes_and_before_the_first():
+def test_a_safe_stop_and_a_farewell_are_the_manifests_or_hold_the_last_value():
+    lift = replace(PEDAL, name="lift", low=-40.0, high=80.0, stop=12.5)
+    controller = make(actions=(PEDAL, STEERING, lift))
+    answer(controller, 0, 0.0, np.array([0.4, -0.25, 70.0], np.float32))
+    assert controller.tick(0.3).action == [-1.0, -0.25, 12.5]
     assert said(driving().farewell()) == "runtime_ended"
     idle = (make(), play(make(), [(0.0, "final", "drive")]), make(True, armed_at_start=False))
     assert [controller.farewell() for controller in idle] == [None] * 3
@@ -345,15 +328,6 @@ def test_a_rate_limit_is_per_second_and_counts_from_the_last_order_whatever_its_
 
 
 SLOW = {"pedal": ActionLimit(-1.0, 0.5, slew_per_s=2.0)}
-units = st.floats(-1, 1)
-times_s = st.one_of(st.floats(0, 3), st.sampled_from([0.0, 0.005, T, 0.25, math.inf]))
-
-
-@pytest.mark.parametrize("vehicle", [{}, MockVehicle.limits])
-@given(st.floats(-3, 3), units, times_s)
-def test_without_a_slow_vehicle_only_the_manifest_bounds(vehicle, wanted, last, elapsed_s):
-    rows = shared_limits([PEDAL], vehicle)
-    assert limit_action([wanted], [last], rows, elapsed_s) == [min(max(wanted, -1.0), 1.0)]
 
 
 @pytest.mark.parametrize(
@@ -430,9 +404,10 @@ VEHICLE_STORIES = {
         *states(0.1, 9, FAULT), (0, "fault", ""), (1.0, "state", FAULT),  # nobody has allowed it
         (1.01, "rearm", ""), *states(1.1, 3, FAULT), (1.4, "state", "drive"),
     ]),
-    "a vehicle at fault never begins to drive": (
-        1, True, [(0, "fault", LYING), (0.0, "tick", None), (0.0, "state", FAULT)]
-    ),
+    "a fault before the first state is remembered": (1, False, [
+        (0, "fault", LYING), (0.0, "tick", None), (0, "fault", ""), *states(0.1, 9, FAULT),
+        (0.95, "rearm", ""), (1.0, "state", "drive"),
+    ]),
     "what stopped a vehicle is said until it is re-armed though it has passed": (1, False, [
         FIRST, (0, "fault", LYING), (0.01, "tick", FAULT), (0, "fault", "vehicle_silent"),
         (0.1, "state", FAULT), (0, "words", "vehicle_silent"), (0, "fault", ""),
@@ -443,22 +418,22 @@ VEHICLE_STORIES = {
 }  # fmt: skip
 
 
+UNARMED = "it waits for its first permission"
+VEHICLE_STORIES[UNARMED] = (1, False, [
+    (5.0, "tick", None), (0, "due", None), (5.0, "rearm", "no fresh states"),
+    (6.0, "begin", None), (6.0, "tick", None),  # the answer comes first
+    (6.001, "finish", "not_armed"), *states(6.1, 4, "not_armed"), (6.45, "rearm", ""),
+    (6.5, "state", "drive"),
+])  # fmt: skip
+
+
 @pytest.mark.parametrize("story", VEHICLE_STORIES)
 def test_with_a_vehicle(story):
     safe_stops, waits, rows = VEHICLE_STORIES[story]
-    controller = play(make(needs_rearm=True), rows)
+    controller = make(needs_rearm=True, armed_at_start=story != UNARMED)
+    assert controller.waits_for_rearm == (story == UNARMED)
+    play(controller, rows)
     assert (controller.safety.safe_stops, controller.waits_for_rearm) == (safe_stops, waits)
-
-
-def test_a_service_with_a_vehicle_waits_for_its_first_permission():
-    controller = make(needs_rearm=True, armed_at_start=False)
-    assert controller.waits_for_rearm
-    play(controller, [
-        (5.0, "tick", None), (0, "due", None), (5.0, "rearm", "no fresh states"),
-        (6.0, "begin", None), (6.0, "tick", None),  # the answer comes first
-        (6.001, "finish", "not_armed"), *states(6.1, 4, "not_armed"), (6.45, "rearm", ""),
-        (6.5, "state", "drive"),
-    ])  # fmt: skip
 
 
 def fault_in_the_vehicle(controller):
@@ -497,13 +472,6 @@ def test_the_table_holds_in_every_mode(mode, event):
     if controller.safety.mode is Mode.SAFE_STOP:
         assert controller.safety.reason == (event.value if event in FAULTS else SILENT)
         assert controller.waits_for_rearm
-
-
-def test_a_fault_of_the_vehicle_before_the_first_state_is_remembered():
-    play(make(needs_rearm=True), [
-        (0, "fault", LYING), (0.0, "tick", None), (0, "fault", ""), *states(0.1, 9, FAULT),
-        (0.95, "rearm", ""), (1.0, "state", "drive"),
-    ])  # fmt: skip
 
 
 def test_held_up_states_do_not_feed_the_watchdog():

@@ -2,13 +2,9 @@
 
 import contextlib
 import math
-import socket
-import socketserver
 import ssl
-import threading
 import time
 from datetime import datetime, timezone
-from itertools import count
 from types import SimpleNamespace
 from typing import Any, List
 from unittest.mock import MagicMock
@@ -20,11 +16,10 @@ from hil_tests.testing.messages import HEALTH
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime import log, reach, run
+from edge_runtime import reach, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.reach import Listener, free_endpoint, look
-from edge_runtime.run import say_what_is_missing
+from edge_runtime.reach import Listener, look
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -188,7 +183,7 @@ def test_the_session_is_closed_whatever_fails(session, link, monkeypatch):
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))
     with pytest.raises(OSError, match="no link"), contextlib.ExitStack() as unbuilt:
-        run._build(Config(), None, unbuilt)
+        run._Runtime(Config(), None, unbuilt)
     assert session.close.call_count == 3  # the one that asked for other runtimes, and its own
 
 
@@ -199,52 +194,3 @@ def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
         assert endpoint[4:].split(":")[0] in why
     with pytest.raises(UserError, match=r"a\.\.b"):
         open_session(listen="tcp/a..b:7447", mode="router")
-
-
-def test_a_server_that_speaks_something_else():
-    class Answers(socketserver.BaseRequestHandler):
-        def handle(self):
-            self.request.recv(1)
-            self.request.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
-
-    for files in (None, FILES):  # certificates that are gone: somebody may replace them meanwhile
-        with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
-            threading.Thread(target=listening.handle_request, daemon=True).start()
-            answers, why = look(f"tls/127.0.0.1:{listening.server_address[1]}", files)
-        assert answers
-        assert why
-
-
-@pytest.fixture
-def said(monkeypatch) -> List[str]:
-    """Why it waits, of each line in the log."""
-    lines: List[str] = []
-    monkeypatch.setattr(log, "event", lambda level, name, **fields: lines.append(fields["why"]))
-    return lines
-
-
-def test_it_is_said_from_then_on_every_five_seconds_until_a_state_came(said):
-    over = MagicMock(**{"wait.side_effect": [False] * 9})
-
-    def why() -> str:
-        return f"because {len(said)}"
-
-    say_what_is_missing(lambda: len(said) == 2, why, over, time.monotonic() + 5.0)
-    assert said == ["because 0", "because 1"]
-    waits_s = [call.args[0] for call in over.wait.call_args_list]
-    assert waits_s == pytest.approx([5.0, 5.0, 5.0], abs=0.5)
-
-
-def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
-    looks = count()
-    over = MagicMock(**{"wait.side_effect": [False, True]})
-    say_what_is_missing(lambda: next(looks) > 0, lambda: "too late", over, 0.0)
-    assert said == []
-
-
-def test_a_free_endpoint_is_given_to_one_process_only():
-    endpoint = free_endpoint()
-    with socket.socket() as other, pytest.raises(OSError, match="in use"):
-        other.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
-    with contextlib.closing(open_session(listen=endpoint, mode="router")):
-        assert look(endpoint, None)[0]

@@ -42,11 +42,6 @@ def test_run_without_a_vehicle_loads_no_more_than_it_needs():
     assert not LAZY & {path.relative_to(ROOT).parts[0].replace(".py", "") for path in loaded}
 
 
-def test_a_vehicle_loads_no_other_one():
-    making = "from edge_runtime.vehicles import find_vehicle; find_vehicle('mock')()"
-    assert {path.parent.name for path in loaded_by(making)} == {"edge_runtime", "vehicles"}
-
-
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel of a copy: building writes into its source folder."""

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import onnx
 import pytest
@@ -20,21 +19,19 @@ from hil_tests.testing.policies import (
     ROVER_INPUTS,
     SHAPE,
     STEERING,
-    TASK,
     WHEELS,
     public_pem,
     write_policy,
     write_rover,
 )
-from hil_tests.testing.vehicles import a_manifest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from onnx import TensorProto, helper
 
 from edge_runtime import policy as module
-from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, Layout, decode_manifest
-from edge_runtime.policy import check_graph, infer, load_policy, probes, verify
+from edge_runtime.manifest import MANIFEST_KEY, Action, Entry, decode_manifest
+from edge_runtime.policy import check_graph, infer, load_policy, verify
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS, Reason
 
@@ -53,23 +50,6 @@ def refused(path, match, **options):
 @pytest.fixture
 def plain(tmp_path):
     return tmp_path / "p.onnx"
-
-
-@pytest.mark.parametrize("actions", [(PEDAL,), (PEDAL, STEERING)])
-def test_a_signed_policy_drives(make_policy, actions):
-    signed = make_policy("mean", actions=actions)
-    policy = load_policy(signed.path, signed.public_key)
-    assert (policy.trust, policy.policy_id) == (module.VERIFIED, signed.policy_id)
-    for level in (0, 51, 255):
-        action = policy.act({"frames": np.full(SHAPE, level, np.uint8)})
-        assert action.dtype == np.float32
-        np.testing.assert_allclose(action, [level / 127.5 - 1] * len(actions), atol=1e-6)
-
-
-def test_a_probe_of_integers_is_not_all_zeros():
-    gear = {"gear": Entry(dtype="int64", shape=[100])}
-    seen = [probe["gear"] for probe in probes(Layout(replace(TASK, observation=gear)))]
-    assert [set(gears.tolist()) for gears in seen] == [{0}, {1}, {0, 1}]
 
 
 ONE_AT_A_TIME = {**ROVER_INPUTS, "camera": "uint8[1, 4, 6, 3]"}
@@ -136,12 +116,6 @@ def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(plain, shape
     with pytest.raises(UserError, match=re.escape(f"float32 {list(shape)}")):
         policy.act(frames)
     assert infer(policy, frames)[0] is None
-
-
-@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
-def test_our_own_policies_drive(scenario):
-    policy = load_policy(POLICIES / f"{scenario}.onnx", POLICIES / "policy.pub")
-    assert (policy.trust, policy.manifest.task) == (module.VERIFIED, scenario)
 
 
 def test_the_task_is_all_that_both_sides_agree_on_and_fits_the_wire(plain):
@@ -224,17 +198,6 @@ def test_manifest_and_graph_must_agree(plain, word):
     refused(plain, word, allow_unsigned=True)
 
 
-def test_what_onnxruntime_prints_stays_off_stdout(plain, monkeypatch, capfd):
-    def fail(*_, **__):
-        print("EP Error")
-        raise ValueError("broken\ngraph")
-
-    monkeypatch.setattr("onnxruntime.InferenceSession", fail)
-    write_policy(plain)
-    refused(plain, "broken graph", allow_unsigned=True)
-    assert capfd.readouterr().out == ""
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "plain.onnx"
@@ -249,16 +212,12 @@ def refused_or_without_manifest(data: bytes) -> bool:
         return True
 
 
-def test_the_envelope_that_an_earlier_manifest_may_hold_is_ignored():
-    manifest = a_manifest()
-    earlier = {**msgspec.to_builtins(manifest), "envelope": {"joint": "whatever"}}
-    assert decode_manifest(json.dumps(earlier)) == manifest
-
-
 def test_what_the_onnx_package_wrote_is_read_and_every_truncation_refused(written):
     """A cut between two fields can leave a whole model, but then the manifest is gone."""
     data = written.read_bytes()
-    assert decode_manifest(check_graph(data)[MANIFEST_KEY]).task == "left_turn"
+    text = check_graph(data)[MANIFEST_KEY]
+    earlier = json.dumps({**json.loads(text), "envelope": {"joint": "ignored"}})
+    assert decode_manifest(text) == decode_manifest(earlier)
     for length in range(len(data)):
         assert refused_or_without_manifest(data[:length]), length
 
@@ -296,19 +255,14 @@ def function():
 HIDDEN: dict = {
     "another file": {
         "in an initializer": lambda m: outside(m.graph.initializer[0]),
-        "in an initializer that says so and names no file": lambda m: setattr(
-            m.graph.initializer[0], "data_location", TensorProto.EXTERNAL
-        ),
         "in a constant": lambda m: m.graph.node.append(constant(value=outside())),
     },
     "sparse weights": {
         "in an initializer": lambda m: m.graph.sparse_initializer.append(sparse()),
         "in a constant": lambda m: m.graph.node.append(constant(sparse_value=sparse())),
-        "in a list": lambda m: m.graph.node.append(constant(values=[sparse()])),
     },
     "control flow": {
         "in a branch": lambda m: m.graph.node.append(helper.make_node("If", [], [], then=m.graph)),
-        "in a list": lambda m: m.graph.node.append(helper.make_node("If", [], [], all=[m.graph])),
     },
     "functions of its own": {"": lambda m: m.functions.append(function())},
     "graphs for training": {

@@ -1,7 +1,5 @@
 """The table of rights as Zenoh will read it; that Zenoh obeys: hil_tests/tests/test_tls.py."""
 
-from datetime import datetime, timezone
-
 import pytest
 from cryptography.hazmat.primitives import serialization as form
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -9,7 +7,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from edge_runtime import tls
 from edge_runtime.util import UserError
-from edge_runtime.wire import TOPICS
 
 
 def allowed(config, name, message, flow):
@@ -60,30 +57,6 @@ def test_no_key_of_another_vehicle_is_in_reach_and_the_rest_is_denied():
     assert tls.rules_for_listener(["a", "a"]) == tls.rules_for_listener(["a"])
 
 
-def test_the_table_knows_every_topic_of_the_wire():
-    columns = [column for rights in tls.ROLES.values() for column in rights[:6]]
-    named = {suffix.split("/")[0] for column in columns for suffix in column}
-    assert set(TOPICS) <= named
-
-
-def test_a_wrong_name_says_which_would_be_right():
-    able = tls.common_name(tls.SIMULATOR, "a"), tls.common_name(tls.ROUTER)
-    for name in able:
-        tls.check_name(name, *able)
-    with pytest.raises(UserError, match=r"viewer.*simulator-a or router"):
-        tls.check_name("viewer", *able)
-    with pytest.raises(UserError):
-        tls.common_name(tls.EDGE, "a/b")
-
-
-def test_a_certificate_is_valid_until_the_second_of_its_end():
-    ends = datetime(2026, 1, 2, tzinfo=timezone.utc)
-    files = tls.TlsFiles("ca.pem", "cert.pem", "key.pem", "edge-a", ends)
-    files.require_valid(ends.timestamp() - 0.001)
-    with pytest.raises(UserError, match=r"cert.pem expired at 2026-01-02"):
-        files.require_valid(ends.timestamp())
-
-
 def pem(key, encryption=None):
     encryption = encryption or form.NoEncryption()
     return key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, encryption)
@@ -100,5 +73,5 @@ def test_only_an_ed25519_key_without_a_password_signs(tmp_path):
         path.write_bytes(data)
         with pytest.raises(UserError):
             tls.read_signing_key(path)
-    with pytest.raises(UserError, match="deploy keys"):
+    with pytest.raises(UserError):
         tls.read_signing_key(tmp_path / "absent")

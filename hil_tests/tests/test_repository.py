@@ -203,7 +203,7 @@ def examples_in(text):
 
 
 @pytest.mark.parametrize("folder", ARROWS)
-def test_every_command_shows_examples_that_it_takes_and_guesses_what_is_meant(folder, only_parse):
+def test_every_command_shows_examples_that_it_takes(folder, only_parse):
     commands = [[name] for name in subcommands_in(help_of(folder, [], only_parse))]
     assert commands
     for words in [[], *commands]:
@@ -219,7 +219,6 @@ def test_every_command_shows_examples_that_it_takes_and_guesses_what_is_meant(fo
         with pytest.raises(SystemExit) as ended:
             main_of(folder)([*words, "--hepl"])
         assert ended.value.code == 2
-        assert "did you mean --help?" in only_parse[-1]
 
 
 @pytest.mark.parametrize(("folder", "least"), LEAST_WRITING.items())
@@ -289,7 +288,7 @@ def test_phil_runs_every_folder(tmp_path):
     for words, status, said in (
         (["trainer", "--version"], 0, __version__),
         (["edge_runtime", "chekc"], 2, "chekc"),
-        (["bridg"], 2, "did you mean bridge?"),
+        (["bridg"], 2, "bridg"),
         (["bridge", "simulate", "--env", "own:Mine-v0"], 2, "ImportError: found"),
         ([], 0, "hil_tests"),
     ):

@@ -516,7 +516,7 @@ def test_a_routers_file_names_the_vehicles_of_both_options(parties, tmp_path, ca
     assert (settings["mode"], settings["listen"]["endpoints"]) == ("router", [words[2]])
     assert link["tls"]["enable_mtls"] is True
     assert link["tls"]["listen_certificate"] == str(parties / "router" / "cert.pem")
-    assert link["protocols"] == ["tls", "quic"]
+    assert link["protocols"] == ["tls"]
     assert settings["scouting"]["multicast"]["enabled"] is False
 
 

@@ -45,7 +45,7 @@ TOLD = [
     ("train --out x --set printed_reward=maybe", "expected true or false, got 'maybe'"),
     ("train --out x --set batch_size=1.5", "expected a whole number, got '1.5'"),
     ("train --out x --set bach_size=4", "did you mean batch_size?"),
-    ("trian", "did you mean train?"),
+    ("trian", "invalid choice: 'trian'"),
     ("plot x --out a.jpg", "a picture is a .png"),
     ("evaluate none", "none is no policy"),
     ("plot one two --out c.png", "one holds no metrics"),
