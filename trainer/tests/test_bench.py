@@ -1,8 +1,4 @@
 import json
-from functools import partial
-from itertools import count
-from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -16,52 +12,6 @@ from trainer.scenarios import SCENARIOS
 TINY = bench.Effort(
     batch_size=4, rounds=2, updates_per_round=1, steps_per_round=10, training_episodes=1
 )
-
-
-def test_contenders_take_turns_and_none_is_always_first(monkeypatch):
-    calls, ticks, clock = list[str](), list[str](), count()
-    monkeypatch.setattr(bench.time, "perf_counter", lambda: float(next(clock)))
-    contenders = {name: partial(calls.append, name) for name in "abc"}
-    times = bench.take_turns(contenders, 4, 2, ticks.append)
-    assert "".join(calls[::2]) == "abc" + "abc" + "bca" + "cab" + "abc"
-    assert times == {name: [0.5] * 4 for name in "abc"}
-    assert len(ticks) == 4
-
-
-def test_training_figures_scale_to_10000_steps():
-    names = [f"{name}_s" for name in bench.PARTS]
-    parts_s = dict(zip(names, (0.1, 0.2, 0.3, 6.0, 0.0), strict=True))
-    episodes: list[Any] = [SimpleNamespace(steps=steps, **parts_s) for steps in (100, 300)]
-    found = bench.training_figures(episodes, 16.0)
-    wanted = zip(("total", *bench.PARTS), (400.0, 5.0, 10.0, 15.0, 300.0, 0.0), strict=True)
-    assert found["steps"] == 400
-    assert found["s_per_10k_steps"] == pytest.approx(dict(wanted))
-
-
-def test_an_update_draws_learns_and_sets_the_new_priorities():
-    seen: list[Any] = []
-
-    def learn(batch, beta):
-        seen.append(batch.indices)
-        return Losses(0.0, 0.0, 0.0, 0.0, np.full(len(batch.indices), 7.0))
-
-    buffer, learner = bench.filled(bench.gather(50)), SimpleNamespace(update=learn)
-    update = bench.whole_update(learner, buffer, batch_size=8)  # type: ignore[arg-type]
-    for _ in range(3):
-        update()
-    assert [len(indices) for indices in seen] == [8, 8, 8]
-    assert (buffer._priorities[np.concatenate(seen)] == 7.0).all()
-    assert 0 < buffer.human_count < 50
-
-
-@pytest.mark.parametrize(("has", "precision"), [(True, "bfloat16"), (False, "float32")])
-def test_an_effective_precision_of_float32_is_measured_once(has, precision, monkeypatch):
-    monkeypatch.setattr(bench, "TRANSITIONS", 20)
-    monkeypatch.setattr(bench, "bfloat16_is_faster", lambda kind: has)
-    found = bench.measure_learner(TINY, lambda done: None)
-    assert found["precision"] == precision
-    assert found["updates_per_s"] == 1e3 / found["ms_per_update"]
-    assert (bench.FLOAT32 in found["peers"]) == has
 
 
 def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkeypatch):

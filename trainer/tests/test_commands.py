@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.policies import public_pem
-from trainer.training.config import SETTINGS, RunConfig
+from trainer.training.config import RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
 
@@ -219,14 +219,3 @@ def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_pa
     assert "the time is over after 1 of 50 episodes" in said
     assert "refining: 2/2" in said  # 100 steps are for 50 episodes
     assert (tmp_path / "human_model.pt").is_file()
-
-
-def test_the_settings_are_listed_with_defaults_and_meanings_and_the_commands(capsys):
-    status, out, _ = call(capsys, "train", "--set")
-    assert status == 0
-    assert max(map(len, out.splitlines())) <= 98
-    assert "  batch_size=128                    transitions in a minibatch (table A5: N)\n" in out
-    assert [name for name in SETTINGS if f"  {name}=" not in out] == []
-    # A bare command prints its help.
-    status, out, _ = call(capsys)
-    assert (status, "experiment" in out) == (0, True)

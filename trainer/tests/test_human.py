@@ -1,15 +1,12 @@
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from edge_runtime.util import UserError
 from hil_tests.testing.people import BRAKE, FULL, drive
-from trainer.drivers import constant_driver, load_driver
+from trainer.drivers import constant_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.config import HumanModelConfig
 from trainer.human.dagger import imitate
@@ -18,8 +15,6 @@ from trainer.human.model import HumanModel, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-
-LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 
 
 def test_the_model_starts_as_an_untrained_actor_and_learns_what_it_is_shown():
@@ -40,23 +35,6 @@ def test_the_model_starts_as_an_untrained_actor_and_learns_what_it_is_shown():
     assert model.act(dark)[0] < -0.7
 
 
-def test_refining_takes_its_updates_under_a_falling_learning_rate():
-    config = HumanModelConfig(batch_size=16, learning_rate=1e-3, refining_updates=45)
-    model, random = HumanModel(config, seed=3), np.random.default_rng(0)
-    for number in range(60):
-        shade = random.integers(0, 255)
-        model.add(np.full((2, 45, 80), shade, np.uint8), FULL if number % 2 else BRAKE)
-    before = [parameter.clone() for parameter in model.actor.parameters()]
-    (group,), rates = model.optimiser.param_groups, []
-    for loss in model.refine(config.refining_updates):
-        assert np.isfinite(loss)
-        rates.append(group["lr"])
-    assert rates == pytest.approx([1e-3 * (1 - part / 20) for part in range(20)])
-    # 45 updates in 20 parts: Adam counts them.
-    assert {int(state["step"]) for state in model.optimiser.state.values()} == {45}
-    assert not all(map(torch.equal, before, model.actor.parameters()))
-
-
 @pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])
 def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     config = HumanModelConfig(episodes=2, updates_per_episode=2, batch_size=8)
@@ -72,34 +50,6 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     assert about["demonstrations"] == models[0].demonstrations
     with torch.no_grad():
         assert actor(torch.from_numpy(frames)[None])[0].numpy() == models[0].act(frames)
-
-
-def test_someone_takes_over_from_a_model_that_never_looks_and_every_step_is_labelled(monkeypatch):
-    config = replace(LABELLED, episodes=2, demonstrate_every=0)
-    model = HumanModel(config, seed=5)
-    monkeypatch.setattr(model, "act", lambda observation: FULL)
-    episodes = list(imitate(model, LeftTurnEnv(), seed=5))
-    assert episodes[-1].demonstrations > 20
-    assert sum(each.interventions for each in episodes) > 0
-
-
-def test_episodes_are_demonstrated_or_watched_in_turn(monkeypatch):
-    config = replace(LABELLED, episodes=4, demonstrate_every=2)
-    looks, begins = Mock(return_value=None), Mock()  # nobody takes over
-    monkeypatch.setattr(HumanGuide, "watch", looks)
-    monkeypatch.setattr(HumanGuide, "reset", begins)
-    watched = []
-    for number, _ in enumerate(imitate(HumanModel(config, seed=5), LeftTurnEnv(), seed=5), 1):
-        assert begins.call_count == 1 + number  # and once where the guide is made
-        watched.append(looks.called)
-        looks.reset_mock()
-    assert watched == [True, False] * 2
-
-
-def test_what_does_not_fit_together_is_refused(tmp_path):
-    HumanModel(HumanModelConfig(), seed=1).save(tmp_path, {"scenario": "congestion"})
-    with pytest.raises(UserError, match="trained in congestion, not in left_turn"):
-        load_driver(str(tmp_path), LeftTurnEnv())
 
 
 @pytest.mark.parametrize(
@@ -169,10 +119,6 @@ def test_the_human_holds_on_and_gives_back(reasons, how, held, first):
 def noticed(attention, *periods, count):
     """What a human notices of a reason that is there in these periods."""
     return [attention.notices("collision" if n in periods else None) for n in range(count)]
-
-
-def test_the_wheel_is_held_for_as_long_whatever_a_control_period_lasts():
-    assert [steps_held(period_s) for period_s in (0.05, 0.1, 0.2, 1.0)] == [30, 15, 8, 2]
 
 
 def test_a_late_human_comes_some_steps_after_its_reason_and_an_inattentive_one_not_at_all():

@@ -1,11 +1,9 @@
 """The compiled kernel against torch in double precision, and how it is built."""
 
-import multiprocessing
 import platform
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -122,23 +120,6 @@ def test_threads_change_nothing_and_reduced_precision_little(frames, reduced, on
         assert (gradient - exact).norm() < 0.2 * exact.norm()
 
 
-@needs_kernel
-@pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
-def test_gradients_in_reduced_precision_are_much_the_same(frames):
-    """Where both passes backward know the same winners, and only factors are rounded."""
-    pictures, slopes = _pictures(33)[:, frames], _slopes(33)
-    parameters = _parameters(pictures.shape[1])
-    features = trunk_features(pictures, *parameters)
-    right = torch.autograd.grad(features, parameters, slopes, retain_graph=True)
-    node: Any = features.grad_fn
-    node.reduced = True
-    gradients = torch.autograd.grad(features, parameters, slopes)
-    library = kernel.load()
-    assert torch.equal(gradients[0], right[0]) != bool(library and library.trunk_has_tiles())
-    for gradient, exact in zip(gradients, right, strict=True):
-        assert (gradient - exact).norm() < 0.01 * exact.norm()
-
-
 def test_other_pictures_take_the_torch_path():
     assert trunk_features(_pictures(0)[:, :2], *_parameters(2)).shape == (0, 1792)
     parameters = _parameters(3)
@@ -198,28 +179,6 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
     assert caplog.records == []
 
 
-@needs_kernel
-@needs_x86
-def test_reduced_precision_is_much_the_same_without_a_matrix_unit(anew):
-    pictures, library = [_pictures(9)[:, :2], _pictures(9)[:, 2:]], kernel.load()
-
-    def features():
-        given = [(seen, _parameters(seen.shape[1])) for seen in pictures]
-        return [
-            [_gradients(*each, _slopes(9), reduced)[0] for reduced in (True, False)]
-            for each in given
-        ]
-
-    found = features()
-    if not (without := anew(CXX="c++ -mno-amx-bf16")):
-        pytest.skip("the compiler knows no matrix unit")
-    assert not without.trunk_has_tiles()
-    for (reduced, single), (by_pairs, again) in zip(found, features(), strict=True):
-        assert torch.equal(single, again)
-        assert torch.equal(reduced, by_pairs) != bool(library and library.trunk_has_tiles())
-        assert (reduced - by_pairs).norm() < 0.01 * single.norm()
-
-
 WITHOUT_OPENMP = """\
 #!/bin/sh
 case "$*" in *-fopenmp*) echo "{says}" >&2; exit 1;; esac
@@ -253,15 +212,3 @@ def test_what_only_a_matrix_unit_needs_compiles_without_one():
     if "sapphirerapids" in done.stderr:
         pytest.skip("the compiler does not know such a processor")
     assert (done.returncode, done.stderr) == (0, "")
-
-
-@needs_kernel
-def test_two_processes_may_build_at_once(tmp_path, anew, small_source):
-    fork = multiprocessing.get_context("fork")  # They compute nothing: torch need not be anew.
-    processes = [fork.Process(target=lambda: sys.exit(anew() is None)) for _ in range(2)]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join(100)
-        assert process.exitcode == 0
-    assert [path.suffix for path in (tmp_path / "cache/phil-hil").iterdir()] == [".so"]

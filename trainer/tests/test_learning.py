@@ -1,21 +1,18 @@
 """The learner's thread: what it averages, waits for and ends with; and one that never waits."""
 
 import threading
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import torch
 
 from hil_tests.processes import wait_until
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Transition
 from trainer.learner.td3 import Losses
 from trainer.tests.loops import CONFIG, ScriptedEnv, scripted_run
-from trainer.training import run as run_module
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread, UnhurriedLearning
 
@@ -58,23 +55,6 @@ def noting(threads, function):
     return noted
 
 
-def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learning):
-    for scale in (1.0, 3.0):
-        scaled = Losses(scale, 2.0 * scale, 3.0 * scale, 4.0 * scale, LOSSES.priorities)
-        learning.learner.update.return_value = scaled
-        learning.begin(0.0)
-        learning.finish()
-    episode, after = learning.end_episode(0.0), learning.end_episode(0.0)
-    found, none = (
-        tuple(each[name] for name in ("critic_loss", "policy_loss", "cloning_loss", "value"))
-        for each in (episode, after)
-    )
-    assert found == (2.0, 4.0, 6.0, 8.0)
-    assert 1.0 < episode["policy_priority"] <= 2.0
-    assert np.isnan(none).all()
-    assert after["learning_s"] == after["waiting_s"] == 0.0
-
-
 @pytest.mark.parametrize("learning", ["rlpd_td3"], indirect=True)
 def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back(
     learning,
@@ -87,25 +67,6 @@ def test_several_updates_in_a_step_are_of_several_batches_and_all_their_prioriti
     assert drawn[0] != drawn[1]
     written = learning.replay.update_priorities.call_args_list
     assert [call.args[0].tolist() for call in written] == drawn
-
-
-def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):
-    begun, let_go = threading.Event(), threading.Event()
-
-    def held_up(batch, beta):
-        begun.set()
-        assert let_go.wait(10.0)
-        return LOSSES
-
-    learning.learner.update = held_up
-    assert learning.finish() == 0.0  # nothing was begun
-    learning.begin(0.0)
-    assert begun.wait(10.0)
-    threading.Timer(0.02, let_go.set).start()
-    waited_s = learning.finish()
-    episode = learning.end_episode(0.0)
-    assert episode["waiting_s"] == waited_s > 0.0
-    assert episode["learning_s"] > 0.0
 
 
 def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
@@ -122,27 +83,6 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
     assert thread.is_alive()
     learning.close()
     assert not thread.is_alive()
-
-
-def test_what_is_too_small_to_count_does_not_slow_the_updates_down(learning):
-    def halved():
-        return (torch.tensor(torch.finfo(torch.float32).tiny) / 2).item()
-
-    assert learning.in_thread(halved) == 0.0 < halved()
-
-
-def test_validation_acts_in_the_learners_thread(tmp_path):
-    config = replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2)
-    run = scripted_run(tmp_path, config, length=3)
-    run.validation.envs = [ScriptedEnv(3) for _ in range(2)]
-    learner, validations = run.learning.learner, []
-    threads: list[threading.Thread] = []
-    for actor in (learner.actor, learner.target_actor):
-        actor.act = noting(threads, actor.act)
-    run.train(lambda metrics: validations.append(metrics.validation_distance_m))
-    assert validations == [3.0]
-    assert len(threads) == 3 + 3  # two episodes of three steps, side by side
-    assert len({*threads, threading.current_thread()}) == 2
 
 
 def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
@@ -191,31 +131,6 @@ def test_what_fails_beside_an_update_or_in_it_ends_the_run_and_the_thread(tmp_pa
         run.train()
     assert (len(run.env.actions), len(run.stored), len(threads)) == (2, 1, 1)
     assert not threads[0].is_alive()
-
-
-def test_each_second_of_a_control_period_is_counted_where_it_is_spent(tmp_path, monkeypatch):
-    """On a clock that stands still but for what is said to take time."""
-    run, now_s = scripted_run(tmp_path, CONFIG, length=4), [0.0]
-
-    def taking(owner, name, seconds, returns=None):
-        function = getattr(owner, name)
-
-        def slow(*arguments, **named):
-            now_s[0] += seconds
-            found = function(*arguments, **named)
-            return found if returns is None else returns
-
-        setattr(owner, name, slow)
-
-    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: now_s[0]))
-    for name, seconds in (("act", 1.0), ("begin", 2.0), ("add", 32.0)):
-        taking(run.learning, name, seconds)
-    taking(run.env, "step", 4.0)
-    taking(run.learning, "finish", 8.0 + 16.0, returns=8.0)
-    metrics = run.advance()
-    run.learning.close()
-    assert (metrics.acting_s, metrics.environment_s) == (4 * 1.0, 4 * 4.0)
-    assert metrics.storing_s == 3 * 2.0 + 4 * (16.0 + 32.0)  # the first step begins no update
 
 
 @pytest.fixture
@@ -285,15 +200,3 @@ def test_the_next_update_begins_when_the_last_is_done_and_its_error_comes_out(un
     unhurried.begin(0.0)
     with pytest.raises(RuntimeError, match="no more memory"):
         unhurried.settle()
-
-
-def test_a_restored_learner_acts_as_the_one_that_was_saved(unhurried):
-    unhurried.begin(0.0)
-    unhurried.settle()
-    state, action = unhurried.state_dict(), unhurried.act(PICTURE)
-    config = RunConfig(seed=5, learner=unhurried.config)
-    other = UnhurriedLearning(config, ScriptedEnv())
-    assert np.any(other.act(PICTURE) != action)
-    other.load_state_dict(state)
-    np.testing.assert_array_equal(other.act(PICTURE), action)
-    other.close()

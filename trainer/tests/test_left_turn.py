@@ -14,25 +14,6 @@ from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
 
 
-def test_on_an_empty_road_full_throttle_reaches_the_goal():
-    env = LeftTurnEnv(EMPTY_ROAD)
-    rewards, info = drive(env, FULL)
-    assert info["outcome"] == "goal"
-    assert info["distance_m"] == pytest.approx(21.0, abs=0.65)
-    assert rewards[-1] == pytest.approx(10.0 - 0.02 * 1.0)
-
-
-@pytest.mark.parametrize("speed_mps", [2.0, 4.0, 6.0])
-def test_the_tracker_keeps_the_car_on_its_path_at_every_speed(speed_mps):
-    env = LeftTurnEnv(replace(EMPTY_ROAD, ego_speed_mps=(speed_mps, speed_mps)))
-
-    def keep(_):
-        return np.array([np.clip(speed_mps - env.ego.speed, -1, 1)], np.float32)
-
-    for _ in episode(env, keep, seed=0):
-        assert abs(env.path.project(*env.ego.position)[1]) < 0.2
-
-
 def test_the_brake_stops_the_car_and_does_not_reverse_it():
     env = LeftTurnEnv(EMPTY_ROAD)
     _, rewards, infos = zip(*episode(env, BRAKE, 0), strict=True)
@@ -54,27 +35,6 @@ def test_the_printed_reward_is_eq_31_without_a_weight():
     )
     assert printed == pytest.approx(np.array(own) / config.speed_weight)
     assert make_environment("left_turn", printed_reward=True).config.speed_weight == 1.0
-
-
-def test_a_crash_is_a_failure_and_always_driving_on_no_solution():
-    env = LeftTurnEnv(LeftTurnConfig(first_car_m=(9.0, 9.0), ego_speed_mps=(4.0, 4.0)))
-    rewards, info = drive(env, FULL)
-    assert info["outcome"] == "collision"
-    assert rewards[-1] < -9.9
-    outcomes = [drive(LeftTurnEnv(), FULL, seed)[1]["outcome"] for seed in range(30)]
-    assert outcomes.count("goal") < 10
-
-
-def test_traffic_does_not_yield():
-    env = LeftTurnEnv()
-    for seed in range(20):
-        paths = []
-        for action in (FULL, BRAKE):
-            env.reset(seed=seed)
-            for _ in range(20):
-                env.step(action)
-                paths.append([car.position[0] for car in env.traffic])
-        assert paths[:20] == paths[20:]
 
 
 def test_the_pedal_for_a_speed_gives_the_car_that_speed_and_makes_up_later_for_what_is_missed():
@@ -169,17 +129,6 @@ def test_nobody_stops_in_the_lane_even_where_nothing_comes(place_m, speed_mps, p
     env, trigger = triggered(traffic_cars=0)
     env.distance_m, env.ego.speed = place_m, speed_mps
     assert trigger.wants_control(np.array([pedal], np.float32)) == reason
-
-
-def test_a_plan_may_end_in_a_stop():
-    env = environment(first_car_m=(60.0, 60.0))
-    crossing = LeftTurnHuman(env).crossing
-    # 0.5 s at 4 m/s, then 2 m/s2: 2 m and 4 m, and a little for whole control periods.
-    plan = PedalPlan(pedal=0.0, hold_s=0.5, then_brake=0.5)
-    reached_m, speed_mps = crossing.state_after(6.0, plan)
-    assert (reached_m, speed_mps) == (pytest.approx(6.0 + 0.5 * 4.0 * 0.1, abs=0.01), 0.0)
-    assert crossing.state_after(9.0, plan) == (reached_m, speed_mps)
-    assert crossing.state_after(0.5, plan) == (pytest.approx(2.0), pytest.approx(4.0))
 
 
 def guided(guide: HumanGuide, action: np.ndarray):

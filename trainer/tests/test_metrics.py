@@ -73,20 +73,6 @@ def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
     assert (list(kept), kept["validation_reward"], kept["steps"]) == (NAMES, "", "1.5")
 
 
-def test_what_the_human_gave_until_the_policy_alone_had_learned_is_kept_after_a_resume(tmp_path):
-    told = [
-        EpisodeMetrics(number, human_steps=10, validation_success=success)
-        for number, success in enumerate((0.5, 0.9, math.nan, 0.7, 0.98, 1.0))
-    ]
-    for first, last in ((0, 3), (3, 6)):
-        writer = MetricsWriter(tmp_path, first, period_s=0.1)
-        for metrics in told[first:last]:
-            writer.add(metrics)
-        writer.close()
-    assert [one.human_s_to_90 for one in told] == pytest.approx([math.nan] + [2.0] * 5, nan_ok=True)
-    assert [one.human_s_to_98 for one in told[3:]] == pytest.approx([math.nan, 5, 5], nan_ok=True)
-
-
 @pytest.mark.parametrize(
     "content",
     [

@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -114,54 +112,6 @@ def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_
     assert rows[3] == (4 + 5 / 2 + 6 / 4, 3, 1.0)
 
 
-def test_the_overruled_action_is_kept_beside_the_humans():
-    buffer, copy = ReplayBuffer(10), ReplayBuffer(10)
-    action, overruled = np.array([0.25], np.float32), np.array([-1.0], np.float32)
-    buffer.add(Transition(pair(0, 0), action, 0.0, pair(0, 1), False))
-    more: Any = {"human": True, "overruled": overruled, "penalised": True}
-    buffer.add(Transition(pair(0, 1), action, 0.0, pair(1, 2), False, **more))
-    copy.load_state_dict(buffer.state_dict())
-    for batch in (sample(buffer), sample(copy)):
-        assert batch.overruled is not None
-        np.testing.assert_array_equal(batch.overruled[:, 0], np.where(batch.human, -1.0, 0.25))
-        np.testing.assert_array_equal(batch.penalised, batch.human)
-
-
-@pytest.mark.parametrize(
-    ("capacity", "steps", "least", "most"),
-    [(50, [25] * 5, 50, 50), (40, [1] * 60, 15, 25)],  # short ones are forgotten early
-)
-def test_a_full_ring_keeps_the_newest_and_mixes_no_pictures(capacity, steps, least, most):
-    buffer, source = filled(*steps, capacity=capacity)
-    assert least <= len(buffer) <= most
-    drawn = {number(picture) for picture in sample(buffer, 1000).frames[:, 1]}
-    assert drawn == set(list(source.stored)[-len(buffer) :])
-
-
-def test_what_is_foreseen_stands_beside_its_pair_and_is_restored():
-    buffer, copy = (ReplayBuffer(8, foresees=True) for _ in range(2))
-    for now in range(4):
-        seen = pair(max(now - 1, 0), now)
-        ahead = [seen, pair(now, 100 + now), pair(100 + now, 200 + now)]
-        actions = np.array([[0.5 + now], [-0.5 - now]], np.float32)
-        human = now % 2 == 1
-        foreseen = tuple(ahead) if human else ()
-        buffer.add(
-            Transition(seen, actions[0], 1.0, pair(now, now + 1), False, human=human,
-                       overruled=actions[1], foreseen=foreseen)
-        )  # fmt: skip
-    copy.load_state_dict(buffer.state_dict())
-    for found in (sample(buffer).foreseen, sample(copy).foreseen):
-        assert found is not None
-        rows = zip(found.next_frames, found.actions, found.overruled, strict=True)
-        assert {(number(a), number(b), *map(float, (*x, *y))) for (a, b), x, y in rows} == {
-            (older, newer, 0.5 + now, -0.5 - now)
-            for now in (1, 3)
-            for older, newer in ((now, 100 + now), (100 + now, 200 + now))
-        }
-    assert buffer.human_count == 2
-
-
 def test_probabilities_follow_equation_20():
     buffer, _ = filled(2, alpha=0.5)
     # Of an index that is named twice, the last priority counts.
@@ -174,21 +124,6 @@ def test_probabilities_follow_equation_20():
         with pytest.raises(ValueError, match="finite"):
             buffer.update_priorities(np.array([0]), np.array([bad]))
     np.testing.assert_array_equal(sample(buffer, 1000).probabilities, batch.probabilities)
-
-
-def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
-    buffer, _ = filled(*[1] * 60, capacity=40, alpha=0.0)
-    buffer.update_priorities(buffer.alive[:3], np.array([0.5, 2.0, 9.0]))
-    batch = sample(buffer, 1000)
-    assert set(batch.indices) == set(buffer.alive)
-    np.testing.assert_allclose(batch.probabilities, 1 / len(buffer))
-
-
-def test_the_human_is_counted_and_its_priorities_kept_apart():
-    buffer, _ = filled(4, -6)
-    assert buffer.human_count == 6
-    buffer.update_priorities(np.arange(10), np.array([2.0] * 4 + [3.0] * 6))
-    assert buffer.mean_priorities() == (2.0, 3.0)
 
 
 @pytest.mark.parametrize("separate", [False, True])

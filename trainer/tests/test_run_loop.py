@@ -71,20 +71,6 @@ def test_learning_waits_for_the_warmup_and_writes_each_updates_priorities_back(
     assert run.written == run.learned
 
 
-@pytest.mark.parametrize(("sampling", "betas"), [(True, [0.6, 0.4, 0.2]), (False, [0.0] * 3)])
-def test_beta_falls_to_zero_over_the_episodes(tmp_path, sampling, betas):
-    run = trained(tmp_path, episodes=4, importance_sampling=sampling, beta=0.8)
-    assert run.betas == pytest.approx(betas)
-
-
-def test_learning_rates_fall_once_an_episode(tmp_path):
-    learner = replace(CONFIG.learner, actor_learning_rate=2e-4, learning_rate_decay=0.9)
-    run = scripted_run(tmp_path, replace(CONFIG, episodes=2, learner=learner), length=3)
-    rates, group = [], run.learning.learner.actor_optimiser.param_groups[0]
-    run.train(lambda metrics: rates.append(group["lr"]))
-    assert rates == pytest.approx([2e-4 * 0.9, 2e-4 * 0.81 / 2])
-
-
 def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
     """With noise as large as its deviation, the actions show the deviation that was used."""
 
@@ -103,13 +89,6 @@ def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_netwo
     assert run.env.braked == [False, False, True, False, False, True, True]
 
 
-def test_the_human_watches_its_share_of_the_episodes(tmp_path):
-    run = trained(tmp_path, 2, human_steps=(2,), episodes=7, guided_share=1 / 3)
-    assert (run.guide.watched, run.guide.episode) == ([0, 0, 3, 3, 6, 6], 6)
-    guided, alone = [False, True], [False, False]
-    assert [stored.human for stored in run.stored] == (guided + 2 * alone) * 2 + guided
-
-
 @given(st.floats(0.0, 1.0), st.integers(1, 300))
 def test_the_share_of_watched_episodes_is_met_at_any_time(share, episodes):
     config = replace(CONFIG, guided_share=share)
@@ -126,14 +105,6 @@ def test_the_human_leaves_after_so_many_steps_or_episodes(tmp_path, until):
 def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
     run = trained(tmp_path, 2, episodes=100, steps=5)
     assert (run.episode, run.steps) == (3, 6)
-
-
-def test_validation_is_due_by_environment_steps(tmp_path):
-    run = scripted_run(tmp_path, replace(CONFIG, episodes=6, evaluate_every_steps=5), length=3)
-    judged: list[int] = []
-    run.validation.judge = lambda metrics, episode, due: judged.append(episode)
-    run.train()
-    assert judged == [2, 4, 5, 6]
 
 
 def bad_update(run):

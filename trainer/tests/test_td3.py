@@ -1,18 +1,16 @@
 """The learner: its networks, learning rates, shifted pictures and precision."""
 
 import itertools
-from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from hil_tests.testing.learners import SMALL, make_batch
 from trainer.learner import networks
-from trainer.learner.config import PHIL, LearnerConfig
-from trainer.learner.networks import FEATURES, Actor, Critic, Picture
+from trainer.learner.config import PHIL
+from trainer.learner.networks import FEATURES, Actor, Critic
 from trainer.learner.td3 import TD3Learner
 
 
@@ -93,33 +91,3 @@ def test_an_intel_is_faster_in_bfloat16_by_its_matrix_unit_only(processor, tiles
 def test_the_flags_of_other_processors_decide(processor, lines, faster):
     processor(*lines)
     assert networks.bfloat16_is_faster("cpu") == faster
-
-
-@pytest.mark.parametrize(
-    ("name", "flags", "autocast"),
-    [("float32", "avx512_bf16", False), ("bfloat16", "avx512_bf16", True),
-     ("bfloat16", "fma avx2", False)],
-)  # fmt: skip
-def test_every_picture_of_an_update_is_embedded_in_its_precision(
-    processor, monkeypatch, name, flags, autocast
-):
-    """Online and target networks alike, the Q advantage's too; acting is always float32."""
-    processor(f"flags : {flags}")
-    embed, reduced = Picture.forward, []
-
-    def spy(self, frames):
-        reduced.append((self, torch.is_autocast_enabled("cpu")))
-        with torch.autocast("cpu", enabled=False):  # whatever this processor can do
-            return embed(self, frames)
-
-    monkeypatch.setattr(Picture, "forward", spy)
-    batch = make_batch()
-    learner = TD3Learner(LearnerConfig(precision=name), PHIL, seed=0)
-    learner.update(batch)
-    targets = learner.target_critics
-    used = [learner.actor, *learner.critics.pair, learner.target_actor, *targets.pair]
-    wanted = Counter((network.picture, autocast) for network in [*used, targets.first])
-    assert Counter(reduced) == wanted
-    reduced.clear()
-    learner.actor.act(batch.frames[:1])
-    assert reduced == [(learner.actor.picture, False)]

@@ -1,6 +1,5 @@
 import json
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -17,21 +16,21 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bridge.outcomes import COLLISION
-from edge_runtime.cli import AGAIN_S, INTERRUPTED, run_cli
+from edge_runtime.cli import INTERRUPTED, run_cli
 from edge_runtime.util import UserError
 from hil_tests.testing.learners import same_weights
 from trainer import drivers
 from trainer.__main__ import main
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.human.guide import ASKED, Asking
-from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
+from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.pictures import write_learning_curve
 from trainer.tests.loops import rows_of
 from trainer.training import validation as validation_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory
-from trainer.training.config import CONFIG_FILE, RunConfig, make_config
+from trainer.training.config import CONFIG_FILE, RunConfig
 from trainer.training.metrics import NAMES, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.training.validation import Trials
@@ -148,13 +147,6 @@ def resume_and_compare(directory: Path, whole: Path, *extra: str) -> None:
     assert same_actors(*(each["learning"]["learner"]["actor"] for each in (a, b)))
 
 
-def test_a_run_of_so_many_steps_goes_on_as_one(tmp_path):
-    """By episodes it would explore as if it had hardly begun."""
-    train(replace(TINY, episodes=1, steps=1, evaluate_every_steps=0), tmp_path)
-    with pytest.raises(UserError, match="is a run of --steps 1: repeat that, or more"):
-        check_directory(tmp_path, replace(TINY, episodes=1, evaluate_every_steps=0), resume=True)
-
-
 def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fit_no_more(tmp_path):
     config = replace(TINY, episodes=1, evaluate_every_steps=0)
     train(config, tmp_path)
@@ -232,18 +224,6 @@ def test_who_quits_gets_one_more_episode_and_a_deadline_none_but_both_a_checkpoi
     assert (tmp_path / BEST_FILE).exists()
 
 
-def test_a_watched_run_that_is_told_twice_ends_at_once_with_its_recording(tmp_path):
-    shown = tmp_path / "run.rrd"
-    process = begin(tmp_path / "run", "--rerun", str(shown), episodes=1)
-    for _ in range(2):
-        process.send_signal(signal.SIGTERM)
-        time.sleep(2 * AGAIN_S)
-    process.communicate(timeout=60)
-    # Where the first one met an episode's end, all is closed already when the second one comes.
-    assert process.returncode in (INTERRUPTED, -signal.SIGTERM)
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["run.rrd"]
-
-
 def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path, monkeypatch):
     rewards = {1: 0.9, 2: 0.4, 3: 0.9, 4: 0.3}  # due after two and four
     episodes = iter([2, 4, 1, 2, 3, 4])
@@ -282,31 +262,6 @@ def test_validation_has_seeds_of_its_own_and_the_network_of_the_run():
     (drive,) = Trials(replace(TINY, evaluation_runs=1, latency="300ms")).drive(full)
     assert drive.seed == episode_seed(3, Purpose.VALIDATION, 0)
     assert (drive.actions[0], drive.actions[-1]) == ([0.0], [1.0])  # hands off before the first
-
-
-def test_the_printed_preset_is_the_papers():
-    said = asdict(make_config("printed", {"warmup_steps": 100_000}).learner)
-    assert said == asdict(replace(PRINTED_LEARNER, warmup_steps=100_000))
-    tables = {  # A5 and A6
-        "gamma": 0.95, "batch_size": 128, "critic_learning_rate": 2e-4, "policy_delay": 1,
-        "actor_learning_rate": 5e-4, "learning_rate_decay": 0.996, "tau": 1e-3,
-        "target_noise": 0.2, "exploration_bound": 1.0, "exploration_initial": 1.0,
-        "exploration_final": 0.05, "replay_capacity": 100_000, "alpha": 0.6, "beta": 1.0,
-        "priority_offset": 1e-3,
-    }  # fmt: skip
-    equations = {  # 17, 22 and 23; all that the paper does not have is off
-        "return_steps": 1, "penalty_on": "human", "split_loss": True, "frames": 2,
-        "exploration_correlation": 0.0, "learning_rate_final": 1.0, "action_bound": 0.0,
-        "critic_norm": False, "picture_shift": 0, "saturation_weight": 0.0,
-        "importance_sampling": False,
-    }  # fmt: skip
-    assert {name: said[name] for name in {**tables, **equations}} == {**tables, **equations}
-
-
-def test_a_pipe_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "pipe.pt")
-    with pytest.raises(UserError, match="no regular file"):
-        load_torch(tmp_path / "pipe.pt")
 
 
 @pytest.mark.parametrize(("averaged", "name"), [(True, "target_actor"), (False, "actor")])

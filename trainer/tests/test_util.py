@@ -28,20 +28,6 @@ def test_a_directory_that_nothing_came_into_goes_again(tmp_path):
     assert (tmp_path / "mine").is_dir()
 
 
-def test_a_directory_is_held_by_one_at_a_time(tmp_path):
-    path = tmp_path / "a" / "b"
-    for _ in range(2):
-        with util.held(path) as mine, util.held(path) as second:
-            assert (mine, second) == (True, False)
-
-
-def test_a_processor_that_no_list_describes_has_a_name(monkeypatch, tmp_path):
-    assert util.processor_model()
-    monkeypatch.setattr(util, "CPU_INFO", tmp_path / "none")
-    assert util.cpu_info() == []
-    assert util.processor_model()
-
-
 @pytest.mark.parametrize(
     ("name", "values", "limits"),
     [

@@ -1,6 +1,5 @@
 """The view of a training beside it, and of recorded sittings."""
 
-import math
 import threading
 import time
 from contextlib import nullcontext
@@ -11,12 +10,10 @@ from unittest.mock import Mock
 import msgspec
 import numpy as np
 import pytest
-import rerun as rr
 import torch
 from rerun.chunk import RrdReader
 
-from bridge.messages import SeenScene
-from bridge.rerun import HUMAN, POLICY, open_sink
+from bridge.rerun import HUMAN, POLICY
 from edge_runtime.cli import run_cli
 from hil_tests.testing.people import record, recorded_step
 from hil_tests.testing.viewers import in_place
@@ -120,17 +117,6 @@ def test_a_scene_that_fails_is_not_shown_and_ends_no_training(scene):
     assert handed[0].scene is None
 
 
-def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
-    handed: list[Any] = []
-    watcher, now_s = looking_on(handed), [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    for _ in range(1007):  # Two seconds at 500 steps a second.
-        watcher.record(*control_period())
-        now_s[0] += 0.002
-    assert [step.number for step in handed] == list(range(40, 1047))
-    assert sum(step.frames is not None for step in handed) == pytest.approx(20, abs=2)
-
-
 def step(number=0, action: Any = 0.0, **changes):
     return ShownStep(number, action, action, 3.0, None)._replace(**changes)
 
@@ -226,31 +212,6 @@ def test_a_sitting_is_shown_whole(tmp_path):
     assert "/loss/critic" not in {path for path, rows in found.items() if rows}
 
 
-def test_each_of_several_actions_is_drawn(tmp_path):
-    out = tmp_path / "two.rrd"
-    with open_sink(str(out), "test", view.make_blueprint(None, ())) as recording:
-        log = view.TrainingLog(recording, ())
-        for number in range(3):
-            log.draw(step(number, (0.25, number / 10), policy_action=(0.5, -0.5)))
-        log.draw_steps()
-    found = values_in(out)
-    for path, expected in (
-        ("/action/policy", 3 * [(0.5, -0.5)]),
-        ("/action/applied", [(0.25, 0.0), (0.25, 0.1), (0.25, 0.2)]),
-    ):
-        assert [value for _, value in found[path]] == [pytest.approx(row) for row in expected]
-
-
-def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
-    for scenario in ("left_turn", "left_turn", "congestion"):
-        drive(tmp_path / "drives", seeds=(4,), steps=6, scenario=scenario)
-    out = tmp_path / "both.rrd"
-    assert main(["view", str(tmp_path / "drives"), "--save", str(out)]) == 0
-    chunks = [c for c in RrdReader(str(out)).stream().to_chunks() if c.entity_path == "/road/roads"]
-    drawn = [step for chunk in chunks for step in chunk.to_record_batch().to_pydict()["step"]]
-    assert sorted(drawn) == [0, 12]
-
-
 @pytest.mark.parametrize("change", [{"seen": BLACK}, {"scenario": "mine/Dock-v0"}])
 def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_path, change):
     steps = list(read_steps(drive(tmp_path)))
@@ -261,21 +222,3 @@ def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_p
     assert scenes == [False] * 15 + [True] * 15
     roads = [entry.has_road for entry in entries if isinstance(entry, view.ShownEpisode)]
     assert roads == [False, True]
-
-
-def test_a_scene_that_is_no_longer_known_is_cleared(monkeypatch):
-    drawn: list[Any] = []
-    monkeypatch.setattr(rr.RecordingStream, "log", lambda _, *what, **__: drawn.append(what))
-    log, frames = view.TrainingLog(rr.RecordingStream("t"), []), np.zeros((2, 45, 80), np.uint8)
-    for scene in (None, SeenScene(), None, np.zeros((4, 4, 3), np.uint8)):
-        log.draw(step(frames=frames, scene=scene))
-    cleared = [type(what[1]) for what in drawn if what[0] == "road"]
-    assert cleared == [rr.Clear, rr.Clear, rr.Clear, rr.Image]
-
-
-def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
-    entries: list[Any] = list(view.sitting_entries([drive(tmp_path, (4,), policy=None)]))
-    *steps, end = entries
-    assert all(math.isnan(step.policy_action) for step in steps)
-    found = end.metrics
-    assert (found.human_steps, found.interventions, found.outcome) == (5, 1, "restarted")

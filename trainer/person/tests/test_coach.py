@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from trainer.person.coach import Coach, SittingEpisode, advise, said, typical_curve
+from trainer.person.coach import Coach, SittingEpisode, advise, said
 
 FINE = SittingEpisode(0, "goal", 0.0, 0)
 HELPED = SittingEpisode(0, "goal", 2.0, 1, since_takeover_s=3.0)
@@ -51,14 +51,6 @@ def test_what_was_given_stands_beside_what_is_typical():
     both = "after 41 s of you, after 28 s of a scripted human"
     assert said(cost, [(20.0, 0.0), (41.4, 0.9)], there) == f"{given} The policy alone: 90% {both}."
     assert said(cost, [(0.0, 0.9)], []) == f"{given} The policy alone: 90% after 0 s of you."
-
-
-def test_the_shipped_curves_rise_in_both_scenarios_and_no_other_has_any():
-    for scenario in ("left_turn", "congestion"):
-        curve = typical_curve(scenario, "phil_td3")
-        assert curve == sorted(curve, key=lambda point: point[0])
-        assert curve[-1][1] > 0.9 > curve[0][1]
-    assert typical_curve("left_turn", "per_td3") == typical_curve("module:Other", "phil_td3") == []
 
 
 def test_a_run_that_goes_on_is_remembered():

@@ -1,5 +1,4 @@
 import json
-import shutil
 import signal
 from itertools import repeat
 from pathlib import Path
@@ -128,26 +127,6 @@ def test_the_policy_is_validated_behind_the_persons_back_and_kept(sit_down):
     assert sit_down(again, *TRAIN_HERE, *quick, "--resume")[0] == 0
     assert again.views[0].coach.curve[0][1] == shown.curve[0][1]
     assert again.views[0].coach.episodes[-1].outcome == STOPPED
-
-
-def test_a_kill_takes_away_no_row_of_what_the_person_gave(sit_down):
-    class Copying(Discarding):
-        def show(self, view):
-            super().show(view)
-            if view.step == 3 and not first.exists():
-                shutil.copy(checkpoint, first)
-
-    checkpoint, first = Path("run") / CHECKPOINT_FILE, Path("first.pt")
-    command = (*TRAIN_HERE, "--set", "evaluate_every_steps=0")
-    assert sit_down(Copying([0], 2), *command)[0] == 0
-    before = read_metrics(Path("run"))
-    shutil.move(first, checkpoint)  # As a kill in the second episode leaves it.
-    assert sit_down(Puppet([LET_GO] * 3, then=QUIT), *command, "--resume")[0] == 0
-    *kept, last = read_metrics(Path("run"))
-    assert kept == before
-    assert float(before[1]["total_human_s"]) > 0.0
-    assert float(last["total_human_s"]) >= float(before[1]["total_human_s"])
-    assert int(last["total_steps"]) > int(before[1]["total_steps"])
 
 
 def demonstrated(index: int):

@@ -17,14 +17,9 @@ import numpy as np
 
 from edge_runtime.util import UserError
 from hil_tests.testing.browser import (
-    PERSON_DRIVES,
-    POLICY_DRIVES,
     address,
-    open_browser,
     page,
-    quit_sitting,
     say,
-    until,
 )
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.person.interface import vector
@@ -141,27 +136,3 @@ async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_p
     human = sum(step.human for step in killed)
     assert f"{len(killed)} recorded steps after the checkpoint, {human} of them yours" in errors
     assert len(all_in_replay(run_dir)) > len(killed)
-
-
-APPLIED = "document.querySelector('.bar.applied output').textContent"
-
-
-def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path, runner):
-    async def sit(url):
-        async with open_browser() as shown:
-            await shown.goto(url)
-            await until(shown, POLICY_DRIVES)
-            await shown.keyboard.down("ArrowDown")
-            await until(shown, f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
-            await shown.keyboard.up("ArrowDown")
-            await until(shown, POLICY_DRIVES)
-            await quit_sitting(shown)
-
-    with closing(Training(tmp_path / "run", "--set", "warmup_steps=8")) as training:
-        runner.run(sit(address(training.process)))
-        status, errors = training.end()
-    assert status == 0, errors
-    steps = all_in_replay(training.run_dir)
-    assert vector(steps[first_of_the_persons(steps)].human_action)[0] < 0.0
-    assert -1.0 in [step.action for step in steps if step.human]
-    assert steps[-1].outcome

@@ -1,13 +1,9 @@
 """A validation beside a person, and what a kill had taken from a run with one."""
 
-import math
-import subprocess
-import sys
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from msgspec import structs
 
 from bridge.outcomes import DISCARDED
@@ -18,7 +14,7 @@ from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
 from trainer.person.recording import DIRECTORY, packed
-from trainer.person.validation import BehindTheScenes, Candidate, PersonValidation
+from trainer.person.validation import BehindTheScenes, Candidate
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
@@ -35,43 +31,6 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
         assert behind.take() is None
     behind.close()
     assert capsys.readouterr().err.count("no validation beside the drive") == 1
-
-
-SCRIPT = """
-from trainer.learner.networks import Actor
-from trainer.person.validation import BehindTheScenes, Candidate
-from trainer.training.config import RunConfig
-
-print(f"this is {__name__}")
-behind = BehindTheScenes(RunConfig(evaluation_runs=1))
-behind.begin(Candidate(Actor(), 1, 0.0, {}))
-while behind.busy:
-    pass
-print(f"{len(behind.take()[1])} drive")
-behind.close()
-"""
-
-
-def test_a_script_that_trains_is_not_run_again_by_its_validation(tmp_path):
-    path = tmp_path / "script.py"
-    path.write_text(SCRIPT)
-    ran = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, timeout=100)
-    assert (ran.stdout, ran.stderr) == ("this is __main__\n1 drive\n", "")
-
-
-@pytest.mark.parametrize(
-    ("added", "loss", "said"),
-    [
-        (0, math.nan, "not learning yet (0 of 256 steps)"),
-        (255, math.nan, "not learning yet (255 of 256 steps)"),
-        (256, math.nan, "critic loss –"),
-        (900, 0.1239, "critic loss 0.124"),
-    ],
-)
-def test_before_it_learns_it_says_so_instead_of_nan(added, loss, said):
-    learning = SimpleNamespace(added=added)
-    validation: Any = SimpleNamespace(config=RunConfig(), learning=learning)
-    assert PersonValidation.learned(validation, loss) == said
 
 
 def episode(first: int, length: int, human: range, **last: Any):

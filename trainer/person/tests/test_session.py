@@ -9,12 +9,9 @@ from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
 from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 from trainer.drivers import constant_driver
 from trainer.person.drive import drive
-from trainer.person.interface import Reading
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import Pacer
 from trainer.person.takeover import MAX_SLEW
-from trainer.scenarios.environment import DrivingEnv
-from trainer.scenarios.picture import draw_scene
 
 
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):
@@ -46,12 +43,6 @@ def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_pat
     assert sitting.cost == {"human_s": pytest.approx(given), "takeovers": 1, "failures": 0}
 
 
-def test_a_wheel_takes_over_by_moving(tmp_path):
-    turned = Reading(-1.0, by_moving=True)
-    _, steps, *_ = drive_and_read(tmp_path, [LET_GO, turned, turned])
-    assert [step.human for step in steps[:3]] == [False, True, True]
-
-
 def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):
     readings = [LET_GO, *[hold(1.0)] * 3, *[hold(-1.0)] * 8]
     _, steps, *_ = drive_and_read(tmp_path, readings, policy=None)
@@ -59,13 +50,6 @@ def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):
     assert all(s.human and s.control == "human" and s.policy_action is None for s in steps)
     assert [s.first for s in steps[:3]] == [True, False, False]
     assert steps[3].speed_mps > max(steps[1].speed_mps, steps[11].speed_mps)
-
-
-def test_a_scene_may_leave_out_what_it_does_not_have(tmp_path, monkeypatch):
-    car = {"x": 1.0, "y": 0.0, "heading_rad": 0.0, "length_m": 4.0, "width_m": 2.0}
-    monkeypatch.setattr(DrivingEnv, "scene", lambda _: {"vehicles": [car]})
-    (view, *_) = drive_and_read(tmp_path, [LET_GO])[2]
-    assert len(np.unique(draw_scene(view.scene))) > 3
 
 
 def test_quitting_ends_the_episode_and_keeps_its_last_step(tmp_path):
@@ -103,12 +87,6 @@ def test_what_has_just_ended_can_still_be_thrown_away(tmp_path):
     assert last is [step for step in steps if step.episode == 0][-1]
     assert last.terminated or last.truncated
     assert [step.index for step in steps] == list(range(len(steps)))
-
-
-@pytest.mark.parametrize("wished", ["discard", "restart"])
-def test_what_was_wished_before_an_episode_does_not_end_it(tmp_path, wished):
-    outcomes, *_ = drive_and_read(tmp_path, [wish(wished), *[LET_GO] * 4], presence=[False])
-    assert dict(outcomes) == {STOPPED: 1}
 
 
 def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):
