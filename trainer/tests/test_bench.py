@@ -40,24 +40,6 @@ def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkey
     assert bars == {""}
 
 
-def test_figures_are_of_medians_and_the_table_says_which_bars_are_missed():
-    times = {bench.OURS: [1.0, 20.0, 90.0], bench.SB3: [40.0, 110.0, 115.0]}
-    learner = bench.figures(times, "ms_per_update", float)
-    peers = {bench.SB3: {"ms_per_update": 110.0, "ratio": 5.5}}
-    assert learner == {"ms_per_update": 20.0, "peers": peers}
-    steps_per_s = bench.figures({bench.OURS: [0.001]}, "steps_per_s", lambda it: 1.0 / it)
-    report = {
-        "learner": {"batch_size": 128, **learner},
-        "environment": {"left_turn": steps_per_s},
-        "training": {"s_per_10k_steps": dict.fromkeys(("total", *bench.PARTS), 1.0)},
-    }
-    update, steps, *_ = bench.rows(report)
-    assert update[1:] == ("20.0", "110.0  Stable-Baselines3 TD3", "5.50", "≥ 5  met")
-    assert steps == ("left_turn with observation, steps/s", "1000.0")
-    learner["peers"][bench.SB3]["ratio"] = 4.9
-    assert next(bench.rows(report))[-1] == "≥ 5  MISSED"
-
-
 def test_stable_baselines3_learns_from_our_experience_with_the_papers_networks():
     pytest.importorskip("stable_baselines3")
     model = bench.make_sb3_model(bench.gather(20))

@@ -3,7 +3,6 @@ import shlex
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -21,42 +20,30 @@ CONGESTION = POLICY.replace("left_turn", "congestion")
 
 WRONG = [
     *(f"train --out {{tmp}}/x {words}" for words in (
-        "--scenario moon", "--algorithm magic", "--human mouse", "--human {tmp}/nobody",
-        "--episodes 0", "--threads 1025", "--max-minutes nan", "--resume", "--set no_such=1",
-        "--set gamma=nan", "--set replay_capacity=99999999999999",
+        "--scenario moon", "--algorithm magic", "--human {tmp}/nobody", "--max-minutes nan",
+        "--resume", "--set gamma=nan", "--set replay_capacity=99999999999999",
     )),
     *(f"evaluate {words}" for words in (
-        "{tmp}/nothing.onnx", "{tmp}/nothing", "{tmp}/file", "expert --runs -1",
-        "expert --condition rain", "expert --out /dev/null/r.json",
+        "{tmp}/nothing.onnx", "{tmp}/file", "expert --runs -1", "expert --out /dev/null/r.json",
     )),
-    *(f"export {{tmp}} --out {{tmp}}/{words}" for words in (
-        "p.onnx", "p.txt",
-    )),
-    "train --out {tmp}/file/x", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
-    "plot {tmp} --out {tmp}/c.pdf", "view {tmp} --save ''",
-    "plot {tmp} --out /dev/null/p.png", "human --out {tmp}/file", "bench --threads -1",
+    "export {tmp} --out {tmp}/p.txt", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
+    "train --out {tmp}/file/x", "plot {tmp} --out /dev/null/p.png", "human --out {tmp}/file",
     "bench --out /dev/null/b.json", "experiment status --results ''",
 ]  # fmt: skip
 
 
 TOLD = [
-    *((f"evaluate constant:{action}", "expected an action from -1 to 1")
-      for action in ("fast", "nan", "1.5")),
-    ("train --out x --set printed_reward=maybe", "expected true or false, got 'maybe'"),
+    ("evaluate constant:nan", "expected an action from -1 to 1"),
     ("train --out x --set batch_size=1.5", "expected a whole number, got '1.5'"),
     ("train --out x --set bach_size=4", "did you mean batch_size?"),
     ("trian", "invalid choice: 'trian'"),
     ("plot x --out a.jpg", "a picture is a .png"),
-    ("evaluate none", "none is no policy"),
     ("plot one two --out c.png", "one holds no metrics"),
     ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
-    ("train --out x --period 0", "argument --period"),
-    ("experiment fig7 --seeds 0", "--seeds"),
     ("experiment report status", "stand alone"),
     ("experiment fig7 --ray auto --device cuda", "on processors"),
     ("experiment guidance --ray auto", "lacks hill, racetrack"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
-    ("experiment report --results nowhere", "no results"),
 ]  # fmt: skip
 """What would be right is said, too."""
 
@@ -69,13 +56,6 @@ def test_bad_input_gets_one_line_and_status_2(words, said, capsys, tmp_path, mon
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]
 
 
-@pytest.mark.parametrize("command", ["experiment fig7", "train --out x"])
-def test_without_a_gpu_no_command_computes_on_one(command, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "no CUDA device" in refusal(capsys, *command.split(), "--device", "cuda")
-
-
 def test_evaluate_reports_what_the_contract_asks_for(capsys):
     words = "evaluate expert --scenario congestion --condition variant --runs 2 --seed 5"
     status, out, _ = call(capsys, *words.split())
@@ -84,9 +64,6 @@ def test_evaluate_reports_what_the_contract_asks_for(capsys):
     wanted = {"scenario": "congestion", "condition": "variant", "episodes": 2, "seed": 5,
               "success_rate": 1.0, "collision_rate": 0.0, "policy_id": "expert"}  # fmt: skip
     assert wanted.items() <= report.items()
-    for name in ("surviving_distance_m", "episode_reward", "episode_time_s",
-                 "lateral_acceleration_mps2", "longitudinal_acceleration_mps2"):  # fmt: skip
-        assert set(report[name]) == {"mean", "std"}
     assert report["surviving_distance_m"]["mean"] == pytest.approx(80.2, abs=0.4)
 
 
@@ -135,26 +112,14 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
         assert said in refusal(capsys, *words.split())
 
 
-def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeypatch):
-    too_much = Mock(side_effect=MemoryError("Unable to allocate 3.4 TiB"))
-    monkeypatch.setattr("trainer.learner.replay.np.empty", too_much)
-    err = refusal(capsys, "train", "--out", str(tmp_path / "x"), "--episodes", "1")
-    assert "no memory for a replay buffer of 100000 transitions: --set replay_capacity=N" in err
-    assert list(tmp_path.iterdir()) == []
-
-
 ONES = {"picture.trunk.conv1.weight": torch.ones(3), "head.output.bias": torch.ones(1)}
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "best_actor.pt", "human_model.pt"])
-@pytest.mark.parametrize(
-    "state", [[1, 2], torch.ones(3), {"actor": ONES}, {"something": 1, "scenario": 3}]
-)
+@pytest.mark.parametrize("state", [[1, 2], {"actor": ONES}, {"something": 1, "scenario": 3}])
 def test_a_foreign_torch_file_is_said_in_one_line(name, state, capsys, tmp_path):
     save_torch(tmp_path / name, state)
-    said = refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
-    assert f"{name} is not a" in said
-    assert "of this project" in said
+    assert f"{name} is not a" in refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
 
 
 @pytest.fixture
@@ -182,11 +147,6 @@ def test_changed_settings_are_named_as_they_are_given(config):
         "was trained with --seed 3 (now 0), --human web (now expert), "
         "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
     ) in refused(values, *OTHERS.split())
-    assert "averaged_actor=True (now False)" in refused(
-        values, "--preset", "printed", "--human", "web"
-    )
-    given = GIVEN.replace("web", "expert").split()
-    assert "is not a checkpoint of this project" in refused({**values, "human": "expert"}, *given)
     # What came later had its default.
     del values["learner"]["gamma"], values["averaged_actor"], values["period_s"]
     err = refused(values, *GIVEN.split())
@@ -202,20 +162,7 @@ def test_no_file_of_a_run_decides_what_is_imported(config, tmp_path, monkeypatch
         assert changed in refused({**values, "human": "expert", name: "planted:Any"})
 
 
-@pytest.mark.parametrize(
-    "spoilt", ["[]", "{", "null", {"learner": 3}, {"episodes": None}, {"episodes": "many"}]
-)
+@pytest.mark.parametrize("spoilt", ["[]", "{", {"learner": 3}, {"episodes": "many"}])
 def test_a_config_that_is_none_is_one_line(spoilt, config):
     values, refused = config
     refused({**values, **spoilt} if isinstance(spoilt, dict) else spoilt, *GIVEN.split())
-
-
-def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_path, capsys):
-    words = "human --max-minutes 1e-6 --updates-per-episode 1 --refining-updates 100 --out"
-    status, _, said = call(capsys, *words.split(), str(tmp_path))
-    assert status == 0
-    report = json.loads((tmp_path / "human.json").read_text())
-    assert (report["episodes"], report["config"]["episodes"]) == (1, 50)
-    assert "the time is over after 1 of 50 episodes" in said
-    assert "refining: 2/2" in said  # 100 steps are for 50 episodes
-    assert (tmp_path / "human_model.pt").is_file()

@@ -18,20 +18,6 @@ CENTRED = CongestionConfig(
 )
 
 
-def test_straight_from_mid_lane_reaches_the_goal_behind_the_car_ahead():
-    env = CongestionEnv(CENTRED)
-    rewards, info = drive(env, STRAIGHT)
-    assert info["outcome"] == "goal"
-    assert info["distance_m"] == pytest.approx(80.0, abs=0.61)
-    assert rewards[:-1] == [0.0] * (len(rewards) - 1)
-    assert rewards[-1] == 10.0
-    leader, follower = (car for car in env.traffic if car.lane_index[2] == 1)
-    assert follower.position[0] < env.ego.position[0]
-    gap_m = leader.position[0] - env.ego.position[0] - 2.5 - 0.5 * leader.LENGTH
-    assert 2.0 < gap_m < 12.0
-    assert env.ego.speed == pytest.approx(leader.speed, abs=0.3)
-
-
 @pytest.mark.parametrize(("action", "sign"), [(RIGHT, 1.0), (LEFT, -1.0)])
 def test_negative_steers_left_and_full_action_is_lambda(action, sign):
     env = CongestionEnv(CENTRED)

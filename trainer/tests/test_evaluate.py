@@ -22,18 +22,6 @@ from trainer.util import save_torch
 POLICY = Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx"
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_an_actor_is_loaded_with_the_frames_that_it_was_trained_on(tmp_path, frames):
-    actor = Actor(frames=frames)
-    label = {"scenario": "congestion", "algorithm": "phil_td3", "seed": 0, "episode": 3}
-    save_torch(tmp_path / BEST_FILE, {**label, "actor": actor.state_dict()})
-    loaded, about = load_actor(tmp_path)
-    assert (loaded.picture.frames, about) == (frames, label)
-    driver, policy_id = load_driver(str(tmp_path), make_environment("congestion"))
-    assert policy_id.startswith("run:")
-    assert driver.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
-
-
 @pytest.mark.parametrize("name", [BEST_FILE, MODEL_FILE])
 def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name):
     (tmp_path / "planted.py").write_text("raise SystemExit('imported')")

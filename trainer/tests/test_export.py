@@ -81,11 +81,3 @@ def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, t
     # An unsigned export removes the signature of an older file.
     write_policy(exported.model, path, None)
     assert not (tmp_path / "policy.onnx.sig").exists()
-
-
-def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
-    path = tmp_path / "one.onnx"
-    write_policy(export_policy(make_actor(frames=1), LABEL, {}).model, path, None)
-    policy, frames = load_policy(path, allow_unsigned=True), real_observations("left_turn", 30)[-1]
-    past = np.stack([np.zeros_like(frames[0]), frames[1]])
-    assert policy.act({"frames": frames}) == policy.act({"frames": past})

@@ -12,27 +12,8 @@ from trainer.human.config import HumanModelConfig
 from trainer.human.dagger import imitate
 from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, load_human_model
-from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-
-
-def test_the_model_starts_as_an_untrained_actor_and_learns_what_it_is_shown():
-    config = HumanModelConfig(batch_size=16, learning_rate=1e-3)
-    model = HumanModel(config, seed=3)
-    assert np.isnan(model.learn(5))
-    with torch.random.fork_rng():
-        torch.manual_seed(3)
-        untrained = Actor(frames=1)
-    assert all(map(torch.equal, model.actor.parameters(), untrained.parameters()))
-    random = np.random.default_rng(0)
-    dark, bright = (random.integers(at, at + 50, (2, 45, 80)).astype(np.uint8) for at in (0, 200))
-    for _ in range(20):
-        model.add(bright, FULL)
-        model.add(dark, BRAKE)
-    assert model.learn(60) < 0.05
-    assert model.act(bright)[0] > 0.7
-    assert model.act(dark)[0] < -0.7
 
 
 @pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])

@@ -1,7 +1,6 @@
 """The compiled kernel against torch in double precision, and how it is built."""
 
 import platform
-import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -59,7 +58,7 @@ def _check(frames, parameters):
 
 
 @needs_kernel
-@pytest.mark.parametrize("batch", [1, 2, 7, 8, 9, 33])
+@pytest.mark.parametrize("batch", [1, 7, 33])
 @pytest.mark.parametrize("frames", [slice(0, 2), slice(1, 3), slice(2, 3)])
 def test_features_and_gradients_are_those_of_torch(batch, frames):
     pictures = _pictures(batch)[:, frames]
@@ -67,13 +66,7 @@ def test_features_and_gradients_are_those_of_torch(batch, frames):
 
 
 @needs_kernel
-def test_any_memory_layout_will_do():
-    pictures = _pictures(8)[::2, [2, 0]].transpose(2, 3).contiguous().transpose(2, 3)
-    _check(pictures, [each.detach().contiguous().requires_grad_() for each in _parameters(2)])
-
-
-@needs_kernel
-@pytest.mark.parametrize("level", [0, 1, 128, 255])
+@pytest.mark.parametrize("level", [0, 128])
 def test_ties_go_to_the_first_position_as_in_torch_in_reduced_precision_too(level):
     """Everywhere the four candidates of a pooling are equal."""
     pictures, parameters = torch.full((3, 2, 45, 80), level, dtype=torch.uint8), _parameters(2)
@@ -120,13 +113,6 @@ def test_threads_change_nothing_and_reduced_precision_little(frames, reduced, on
         assert (gradient - exact).norm() < 0.2 * exact.norm()
 
 
-def test_other_pictures_take_the_torch_path():
-    assert trunk_features(_pictures(0)[:, :2], *_parameters(2)).shape == (0, 1792)
-    parameters = _parameters(3)
-    features = trunk_features(_pictures(2), *parameters)
-    assert torch.equal(features, kernel._torch_features(_pictures(2), *parameters))
-
-
 @pytest.fixture
 def anew(tmp_path, monkeypatch):
     """Has this process look for its kernel once more: in another environment, with a new cache."""
@@ -142,15 +128,7 @@ def anew(tmp_path, monkeypatch):
     kernel.load.cache_clear()
 
 
-@pytest.fixture
-def small_source(tmp_path, monkeypatch):
-    """In the kernel's place: it compiles in a moment."""
-    source = 'extern "C" void trunk_forward() {}\nextern "C" void trunk_backward() {}\n'
-    (tmp_path / "trunk.cpp").write_text(source)
-    monkeypatch.setattr(kernel, "__file__", str(tmp_path / "kernel.py"))
-
-
-@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", '"c++', None])
+@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler", None])
 def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, anew, compiler, caplog):
     if compiler is None:
         (tmp_path / "cache").write_text("in the way of a directory")
@@ -168,38 +146,14 @@ def test_without_a_compiler_or_a_cache_torch_does_the_work(tmp_path, anew, compi
 
 @needs_kernel
 @needs_x86
-@pytest.mark.parametrize("flags", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
-def test_processors_with_shorter_vectors_compute_the_same(anew, flags, caplog):
+def test_processors_with_shorter_vectors_compute_the_same(anew, caplog):
     """Also: without bfloat16 instructions, reduced precision is single precision."""
-    assert anew(CXX=f"c++ {flags}") is not None
+    assert anew(CXX="c++ -mno-avx512f -mno-avx") is not None
     pictures, parameters = _pictures(5)[:, :2], _parameters(2)
     _check(pictures, parameters)
     single, reduced = (_gradients(pictures, parameters, _slopes(5), it) for it in (False, True))
     assert all(map(torch.equal, (single[0], *single[1]), (reduced[0], *reduced[1])))
     assert caplog.records == []
-
-
-WITHOUT_OPENMP = """\
-#!/bin/sh
-case "$*" in *-fopenmp*) echo "{says}" >&2; exit 1;; esac
-exec {compiler} "$@"
-"""
-
-
-@needs_kernel
-@pytest.mark.parametrize(
-    ("says", "is_kept"),
-    [("error: unsupported option '-fopenmp'", True), ("c++: fatal error: Killed", False)],
-)
-def test_only_for_want_of_openmp_a_kernel_of_one_thread_is_kept(
-    tmp_path, anew, small_source, says, is_kept
-):
-    """What fails for another reason may pass the next time."""
-    compiler = tmp_path / "compiler"
-    compiler.write_text(WITHOUT_OPENMP.format(says=says, compiler=shlex.join(kernel._compiler())))
-    compiler.chmod(0o700)
-    assert (anew(CXX=str(compiler)) is not None) == is_kept
-    assert bool(list(tmp_path.rglob("*.so"))) == is_kept
 
 
 @needs_kernel

@@ -55,20 +55,6 @@ def noting(threads, function):
     return noted
 
 
-@pytest.mark.parametrize("learning", ["rlpd_td3"], indirect=True)
-def test_several_updates_in_a_step_are_of_several_batches_and_all_their_priorities_come_back(
-    learning,
-):
-    learning.replay.update_priorities = Mock()
-    learning.begin(0.0)
-    learning.finish()
-    drawn = [call.args[0].indices.tolist() for call in learning.learner.update.call_args_list]
-    assert len(drawn) == 2
-    assert drawn[0] != drawn[1]
-    written = learning.replay.update_priorities.call_args_list
-    assert [call.args[0].tolist() for call in written] == drawn
-
-
 def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
     threads: list[threading.Thread] = []
     learner = learning.learner

@@ -6,7 +6,6 @@ import pytest
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from hil_tests.testing.people import BRAKE, FULL, NOTHING, drive, episode
 from trainer.drivers import constant_driver
-from trainer.environments import make_environment
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
@@ -26,31 +25,6 @@ def test_the_brake_stops_the_car_and_does_not_reverse_it():
     accelerations_mps2 = [each["longitudinal_acceleration_mps2"] for each in infos[1:]]
     motion = np.diff([each["speed_mps"] for each in infos]) / 0.1
     assert accelerations_mps2 == pytest.approx(motion)
-
-
-def test_the_printed_reward_is_eq_31_without_a_weight():
-    config = replace(EMPTY_ROAD, max_steps=50)
-    own, printed = (
-        drive(LeftTurnEnv(each), BRAKE)[0] for each in (config, config.with_printed_reward())
-    )
-    assert printed == pytest.approx(np.array(own) / config.speed_weight)
-    assert make_environment("left_turn", printed_reward=True).config.speed_weight == 1.0
-
-
-def test_the_pedal_for_a_speed_gives_the_car_that_speed_and_makes_up_later_for_what_is_missed():
-    env = LeftTurnEnv(EMPTY_ROAD)
-    env.reset(seed=0, options={"standing": True})
-
-    def drive_at(speed_mps, steps=1):
-        for _ in range(steps):
-            env.step(np.array([env.pedal_for_speed(speed_mps)], np.float32))
-        assert env.ego.speed == pytest.approx(speed_mps, abs=1e-6)
-
-    for speed_mps in (0.1, 0.4, 0.7, 0.55, 0.2, 0.2, 0.0):
-        drive_at(speed_mps)
-    assert env.pedal_for_speed(1.0) == 1.0  # 0.3 m/s a step is all that the engine gives
-    drive_at(1.0, steps=4)
-    assert env.pedal_for_speed(0.0) == -1.0
 
 
 ONE_CAR = LeftTurnConfig(traffic_cars=1, traffic_speed_mps=(5.0, 5.0), ego_speed_mps=(4.0, 4.0))
@@ -79,16 +53,6 @@ def test_foresight_agrees_with_what_then_happens():
     assert agreed >= 37
 
 
-@pytest.mark.parametrize(
-    ("first_car_m", "length_m", "clear"),
-    [(9.0, 5.0, False), (60.0, 5.0, True), (60.0, 90.0, False)],
-)
-def test_a_near_car_blocks_and_a_far_one_does_not_unless_it_is_long(first_car_m, length_m, clear):
-    env = environment(first_car_m=(first_car_m, first_car_m))
-    env.traffic[0].LENGTH = length_m
-    assert LeftTurnHuman(env).crossing.clear(6.0, 1.5, LeftTurnHuman.GO) is clear
-
-
 def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
     (env, trigger), steps = triggered(first_car_m=(9.0, 9.0)), 0
     while (reason := trigger.wants_control(NOTHING)) is None:
@@ -101,16 +65,6 @@ def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
         env.step(BRAKE)
     assert env.ego.speed == 0.0
     assert env.distance_m < LeftTurnHuman.STOP_BY_M
-
-
-def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
-    env, trigger = triggered(first_car_m=(9.0, 9.0))
-    env.traffic[0].position[0] = -2.0
-    env.ego.speed = 0.0
-    for place_m, stays in ((7.8, None), (8.1, "collision")):
-        env.distance_m = place_m
-        assert trigger.wants_control(BRAKE) == stays
-        assert trigger.wants_control(np.array([0.1], np.float32)) == "collision"
 
 
 @pytest.mark.parametrize(

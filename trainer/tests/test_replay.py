@@ -169,15 +169,6 @@ def test_half_of_what_is_drawn_is_the_humans_where_there_are_both(steps, share):
     np.testing.assert_allclose(counts / 4000, batch.probabilities[where], atol=0.002)
 
 
-@pytest.mark.parametrize(("separate", "expected"), [(False, [9.0, 9.0]), (True, [2.0, 9.0])])
-def test_what_is_new_gets_the_highest_priority_of_its_own_buffer(separate, expected):
-    buffer, source = filled(5, -5, separate=separate)
-    buffer.update_priorities(np.arange(10), np.array([1.0] * 4 + [2.0] + [9.0] * 5))
-    source.episode(1)
-    source.episode(1, human=True)
-    assert buffer._priorities[10:12].tolist() == expected
-
-
 def test_a_slot_that_changes_hands_leaves_the_other_buffer():
     buffer, _ = filled(-10, 10, capacity=10, separate=True)
     assert buffer.human_count == 0

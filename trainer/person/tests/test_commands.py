@@ -25,35 +25,20 @@ MINE = "{tmp}/mine"
 SHIPPED = str(Path(__file__).parents[3] / "results/policies/left_turn.onnx")
 WIRE = str(Path(__file__).parents[3] / "hil_tests/recordings/left_turn.mcap")
 WRONG = [
-    (DRIVE, ("--human", "telepathy"), "invalid choice"),
-    (DRIVE, ("--human", "web", "--port", "70000"), "not a whole number from 0 to 65535"),
     (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
-    (DRIVE, ("--speed", "0"), "not a number from 0.01 to 1000"),
-    (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
-    (
-        DRIVE,
-        ("--scenario", "congestion", "--policy", SHIPPED),
-        "asks for congestion: ",
-    ),
+    (DRIVE, ("--scenario", "congestion", "--policy", SHIPPED), "asks for congestion: "),
     (DRIVE, ("--at", "3"), "--from F.mcap"),
     (DRIVE, ("--from", WIRE, "--episode", "1", "--at", "99"), "fork before"),
     (DRIVE, ("--from", WIRE, "--episode", "1", "--scenario", "congestion"), "was driven in"),
     (DRIVE, ("--from", "{tmp}/file"), "is no MCAP recording"),
-    (("drive", "--out", "{tmp}/file"), (), "Not a directory"),
     (TRAIN, ("--human", "web", "--algorithm", "per_td3"), "takes no guidance"),
     (TRAIN, ("--human", "web", "--set", "guided_share=0.5"), "watches every episode"),
-    (TRAIN, ("--human", "web", "--set", "poor_guidance_share=0.3"), "not replaced"),
-    (TRAIN, ("--human", "web", "--algorithm", "phil_gated"), "no person yet"),
     (TRAIN, ("--port", "80"), "--port means nothing with --human expert"),
-    (TRAIN, ("--human", "web", "--resume"), "no checkpoint"),
-    (HUMAN, ("{tmp}",), "no recording in"),
     (HUMAN, ("{tmp}/file",), "is no MCAP recording"),
     (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows one"),
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
-    (HUMAN, (MINE, "--label-every-step"), "asks the scripted expert"),
     (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is no recording of a sitting"),
-    (("view", "{tmp}/none"), ("--save", "{tmp}/v.rrd"), "no recording in"),
     (("view", MINE), (), "no display for a window here"),
     (TRAIN, ("--rerun", "window"), "neither spawn nor serve"),
     (TRAIN, ("--rerun", "spawn"), "no display"),
@@ -86,12 +71,9 @@ def test_whoever_quits_before_the_first_episode_has_lost_nothing(sit_down):
     assert sit_down(nobody, *TRAIN_HERE, "--resume")[0] == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch, number):
-    ours = signal.signal(number, signal.default_int_handler)  # Under nohup one is ignored.
-    monkeypatch.setattr(Validation, "after", lambda *_: signal.raise_signal(number))
+def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch):
+    monkeypatch.setattr(Validation, "after", lambda *_: signal.raise_signal(signal.SIGINT))
     status, out, errors = sit_down(Puppet([LET_GO] * 3, then=QUIT), *TRAIN_HERE)
-    signal.signal(number, ours)
     assert status == 0
     assert "validation left out" in errors
     assert "1 episode, 4 steps" in out
@@ -123,10 +105,6 @@ def test_the_policy_is_validated_behind_the_persons_back_and_kept(sit_down):
     assert {view.coach.alone for view in person.views} >= {"", "checking"}
     assert load_torch(Path("run") / BEST_FILE)["episode"] <= len(rows)
     assert len(shown.typical) > 5
-    again: Any = UntilChecked()
-    assert sit_down(again, *TRAIN_HERE, *quick, "--resume")[0] == 0
-    assert again.views[0].coach.curve[0][1] == shown.curve[0][1]
-    assert again.views[0].coach.episodes[-1].outcome == STOPPED
 
 
 def demonstrated(index: int):

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bridge.fork import RecordedEpisode, read_episode
@@ -44,12 +43,3 @@ def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
     status, out, _ = call(capsys, "human", "--from", "rec", "--episodes", "1", "--out", "me")
     assert (status, f"from {len(steps)} demonstrated steps" in out) == (0, True)
     assert call(capsys, "train", "--human", "me", "--steps", "60", *UNJUDGED)[0] == 0
-
-
-def test_a_policy_may_drive_until_the_person_takes_over(sit_down, recorded):
-    person = Puppet([LET_GO] * 4 + [hold(1.0)] * 4, then=QUIT)
-    words = ("--policy", "policy.onnx", "--out", "rec")
-    assert sit_down(person, *FORK, *words)[0] == 0
-    steps = list(read_steps(find_recordings([Path("rec")])[0]))
-    assert np.allclose([step.action for step in steps[:3]], 0.2)
-    assert [step.human for step in steps[:6]] == [False] * 4 + [True] * 2

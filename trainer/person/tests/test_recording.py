@@ -9,25 +9,13 @@ from itertools import cycle
 from typing import cast
 
 import msgspec
-import numpy as np
 import pytest
 
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
 from hil_tests.testing.people import record, recorded_step
 from trainer.person import recording
-from trainer.person.recording import Recorder, read_steps, sittings
-
-
-def record_some(directory, count: int) -> list[recording.RecordedStep]:
-    """A sitting of so many steps, each of which is there before the next is taken."""
-    recorder, steps = Recorder(directory), []
-    for index in range(count):
-        steps.append(recorded_step(recorder.sitting, index))
-        recorder.write(steps[-1])
-        assert list(read_steps(recorder.path)) == steps
-    recorder.close()
-    return steps
+from trainer.person.recording import Recorder, read_steps
 
 
 def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
@@ -79,51 +67,36 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
         list(read_steps(path))
 
 
-def test_what_is_written_is_read_and_sittings_add_up_and_are_never_overwritten(tmp_path):
+def test_what_is_written_is_read_and_sittings_are_never_overwritten(tmp_path):
     run = tmp_path / "run"
-    first, second = record_some(run / "sittings", 2), record_some(run / "sittings", 3)
-    np.testing.assert_array_equal(first[0].next_observation, first[1].observation)
-    paths = sittings(run / "sittings")
+    written = [[recorded_step(sitting, index) for index in range(3)] for sitting in (1, 2)]
+    paths = [record(run / "sittings", steps) for steps in written]
     assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
-    assert [step for path in paths for step in read_steps(path)] == first + second
+    assert [list(read_steps(path)) for path in paths] == written
     # They are found by file, directory and run, each once.
     assert recording.find_recordings([paths[1], run, run / "sittings"]) == paths[::-1]
     with pytest.raises(UserError, match="no recording"):
         recording.find_recordings([tmp_path])
 
 
-def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
-    record_some(tmp_path / "rec", 0)
-    assert sittings(tmp_path / "rec") == []
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot create"):
-        Recorder(tmp_path / "file")
-
-
-@pytest.mark.parametrize(("room", "refused"), [(500, "write"), (0, "close")])
-def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path, room, refused):
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
     recorder, step = Recorder(tmp_path), recorded_step(1, 0)
     recorder.write(step)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + room, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + 500, before[1]))
     try:
         with pytest.raises(UserError, match="cannot write"):
-            recorder.write(recorded_step(1, 1)) if refused == "write" else recorder.close()
+            recorder.write(recorded_step(1, 1))
         recorder.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(read_steps(recorder.path)) == [step]
 
 
-def episode(sitting: int, count: int):
-    """A recorded episode without an end."""
-    return [recorded_step(sitting, index) for index in range(count)]
-
-
 @pytest.mark.parametrize(("position", "left"), [((1, 0), 5), ((1, 2), 3), ((2, 0), 2), ((3, 0), 0)])
 def test_only_what_came_after_the_checkpoint(tmp_path, position, left):
     for sitting, count in ((1, 3), (2, 2)):
-        record(tmp_path, episode(sitting, count))
+        record(tmp_path, [recorded_step(sitting, index) for index in range(count)])
     (tmp_path / "sitting-0003.mcap").touch()  # A power cut just after its beginning.
     assert len(recording.find_recordings([tmp_path])) == 2
     assert len(list(recording.steps_since(tmp_path, position))) == left
@@ -133,7 +106,7 @@ COUNT = struct.Struct("<Q")
 STEPS = [recorded_step(1, 0), recorded_step(1, 1)]
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_step_that_was_kept_is_lost(tmp_path, seed):
     """Killed while it records as quickly as it can; ``kept`` counts what the recorder took."""
     kept = mmap.mmap(-1, COUNT.size)

@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from bridge.outcomes import DISCARDED
 from hil_tests.processes import wait_until
 from hil_tests.testing.people import record, recorded_step
 from trainer.human.guide import Guide
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
-from trainer.person.recording import DIRECTORY, packed
+from trainer.person.recording import DIRECTORY
 from trainer.person.validation import BehindTheScenes, Candidate
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
@@ -78,12 +77,6 @@ def test_steps_come_back_with_mask_action_reward_and_pictures(tmp_path, capsys):
         assert batch.frames[row].tobytes() == STEPS[index].observation.tobytes()
 
 
-def test_an_episode_that_was_thrown_away_does_not_come_back(tmp_path):
-    steps = [*episode(0, 4, range(1, 3), outcome=DISCARDED), *episode(4, 3, range(0))]
-    state = recovered(tmp_path, steps).learning.replay.state_dict()
-    assert state["rewards"].tolist() == [4.0, 5.0, 6.0]
-
-
 def test_behind_a_network_the_action_answers_an_older_picture(tmp_path):
     steps = episode(0, 5, range(0))
     replay = recovered(tmp_path, steps, latency="100ms").learning.replay
@@ -91,14 +84,3 @@ def test_behind_a_network_the_action_answers_an_older_picture(tmp_path):
     batch = replay.sample(50, np.random.default_rng(0))
     for row, index in enumerate(batch.indices):
         assert batch.frames[row].tobytes() == steps[index].observation.tobytes()
-
-
-def test_what_was_foreseen_comes_back(tmp_path):
-    ahead = tuple(packed(np.full((2, 45, 80), value, np.uint8)) for value in (7, 8))
-    steps = episode(0, 4, range(1, 3))
-    steps[1] = structs.replace(steps[1], ahead=ahead)
-    replay = recovered(tmp_path, steps, algorithm="ppl_td3").learning.replay
-    foreseen = replay.sample(50, np.random.default_rng(0)).foreseen
-    assert foreseen is not None
-    assert set(foreseen.next_frames[:, 1, 0, 0]) == {7, 8}
-    assert set(foreseen.overruled[:, 0]) == {0.25}

@@ -1,6 +1,5 @@
 from collections import Counter
 from itertools import pairwise, repeat
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, mak
 from trainer.drivers import constant_driver
 from trainer.person.drive import drive
 from trainer.person.recording import read_episodes, read_steps
-from trainer.person.session import Pacer
 from trainer.person.takeover import MAX_SLEW
 
 
@@ -99,14 +97,6 @@ def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):
     assert len(set(scenes)) == 1
 
 
-@pytest.mark.parametrize(
-    ("wished", "outcome"), [("quit", STOPPED), ("restart", RESTARTED), ("discard", DISCARDED)]
-)
-def test_out_of_a_pause_one_can_quit_restart_or_discard(tmp_path, wished, outcome):
-    readings = [LET_GO, wish("pause"), LET_GO, wish(wished), *[LET_GO] * 3]
-    assert drive_and_read(tmp_path, readings)[0][outcome] == 1
-
-
 def test_without_the_person_no_episode_begins(tmp_path):
     outcomes, steps, views, _ = drive_and_read(tmp_path, [LET_GO] * 5, presence=repeat(False))
     assert (dict(outcomes), steps) == ({}, [])
@@ -121,31 +111,3 @@ def test_nobody_demonstrates_where_nobody_is(tmp_path):
     human, policy = (True, "human"), (False, "policy")
     assert [(step.human, step.control) for step in steps] == [human, human, policy, policy, human]
     assert [step.first for step in steps] == [True, False, False, False, True]
-
-
-@pytest.mark.parametrize(
-    ("works_s", "expected_s", "late"),
-    [
-        ([0.0, 0.05, 0.09, 0.01], [0.0, 0.1, 0.2, 0.3], 0),  # within the period
-        ([0.0, 0.15, 0.0, 0.0], [0.0, 0.15, 0.2, 0.3], 1),  # a short delay is caught up
-        ([0.0, 0.5, 0.0, 0.0], [0.0, 0.5, 0.6, 0.7], 1),  # after a long one they begin anew
-        ([0.0, 0.11, 0.0], [0.0, 0.11, 0.2], 0),  # a hair is not late
-    ],
-)
-def test_when_periods_begin_and_which_are_late(monkeypatch, works_s, expected_s, late):
-    now_s = 100.0
-
-    def wait(seconds: float) -> None:
-        nonlocal now_s
-        now_s += seconds
-
-    monkeypatch.setattr(
-        "trainer.person.session.time", SimpleNamespace(monotonic=lambda: now_s, sleep=wait)
-    )
-    pacer, began_s = Pacer(0.1), []
-    for work_s in works_s:
-        wait(work_s)
-        pacer.wait()
-        began_s.append(now_s - 100.1)
-    assert began_s == pytest.approx(expected_s)
-    assert pacer.late == late

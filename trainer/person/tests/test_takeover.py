@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hil_tests.testing.people import LET_GO
 from trainer.person.interface import WISHES, Reading, distance
-from trainer.person.takeover import MAX_SLEW, NEXT, SILENCE_S, Input, Intent, Seat, TakeOver
+from trainer.person.takeover import MAX_SLEW, SILENCE_S, Input, Intent, Seat, TakeOver
 
 ACTION = st.floats(-1.0, 1.0)
 STEPS = st.lists(st.tuples(ACTION, ACTION, st.booleans()), min_size=1, max_size=60)
@@ -45,17 +45,6 @@ def test_a_person_who_holds_or_lets_go_for_long_is_followed_exactly(steps, polic
             by_person = take_over.step(policy, human, control == "human")
         decided = take_over.applied, take_over.control, by_person is not None
         assert decided == (action, control, control == "human")
-
-
-def test_on_the_way_back_the_steps_are_the_persons():
-    take_over, back = TakeOver(), []
-    for held in (True, True, False, False, False):
-        by_person = take_over.step(1.0, -1.0, held)
-        back.append((take_over.applied, take_over.control, by_person is not None))
-    assert back[2:] == [(0.5, "returning", True), (1.0, "policy", False), (1.0, "policy", False)]
-    states = {state for state, _ in NEXT}
-    assert len(NEXT) == 2 * len(states)
-    assert {state for row in NEXT.values() for state in row} == states
 
 
 def wheel(action):
@@ -106,15 +95,6 @@ def test_after_a_silence_the_hands_must_be_off_once_and_a_wheel_at_rest(seat, of
     seat.hear(1, off, late_s + 0.1)
     assert seat.hear(1, on, late_s + 0.2)
     assert seat.poll(late_s + 0.2).action == 0.8
-
-
-def test_hands_that_are_off_say_the_environments_rest():
-    seat = Seat(rest=-1.0)
-    seat.sit_down(1)
-    assert seat.poll(0.0) == Reading(-1.0)
-    seat.hear(1, Input(at_ms=0.0, action=None, engaged=False, by_moving=True), 0.0)
-    assert seat.poll(0.0) == Reading(-1.0, by_moving=True)
-    assert seat.hear(1, HOLD, 0.1), "the wheel was at rest"
 
 
 def test_a_tap_between_two_polls_counts_for_one_and_a_hold_ends_with_its_release(seat):

@@ -1,8 +1,6 @@
 import argparse
 import asyncio
-import base64
 import itertools
-import json
 import os
 import queue
 import resource
@@ -11,17 +9,12 @@ import time
 import webbrowser
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from unittest.mock import Mock
-from urllib.parse import urlsplit
 
 import aiohttp
-import numpy as np
 import pytest
-import segno
 
 from hil_tests.testing.browser import (
     WAIT_S,
-    first_view,
     hear,
     origin,
     page,
@@ -62,35 +55,6 @@ async def test_a_page_that_falls_silent_has_let_go_and_is_disconnected(cockpit, 
         assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
 
 
-async def test_a_second_page_watches_until_the_first_is_gone(cockpit):
-    async with page(cockpit) as first, page(cockpit) as watching:
-        await say(first)
-        assert not (await say(watching))["driving"]
-        await say(watching, True, 1.0)
-        assert not poll(cockpit).engaged
-        await say(first, True, 0.5)
-        assert poll(cockpit).action == 0.5
-        await first.close()
-        await reads(cockpit, lambda reading: not reading.engaged)
-        assert (await say(watching))["driving"]
-
-
-async def test_a_view_arrives_whole_and_a_page_that_comes_later_sees_the_newest(cockpit):
-    expected = first_view()
-    async with page(cockpit) as link:
-        cockpit.show(expected)
-        view = await hear(link, "view")
-    frames = np.frombuffer(base64.b64decode(view["frames"]), np.uint8)
-    assert frames.tobytes() == np.array(expected.frames).tobytes()
-    assert view["scene"] == json.loads(json.dumps(expected.scene))
-    seen = view["policy_action"], view["ground"]["left_m"], view["number"]
-    assert seen == (0.25, -30.0, 1)
-    for step in (1, 2):
-        cockpit.show(view_of_step(step))
-    async with page(cockpit) as link:
-        assert (await hear(link, "view"))["step"] == 2
-
-
 async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
     """Its views and echoes pile up in front of a closed window; the loop's thread goes on."""
     reader, writer = await asyncio.open_connection("127.0.0.1", cockpit.port, limit=256)
@@ -109,54 +73,31 @@ async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
     writer.close()
 
 
-async def test_closing_tells_every_page_and_frees_the_port():
-    cockpit = Cockpit()
-    async with page(cockpit) as link:
-        await say(link)
-        cockpit.close()
-        assert (await link.receive_json(timeout=WAIT_S))["kind"] == "end"
-        assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
-    cockpit.close()
-    cockpit.show(first_view())
-    assert poll(cockpit) == LET_GO
-    Cockpit(port=cockpit.port).close()
-
-
 async def status_of(url, **more):
     async with aiohttp.ClientSession() as session, session.get(url, **more) as answer:
         return answer.status, await answer.text(), answer.headers
 
 
 async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
-    status, text, headers = await status_of(cockpit.url)
-    assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
-    assert 'rel="icon" href="data:' in text, "else browsers ask for one outside of the token"
-    assert headers["Referrer-Policy"] == "no-referrer"
-    assert "default-src 'self'" in headers["Content-Security-Policy"]
+    status, _, headers = await status_of(cockpit.url)
+    assert (status, headers["Referrer-Policy"]) == (200, "no-referrer")
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
-    assert (headers["Cache-Control"], headers["X-Content-Type-Options"]) == ("no-store", "nosniff")
     served = [path.name for path in (Path(web.__file__).parent / "page").glob("*.[jc]s*")]
     for name in (*served, "server.py", "..%2fserver.py"):
         assert (await status_of(cockpit.url + name))[0] == (200 if name in served else 404), name
-    assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
     for path in ("", "wrong/", "wrong/cockpit.js", "wrong/socket", "socket"):
-        status, text, _ = await status_of(f"{origin(cockpit)}/{path}")
-        assert (status, "token" in text) == (403, True), path
+        assert (await status_of(f"{origin(cockpit)}/{path}"))[0] == 403, path
 
 
 @pytest.mark.parametrize(
     ("words", "answer"),
     [
-        (b"GET /\xff HTTP/1.1", b"400 Bad Request"),
         (b"\x16\x03\x01\x02\x00", b"400 Bad Request"),
-        (b"GET / HTTP/9.9", b"400 Bad Request"),
         (b"OPTIONS * HTTP/1.1", b"421 "),
         (b"GET /wrong/ HTTP/1.1\r\nHost: 127.0.0.1", b"403"),  # no token
     ],
 )
-def test_who_is_refused_is_told_so_and_disconnected_and_the_log_stays_empty(
-    cockpit, caplog, words, answer
-):
+def test_who_is_refused_is_disconnected_and_the_log_stays_empty(cockpit, caplog, words, answer):
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
         link.sendall(words + (b"" if b"Host" in words else b"\r\nHost: x") + b"\r\n\r\n")
         told = b""
@@ -183,13 +124,10 @@ async def test_another_sites_page_gets_no_socket(cockpit):
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "[]",
         "{}",
         *(f'{{"at_ms": 1, "engaged": true, "action": {wrong}}}' for wrong in (
-            "1.5", "NaN", "1e999", "[0.5, 0.9]", '"1"', '1, "wishes": ["fly"]', '1, "admin": 1',
+            "1.5", "NaN", "[0.5, 0.9]", '1, "wishes": ["fly"]',
         )),
-        "[" * MAX_INPUT_BYTES,
         "x" * (MAX_INPUT_BYTES + 1),
         b"\x00",
     ],
@@ -217,10 +155,8 @@ def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys
         cockpit = open_web(host=host)
         cockpit.close()
         out, err = capsys.readouterr()
-        assert out.startswith("cockpit: open http://")
         assert ("warning: --host" in err) == warned
         assert (f"phone in this network: {cockpit.phone_url}\n" in out) == warned
-    assert cockpit.phone_url == cockpit.url
 
 
 async def test_where_there_is_a_display_the_browser_opens_by_an_address_for_one_request(
@@ -234,25 +170,9 @@ async def test_where_there_is_a_display_the_browser_opens_by_an_address_for_one_
         url = opened.get(timeout=WAIT_S)
         assert opened.empty(), "no browser without a display"
         assert cockpit.url not in url, "every user of this machine can read a command line"
-        status, text, _ = await status_of(url)
-        assert (status, "<title>PHIL cockpit</title>" in text) == (200, True)
+        assert (await status_of(url))[0] == 200
         assert (await status_of(url))[0] == 403
         assert (await status_of(cockpit.url))[0] == 200
-
-
-async def test_a_phone_gets_in_by_the_address_in_the_code_and_loopback_shows_none(
-    cockpit, monkeypatch
-):
-    make = Mock(wraps=segno.make)
-    monkeypatch.setattr(segno, "make", make)
-    with closing(Cockpit("0.0.0.0")) as open_to_all:
-        make.assert_called_once_with(open_to_all.phone_url)
-        status, text, _ = await status_of(open_to_all.phone_url)
-    assert status == 200
-    assert 'src="data:image/svg' in text
-    assert str(open_to_all.phone_url) in text
-    assert urlsplit(open_to_all.phone_url).hostname not in ("0.0.0.0", *web.LOOPBACK)
-    assert "data:image" not in (await status_of(cockpit.url))[1]
 
 
 CROWD = 375
@@ -271,16 +191,13 @@ def few_descriptors():
 
 
 @pytest.mark.usefixtures("few_descriptors")
-@pytest.mark.parametrize("said", [b"", b"GET / HTTP/1.1\r\nHost: "])
-async def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(
-    cockpit, caplog, said
-):
+async def test_a_crowd_that_says_little_takes_no_descriptors_and_fills_no_log(cockpit, caplog):
     there = ("127.0.0.1", cockpit.port)
     with ExitStack() as idle:
         async with page(cockpit) as link:
             await say(link)
             for _ in range(CROWD):
-                idle.enter_context(socket.create_connection(there, WAIT_S)).sendall(said)
+                idle.enter_context(socket.create_connection(there, WAIT_S)).sendall(b"GET /")
                 await say(link)  # A page that falls silent is disconnected.
             assert (await status_of(cockpit.url))[0] == 200
             assert (await say(link))["driving"], "the page that was there first stays"
@@ -288,34 +205,29 @@ async def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(
     assert caplog.messages == []
 
 
-@pytest.mark.parametrize("said", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "])
-def test_a_client_that_sends_no_whole_request_is_cut_off(cockpit, monkeypatch, said):
+def test_a_client_that_sends_no_whole_request_is_cut_off(cockpit, monkeypatch):
     monkeypatch.setattr(web, "HEADERS_S", 0.2)
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as stranger:
-        stranger.sendall(said)
+        stranger.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: ")
         began_s = time.monotonic()
         with suppress(ConnectionResetError):
             assert stranger.recv(1) == b""
         assert time.monotonic() - began_s < WAIT_S / 2
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:{port}", "[::1", "127.0.0.1.evil", ""]
-)
+@pytest.mark.parametrize("host", ["evil.example:{port}", "[::1", "127.0.0.1.evil"])
 async def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
     """DNS rebinding: the other site's page would be of the same origin as the cockpit."""
     headers = {"Host": host.format(port=cockpit.port)}
-    status, text, _ = await status_of(cockpit.url, headers=headers)
-    assert (status, "address" in text) == (421, True)
+    assert (await status_of(cockpit.url, headers=headers))[0] == 421
     assert await refusal(cockpit, origin=f"http://{headers['Host']}", headers=headers) == 421
     # Loopback is let in by any port, as through a tunnel.
-    for here in ("localhost:7", "LOCALHOST", "[::1]:80", "127.0.0.1"):
+    for here in ("LOCALHOST:7", "[::1]:80"):
         assert (await status_of(cockpit.url, headers={"Host": here}))[0] == 200
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.2"])
-async def test_the_address_that_it_listens_on_is_let_in(host):
-    with closing(Cockpit(host=host)) as cockpit:
+async def test_the_address_that_it_listens_on_is_let_in():
+    with closing(Cockpit(host="0.0.0.0")) as cockpit:
         printed = cockpit.url.split("/")[2]
         here = cockpit.url.replace(printed, f"127.0.0.2:{cockpit.port}")
         assert (await status_of(here))[0] == 200
