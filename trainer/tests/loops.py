@@ -84,15 +84,12 @@ class ScriptedGuide(Guide):
 
     def __init__(self, human_steps=(), reason: str = "collision") -> None:
         self.human_steps, self.reason = human_steps, reason
-        self.episode = -1
-        self.watched: list[int] = []
 
     def reset(self):
-        self.episode, self.step = self.episode + 1, 0
+        self.step = 0
 
     def watch(self, observation, policy_action, doubt=0.0):
         self.step += 1
-        self.watched.append(self.episode)
         if self.step not in self.human_steps:
             return None
         first = self.step - 1 not in self.human_steps
@@ -101,8 +98,8 @@ class ScriptedGuide(Guide):
 
 def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(),
                  reason="collision") -> Any:  # fmt: skip
-    """A run that keeps what it ``stored``, the ``betas``, and the (indices, priorities) that it was
-    given (``learned``) and wrote back (``written``)."""
+    """A run that keeps what it ``stored``, and the (indices, priorities) that it was given
+    (``learned``) and wrote back (``written``)."""
     env = ScriptedEnv(length, outcome)
     spec = parse_spec(config.latency)
     delayed = DelayedVehicle(env, spec) if config.latency != "none" else None
@@ -112,7 +109,7 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
     run: Any = TrainingRun(
         config, run_dir, parts=Parts(env, delayed, delayed or env, guide, learning, validation)
     )
-    run.stored, run.betas, run.learned, run.written = [], [], [], []
+    run.stored, run.learned, run.written = [], [], []
     add, write = learning.replay.add, learning.replay.update_priorities
 
     def spy_add(transition):
@@ -125,8 +122,7 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
         write(indices, priorities)
 
     def update(batch, beta):
-        priorities = 2.0 + len(run.betas) + np.arange(BATCH) / 8
-        run.betas.append(beta)
+        priorities = 2.0 + len(run.learned) + np.arange(BATCH) / 8
         run.learned.append((batch.indices.tolist(), priorities.tolist()))
         return Losses(0.0, 0.0, 0.0, 0.0, priorities)
 

@@ -111,30 +111,3 @@ def environment(
 def test_who_turns_or_is_aside_is_taken_over(side, offset_m, heading_rad, action, reason):
     trigger = CongestionHuman(environment(side * offset_m, side * heading_rad, ALONE))
     assert trigger.wants_control(side * action) == reason
-
-
-def test_who_will_touch_a_car_with_its_side_is_taken_over():
-    for offset_m, action, reason in ((0.75, RIGHT, "collision"), (-0.75, STRAIGHT, None)):
-        trigger = CongestionHuman(environment(offset_m, 0.1))
-        assert trigger.wants_control(action) == reason
-
-
-def test_every_crash_is_foreseen(monkeypatch):
-    """By a trigger that objects to nothing but cars that would be hit."""
-    monkeypatch.setattr(CongestionHuman, "HEADING_RAD", math.inf)
-    monkeypatch.setattr(CongestionHuman, "OFFSET_M", math.inf)
-    env, random = CongestionEnv(), np.random.default_rng(1)
-    trigger, crashes = CongestionHuman(env), 0
-    for seed in range(12):
-        objected: list[bool] = []
-
-        def judged(_, objected=objected):
-            action = random.uniform(-1, 1, 1).astype(np.float32)
-            objected.append(trigger.wants_control(action) is not None)
-            return action
-
-        _, info = drive(env, judged, seed)
-        if info["outcome"] == "collision":
-            crashes += 1
-            assert any(objected[-round(trigger.HORIZON_S / env.config.control_period_s) :])
-    assert crashes > 5

@@ -80,14 +80,3 @@ def test_equation_18b_noise_has_its_scale_and_keeps_its_bound():
     assert noise.mean() == pytest.approx(0.0, abs=0.005)
     assert noise.std() == pytest.approx(0.2, rel=0.02)
     assert np.abs(eq.exploration_noise(3.0, 0.5, drawn)).max() == 0.5
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.9])
-def test_noise_keeps_its_deviation_whatever_its_correlation(correlation):
-    random, drawn = np.random.default_rng(0), np.zeros(50_000)
-    series = []
-    for _ in range(60):
-        drawn = eq.correlated(drawn, correlation, random)
-        series.append(drawn)
-    assert series[-1].std() == pytest.approx(1.0, rel=0.02)
-    assert np.corrcoef(series[-2], series[-1])[0, 1] == pytest.approx(correlation, abs=0.02)

@@ -12,25 +12,13 @@ from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from trainer import drivers
 from trainer.__main__ import main
-from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver
+from trainer.drivers import BEST_FILE, OnnxDriver, load_actor
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together, evaluate
-from trainer.human.config import MODEL_FILE
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 
 POLICY = Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx"
-
-
-@pytest.mark.parametrize("name", [BEST_FILE, MODEL_FILE])
-def test_no_file_of_weights_decides_what_is_imported(tmp_path, monkeypatch, name):
-    (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
-    monkeypatch.syspath_prepend(tmp_path)
-    label = {"scenario": "planted:Env-v0", "algorithm": "phil_td3", "seed": 0, "episode": 3}
-    more = {"action_size": 1, "frames": 2, "actor": Actor().state_dict()}
-    save_torch(tmp_path / name, {**label, **more})
-    with pytest.raises(UserError, match="trained in planted:Env-v0, not in left_turn"):
-        load_driver(str(tmp_path), make_environment("left_turn"))
 
 
 @pytest.mark.parametrize(

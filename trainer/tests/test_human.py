@@ -10,7 +10,7 @@ from trainer.drivers import constant_driver
 from trainer.environments import expert_of, make_environment
 from trainer.human.config import HumanModelConfig
 from trainer.human.dagger import imitate
-from trainer.human.guide import ASKED, Asking, Attention, HumanGuide, PoorHands, steps_held
+from trainer.human.guide import ASKED, Asking, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, load_human_model
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
@@ -95,39 +95,6 @@ def test_the_human_holds_on_and_gives_back(reasons, how, held, first):
     assert in_control == held
     assert [step.first for step in steps] == first
     assert {step.reason for step in steps} == {next(filter(None, reasons))}
-
-
-def noticed(attention, *periods, count):
-    """What a human notices of a reason that is there in these periods."""
-    return [attention.notices("collision" if n in periods else None) for n in range(count)]
-
-
-def test_a_late_human_comes_some_steps_after_its_reason_and_an_inattentive_one_not_at_all():
-    random = np.random.default_rng(0)
-    assert noticed(Attention((3.0, 3.0), 0.0, random), 2, count=8).index("collision") == 5
-    delays = set()
-    for _ in range(40):
-        late = Attention((3.0, 8.0), 0.0, random)
-        delays.add(noticed(late, 1, count=12).index("collision") - 1)
-    assert delays == {3, 4, 5, 6, 7, 8}
-    always = range(40)
-    assert noticed(Attention((0.0, 0.0), 1.0, random), *always, count=40) == [None] * 40
-    half = [noticed(Attention((0.0, 0.0), 0.5, random), 0, count=1)[0] for _ in range(400)]
-    assert half.count("collision") == pytest.approx(200, abs=40)
-    # What is overlooked is seen a second and a half later, if it is still there.
-    drawn = iter([0.0, *[0.9] * 9])
-    once: Any = SimpleNamespace(random=drawn.__next__, uniform=lambda *ends: 0.0)
-    seen = noticed(Attention((0.0, 0.0), 0.5, once), *always, count=20)
-    assert seen.index("collision") == 16
-
-
-def test_at_the_wheel_every_human_is_attentive():
-    """A reason that is still there keeps it there, however much it overlooks beside the policy."""
-    drawn = iter([0.9, *[0.0] * 9])  # Notices the first reason, and would notice no other
-    once: Any = SimpleNamespace(random=drawn.__next__, uniform=lambda *ends: 0.0)
-    attention = Attention((0.0, 0.0), 0.5, once)
-    held, _ = watch([CRASH] * 30 + [NONE] * 4, hold_steps=3, attention=attention)
-    assert held == [YES] * 32 + [NO] * 2
 
 
 def test_the_robot_asks_where_its_doubt_is_high_once_it_knows_what_that_is():

@@ -2,8 +2,6 @@
 
 import platform
 import shutil
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -154,15 +152,3 @@ def test_processors_with_shorter_vectors_compute_the_same(anew, caplog):
     single, reduced = (_gradients(pictures, parameters, _slopes(5), it) for it in (False, True))
     assert all(map(torch.equal, (single[0], *single[1]), (reduced[0], *reduced[1])))
     assert caplog.records == []
-
-
-@needs_kernel
-@needs_x86
-def test_what_only_a_matrix_unit_needs_compiles_without_one():
-    source = Path(kernel.__file__).with_name("trunk.cpp")
-    flags = ["-std=c++17", "-march=sapphirerapids", "-fsyntax-only"]
-    command = [*kernel._compiler(), *flags, str(source)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if "sapphirerapids" in done.stderr:
-        pytest.skip("the compiler does not know such a processor")
-    assert (done.returncode, done.stderr) == (0, "")

@@ -1,48 +1,25 @@
-"""The learner's thread: what it averages, waits for and ends with; and one that never waits."""
+"""The learner's thread beside a control period, and one that is never waited for."""
 
 import threading
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from hil_tests.processes import wait_until
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Transition
-from trainer.learner.td3 import Losses
 from trainer.tests.loops import CONFIG, ScriptedEnv, scripted_run
 from trainer.training.config import RunConfig
-from trainer.training.learning import LearningThread, UnhurriedLearning
+from trainer.training.learning import UnhurriedLearning
 
-SMALL = LearnerConfig(batch_size=8, replay_capacity=60, warmup_steps=1)
-LOSSES = Losses(1.0, 2.0, 3.0, 4.0, np.full(SMALL.batch_size, 2.0))
 PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
 SOON_S = 30.0
 
 
 def transition(reward: float = 0.0, action: float = 0.5, **more: Any) -> Transition:
-    return Transition(
-        PICTURE,
-        np.full(1, action, np.float32),
-        reward,
-        PICTURE,
-        more.pop("terminal", False),
-        **more,
-    )
-
-
-@pytest.fixture(params=["phil_td3"])
-def learning(request):
-    """One that is filled, with every third step the human's; its learner's update is scripted."""
-    config = RunConfig(algorithm=request.param, seed=1, learner=SMALL)
-    made: Any = LearningThread(config, ScriptedEnv())
-    for step in range(20):
-        made.add(transition(float(step % 5), step / 20, human=step % 3 == 0))
-    made.learner.update = Mock(return_value=LOSSES)
-    yield made
-    made.close()
+    done = more.pop("terminal", False)
+    return Transition(PICTURE, np.full(1, action, np.float32), reward, PICTURE, done, **more)
 
 
 def noting(threads, function):
@@ -53,22 +30,6 @@ def noting(threads, function):
         return function(*arguments)
 
     return noted
-
-
-def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
-    threads: list[threading.Thread] = []
-    learner = learning.learner
-    learner.update = noting(threads, learner.update)
-    learner.actor.act = noting(threads, learner.actor.act)
-    learning.act(PICTURE)
-    learning.begin(0.0)
-    learning.finish()
-    assert len(threads) == 2
-    (thread,) = set(threads)
-    assert thread is not threading.current_thread()
-    assert thread.is_alive()
-    learning.close()
-    assert not thread.is_alive()
 
 
 def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
@@ -92,7 +53,7 @@ def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_
     assert known == [1, 2, 3]
 
 
-def test_what_fails_beside_an_update_or_in_it_ends_the_run_and_the_thread(tmp_path):
+def test_what_fails_beside_an_update_ends_the_run_and_the_thread(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=9)
     threads: list[threading.Thread] = []
     step = run.env.step
@@ -108,14 +69,6 @@ def test_what_fails_beside_an_update_or_in_it_ends_the_run_and_the_thread(tmp_pa
         run.train()
     # The last update ran to its end, and nobody took its priorities.
     assert (len(run.learned), len(run.written), len(run.stored)) == (2, 1, 2)
-    assert not threads[0].is_alive()
-
-    run, threads = scripted_run(tmp_path, CONFIG, length=9), []
-    no_memory = Mock(side_effect=RuntimeError("no memory is left"))
-    run.learning.learner.update = noting(threads, no_memory)
-    with pytest.raises(RuntimeError, match="no memory"):
-        run.train()
-    assert (len(run.env.actions), len(run.stored), len(threads)) == (2, 1, 1)
     assert not threads[0].is_alive()
 
 
@@ -173,16 +126,3 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurr
     assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert state["human"].tolist() == [False, False, False, True, False]
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
-
-
-def test_the_next_update_begins_when_the_last_is_done_and_its_error_comes_out(unhurried, gate):
-    gate.open.set()
-    for _ in range(3):
-        unhurried.begin(0.0)
-        wait_until(lambda: not unhurried.updating, "the update's end")
-    unhurried.settle()
-    assert gate.begun == 3
-    unhurried.learner.update = Mock(side_effect=RuntimeError("no more memory"))
-    unhurried.begin(0.0)
-    with pytest.raises(RuntimeError, match="no more memory"):
-        unhurried.settle()

@@ -100,18 +100,6 @@ def test_a_run_is_summed_up():
     assert totals([], 0.1) == {}
 
 
-def test_the_best_step_is_that_of_the_actor_that_is_kept():
-    rows = [{"total_steps": str(100 * n), "updates": "0", "outcome": outcome, "human_steps": "0",
-             "interventions": "0", "validation_success": success, "validation_reward": reward}
-            for n, (success, reward, outcome) in enumerate([
-                ("0.9", "3.0", "truncated"), ("0.9", "4.0", "goal"), ("nan", "nan", "truncated"),
-                ("0.9", "4.0", "goal"), ("0.8", "9.0", "goal")], 1)]  # fmt: skip
-    assert totals(rows, 0.1)["validation"] == {"best": 0.9, "best_at_step": 400, "last": 0.8}
-    assert totals(rows, 0.1, kept_episode=2)["validation"]["best_at_step"] == 200
-    assert totals(rows, 0.1)["failures"] == {"timeout": 2}
-    assert totals(rows[:1], 0.1)["failures"] == {}  # Nobody knows yet.
-
-
 def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):
     dirs = [str(tmp_path / name) for name in ("one", "two")]
     for directory, episodes in zip(dirs, (30, 12), strict=True):

@@ -169,12 +169,6 @@ def test_half_of_what_is_drawn_is_the_humans_where_there_are_both(steps, share):
     np.testing.assert_allclose(counts / 4000, batch.probabilities[where], atol=0.002)
 
 
-def test_a_slot_that_changes_hands_leaves_the_other_buffer():
-    buffer, _ = filled(-10, 10, capacity=10, separate=True)
-    assert buffer.human_count == 0
-    assert not sample(buffer).human.any()
-
-
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=70), st.floats(0, 1, exclude_max=True))
 def test_find_inverts_the_cumulative_sum(weights, share):
     plain = np.array(weights)

@@ -11,9 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import refusal
 from trainer.drivers import CHECKPOINT_FILE
-from trainer.learner import equations
 from trainer.learner.td3 import Losses
 from trainer.tests.loops import BATCH, CONFIG, HUMAN, POLICY, number, scripted_run, trained
 from trainer.training.metrics import MetricsWriter
@@ -71,19 +69,6 @@ def test_learning_waits_for_the_warmup_and_writes_each_updates_priorities_back(
     assert run.written == run.learned
 
 
-def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
-    """With noise as large as its deviation, the actions show the deviation that was used."""
-
-    def noise(scale, bound, drawn):
-        return np.full(len(drawn), scale, np.float32)
-
-    monkeypatch.setattr(equations, "exploration_noise", noise)
-    falling = {"exploration_initial": 0.5, "exploration_share": 0.4, "exploration_final": 0.1}
-    run, stds = trained(tmp_path, episodes=5, **falling), [0.5, 0.3, 0.1, 0.1, 0.1]
-    assert [told.exploration_std for told in run.told] == pytest.approx(stds)
-    assert run.env.actions == pytest.approx([POLICY + std for std in stds])
-
-
 def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
     run = trained(tmp_path, 7, human_steps=(4, 5), latency="up.loss=100%")
     assert run.env.braked == [False, False, True, False, False, True, True]
@@ -132,11 +117,3 @@ def test_divergence_ends_the_run_where_it_shows_and_the_checkpoint_stays(spoil, 
         run.train()
     assert all(np.isfinite(run.env.actions))
     assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
-
-
-def test_a_command_whose_training_diverges_ends_with_one_line(capsys, tmp_path, one_thread):
-    settings = ("actor_learning_rate=1e30", "warmup_steps=10", "batch_size=4", "precision=float32")
-    chosen = [part for setting in settings for part in ("--set", setting)]
-    with np.errstate(all="raise"):
-        err = refusal(capsys, "train", "--episodes", "1", "--out", str(tmp_path), *chosen)
-    assert "diverged in episode 1" in err

@@ -1,6 +1,5 @@
 import copy
 import hashlib
-import itertools
 from typing import Any
 
 import gymnasium
@@ -10,16 +9,11 @@ from gymnasium.utils.env_checker import check_env
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from edge_runtime.manifest import Car
-from hil_tests.testing.people import episode
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.scenarios import SCENARIOS
-from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.scenarios.picture import overlap
-from trainer.scenarios.traffic import CAR, footprint
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 
@@ -46,20 +40,6 @@ def test_standing_changes_the_ego_cars_speed_and_nothing_else(scenario):
     assert start() == moving
 
 
-NAMES = ("nominal", "variant", "dense")
-
-
-def gaps_m(env, of_the_ego_lane=False):
-    """Bumper to bumper, of each two vehicles one behind the other in a lane."""
-    others = [car for car in env.traffic if of_the_ego_lane or abs(car.position[1]) > 1.0]
-    cars = sorted(others, key=lambda car: (car.lane_index, car.position[0]))
-    return [
-        ahead.position[0] - behind.position[0] - 0.5 * (ahead.LENGTH + behind.LENGTH)
-        for behind, ahead in itertools.pairwise(cars)
-        if behind.lane_index == ahead.lane_index
-    ]
-
-
 @pytest.mark.parametrize(
     ("scenario", "condition", "drives", "arriving"),
     [
@@ -75,35 +55,6 @@ def test_the_expert_arrives(scenario, condition, drives, arriving):
     env = make_environment(scenario, condition)
     results = drive_episodes(env, env.expert(), range(drives), condition)
     assert sum(result.outcome == "goal" for result in results) >= arriving
-
-
-@every_scenario
-@pytest.mark.parametrize("condition", NAMES)
-def test_cars_start_apart_and_never_touch_each_other(scenario, condition):
-    env = make_environment(scenario, condition)
-    expert = env.expert()
-    fastest_mps = 6.01 if condition != "dense" else 7.01
-    for seed in range(6):
-        expert.reset()
-        env.reset(seed=seed)
-        assert min(gaps_m(env, of_the_ego_lane=True)) > (3.0 if condition != "dense" else 0.0)
-        for _ in episode(env, expert):
-            shapes = [footprint(car) for car in env.traffic]
-            assert not any(overlap(a, b) for a, b in itertools.combinations(shapes, 2))
-            assert all(0.0 <= car.speed <= fastest_mps for car in env.traffic)
-
-
-@every_scenario
-def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
-    env = make_environment(scenario)
-    car, config = Car(**env.car), env.config
-    if scenario == "left_turn":
-        wanted = config.throttle_mps2, config.max_speed_mps, EgoVehicle.MAX_STEERING_RAD
-    else:  # its +1 turns right
-        wanted = CAR.acceleration_mps2, config.desired_speed_mps, -config.lambda_rad
-    assert (car.throttle_mps2, car.max_speed_mps, car.full_steering_rad) == wanted
-    assert car.brake_mps2 == config.brake_mps2
-    assert car.wheelbase_m == EgoVehicle.LENGTH == Vehicle.LENGTH
 
 
 @every_scenario

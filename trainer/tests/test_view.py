@@ -5,20 +5,19 @@ from contextlib import nullcontext
 from typing import Any
 from unittest.mock import Mock
 
-import msgspec
 import numpy as np
 import pytest
 import torch
 from rerun.chunk import RrdReader
 
 from bridge.rerun import HUMAN, POLICY
-from hil_tests.testing.people import record, recorded_step
+from hil_tests.testing.people import recorded_step
 from trainer import view
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
-from trainer.person.recording import Recorder, packed, read_steps
+from trainer.person.recording import Recorder, packed
 from trainer.training.config import RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
@@ -122,7 +121,6 @@ def test_a_view_that_fails_does_not_end_the_run(capsys):
     assert "disk full" in line
 
 
-BLACK = packed(np.zeros((2, 45, 80), np.uint8))
 BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
 
@@ -158,15 +156,3 @@ def test_a_sitting_is_shown_whole(tmp_path):
     assert [step for step, _ in found["/return/episode"]] == [14, 29]
     assert {"/road/ego/body", "/road/roads", "/frames/now"} <= set(found)
     assert "/loss/critic" not in {path for path, rows in found.items() if rows}
-
-
-@pytest.mark.parametrize("change", [{"seen": BLACK}, {"scenario": "mine/Dock-v0"}])
-def test_a_road_that_would_be_driven_differently_or_nowhere_is_not_made_up(tmp_path, change):
-    steps = list(read_steps(drive(tmp_path)))
-    for number in range(7 if "seen" in change else 0, 15):
-        steps[number] = msgspec.structs.replace(steps[number], **change)
-    entries = list(view.sitting_entries([record(tmp_path, steps)]))
-    scenes = [entry.scene is not None for entry in entries if isinstance(entry, ShownStep)]
-    assert scenes == [False] * 15 + [True] * 15
-    roads = [entry.has_road for entry in entries if isinstance(entry, view.ShownEpisode)]
-    assert roads == [False, True]

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from trainer.person.coach import Coach, SittingEpisode, advise, said
+from trainer.person.coach import Coach, SittingEpisode, advise
 
 FINE = SittingEpisode(0, "goal", 0.0, 0)
 HELPED = SittingEpisode(0, "goal", 2.0, 1, since_takeover_s=3.0)
@@ -40,17 +40,6 @@ def test_the_first_rule_that_fits_is_the_advice(episodes, alone, mastered, begin
     numbered = [replace(one, number=number) for number, one in enumerate(episodes)]
     advice = advise(numbered, alone, mastered)
     assert advice.startswith(begins) if begins else advice == ""
-
-
-def test_what_was_given_stands_beside_what_is_typical():
-    cost = {"human_s": 41.6, "takeovers": 1, "failures": 2}
-    given = "42 s at the wheel, 1 take-over, 2 failures."
-    assert said(cost, [], []) == said(cost, [], [(10.0, 0.89)]) == given
-    there = [(10.0, 0.5), (28.3, 0.9), (30.0, 0.8)]
-    assert said(cost, [], there) == f"{given} The policy alone: 90% after 28 s of a scripted human."
-    both = "after 41 s of you, after 28 s of a scripted human"
-    assert said(cost, [(20.0, 0.0), (41.4, 0.9)], there) == f"{given} The policy alone: 90% {both}."
-    assert said(cost, [(0.0, 0.9)], []) == f"{given} The policy alone: 90% after 0 s of you."
 
 
 def test_a_run_that_goes_on_is_remembered():

@@ -11,7 +11,7 @@ from hil_tests.testing.people import LET_GO, QUIT, Puppet, hold
 from hil_tests.testing.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 
-UNJUDGED = ["--out", "run", "--threads", "1", "--set", "evaluate_every_steps=0"]
+UNJUDGED = ["--out", "run", "--threads", "1", "--set", "batch_size=4"]
 FORK = ["drive", "--human", "web", "--from", "drive.mcap", "--at", "0.95s"]
 
 
@@ -28,7 +28,6 @@ def recorded(tmp_path, monkeypatch, one_thread) -> RecordedEpisode:
 def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
     sit_down, recorded, capsys
 ):
-    """Twice: the first is ended by the person, the second is quit."""
     person = Puppet([LET_GO, *[hold(-1.0)] * 60], then=QUIT)
     status, out, errors = sit_down(person, *FORK, "--out", "rec", "--episodes", "1")
     assert status == 0, errors
@@ -40,6 +39,7 @@ def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
     assert [step.action for step in steps[1:4]] == [-1.0] * 3
     assert all(step.control == "human" for step in steps)
     assert steps[-1].speed_mps < steps[1].speed_mps
-    status, out, _ = call(capsys, "human", "--from", "rec", "--episodes", "1", "--out", "me")
+    short = "--episodes 1 --updates-per-episode 2 --refining-updates 3"
+    status, out, _ = call(capsys, "human", "--from", "rec", *short.split(), "--out", "me")
     assert (status, f"from {len(steps)} demonstrated steps" in out) == (0, True)
     assert call(capsys, "train", "--human", "me", "--steps", "60", *UNJUDGED)[0] == 0

@@ -33,31 +33,6 @@ def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
         assert indices in (list(range(flushed)), list(range(flushed + 1)))
 
 
-@pytest.fixture(scope="module")
-def three(tmp_path_factory):
-    """A sitting of three episodes of five steps, each to its outcome."""
-    steps = [
-        recorded_step(1, 5 * number + step, step=step, outcome="goal" * (step == 4))
-        for number in range(3)
-        for step in range(5)
-    ]
-    return record(tmp_path_factory.mktemp("three"), steps), steps
-
-
-def test_a_flipped_bit_costs_no_more_than_the_episode_in_which_it_is(three, tmp_path, capsys):
-    whole, steps = three
-    data, path = whole.read_bytes(), tmp_path / "sitting-0001.mcap"
-    said = 0
-    for at in range(60, len(data) - 9, 977):
-        path.write_bytes(data[:at] + bytes([data[at] ^ 1 << at % 8]) + data[at + 1 :])
-        read = list(read_steps(path))
-        assert read in (steps, steps[5:], steps[:5] + steps[10:], steps[:10]), at
-        assert len(read) == 15 or "taken, 10 of 1" in capsys.readouterr().err
-        said += len(read) < 15
-    assert said > 9
-    assert list(recording.steps_since(tmp_path, (1, 0))) == read
-
-
 def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_path):
     class Older(msgspec.Struct):
         time_ns: int = 1
@@ -65,18 +40,6 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
     path = record(tmp_path, [cast(recording.RecordedStep, Older())])
     with pytest.raises(UserError, match="recorded by another version: Object missing"):
         list(read_steps(path))
-
-
-def test_what_is_written_is_read_and_sittings_are_never_overwritten(tmp_path):
-    run = tmp_path / "run"
-    written = [[recorded_step(sitting, index) for index in range(3)] for sitting in (1, 2)]
-    paths = [record(run / "sittings", steps) for steps in written]
-    assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
-    assert [list(read_steps(path)) for path in paths] == written
-    # They are found by file, directory and run, each once.
-    assert recording.find_recordings([paths[1], run, run / "sittings"]) == paths[::-1]
-    with pytest.raises(UserError, match="no recording"):
-        recording.find_recordings([tmp_path])
 
 
 def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):

@@ -109,27 +109,6 @@ def test_a_tap_between_two_polls_counts_for_one_and_a_hold_ends_with_its_release
     assert not seat.poll(0.4).engaged
 
 
-def test_a_pedal_that_is_tapped_between_two_polls_counts_with_its_farthest_place(seat):
-    seat.hear(1, RESTING, 0.0)
-    for place in (0.3, 0.9, 0.2, 0.0):
-        seat.hear(1, Input(0.0, place, engaged=False, by_moving=True), 0.01)
-    assert seat.poll(0.1) == Reading(0.9, by_moving=True)
-    assert seat.poll(0.2) == Reading(0.0, by_moving=True)
-    seat.hear(1, TURNED, 0.3)
-    assert seat.poll(0.3).action == 0.8
-    seat.hear(1, RESTING, 0.35)
-    assert seat.poll(0.4).action == 0.03, "its end is no new tap"
-
-
-def test_a_wish_outlives_its_page_and_is_told_once_and_a_tap_is_lost_with_it(seat):
-    take_over(seat)
-    seat.hear(1, Input(at_ms=0.0, action=0.0, engaged=False, wishes=("quit",)), 0.05)
-    seat.get_up(1)
-    reading = seat.poll(0.1)
-    assert (reading.wishes, reading.engaged) == ({"quit"}, False)
-    assert not seat.poll(0.1).wishes
-
-
 PAGES = st.integers(1, 3)
 EVENTS = st.one_of(
     st.tuples(st.just("sit_down"), PAGES),

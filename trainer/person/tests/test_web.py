@@ -18,41 +18,13 @@ from hil_tests.testing.browser import (
     hear,
     origin,
     page,
-    poll,
     reads,
     say,
     view_of_step,
 )
-from hil_tests.testing.people import LET_GO
 from trainer.person import web
 from trainer.person.interface import open_person
 from trainer.person.web import MAX_INPUT_BYTES, Cockpit
-
-
-async def test_what_a_page_holds_or_wishes_is_polled_and_its_closing_is_letting_go(cockpit):
-    async with page(cockpit) as link:
-        assert not cockpit.present
-        echo = await say(link)
-        assert echo == {"kind": "echo", "at_ms": 12.5, "driving": True, "refused": False}
-        assert cockpit.present
-        assert not (await say(link, True, -0.75, wishes=["pause", "restart"]))["refused"]
-        reading = poll(cockpit)
-        assert (reading.engaged, reading.action) == (True, -0.75)
-        assert reading.wishes == {"pause", "restart"}
-        assert not poll(cockpit).wishes
-    await reads(cockpit, lambda reading: not reading.engaged)
-    assert not cockpit.present
-
-
-async def test_a_page_that_falls_silent_has_let_go_and_is_disconnected(cockpit, monkeypatch):
-    monkeypatch.setattr(web, "GONE_S", 0.6)
-    async with page(cockpit) as link:
-        await say(link)
-        await say(link, True, 1.0)
-        said_s = time.monotonic()
-        assert cockpit.poll(said_s).engaged
-        assert cockpit.poll(said_s + 0.51) == LET_GO
-        assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
 
 
 async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
