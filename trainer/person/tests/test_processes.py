@@ -48,7 +48,7 @@ class Training:
             for step in newest_sitting(self.run_dir):
                 if wanted(step):
                     return step
-            time.sleep(0.05)
+            time.sleep(0.3)
         raise AssertionError(f"no such step: {self.process.poll()}")
 
     def end(self) -> tuple[int, str]:
