@@ -11,9 +11,10 @@ or not, duplicated or not, and in order if order is kept.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -31,11 +32,11 @@ class Kind(NamedTuple):
 
     read: Callable[[str], Any]
     write: Callable[[Any], str] = str
-    limit: str = ""  # What a message about a wrong value says besides the example
 
 
 def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kind:
-    """A number with a unit; values are kept and written in the first, whose factor is 1."""
+    """Make the kind of a number with a unit; values are kept in the first, whose factor is 1."""
+    first = next(iter(units))
 
     def read(text: str) -> float | None:
         match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
@@ -44,10 +45,8 @@ def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kin
         value = float(match[1]) * units[match[2]]
         return value if least <= value <= most else None
 
-    def write(value: float) -> str:
-        return repr(float(value)).removesuffix(".0") + next(iter(units))  # Reads back as the same
-
-    return Kind(read, write, f", at most {write(most)}")
+    # Reads back as the same
+    return Kind(read, lambda value: repr(float(value)).removesuffix(".0") + first)
 
 
 def _choice(words: Sequence[str]) -> Kind:
@@ -80,22 +79,18 @@ class Outage:
 
 def _read_outages(text: str) -> tuple[Outage, ...] | None:
     """Read windows with a plus between: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
+    windows = []
     # A plus also stands inside an exponent, where it is followed by a bare number.
-    windows = [_read_outage(part) for part in re.split(r"(?<!e)\+", text)]
-    return None if None in windows else tuple(window for window in windows if window)
-
-
-def _read_outage(text: str) -> Outage | None:
-    match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", text)
-    if match is None or not (match[2] or match[3]):
-        return None
-    times_s = [SECONDS.read(part) for part in match.groups() if part]
-    if None in times_s:
-        return None
-    length_s, other_s, start_s = times_s[0], times_s[1], times_s[-1]
-    if match[2] and length_s >= other_s:
-        raise UserError(f"outage {text!r} never ends: the length comes first, then the period")
-    return Outage(length_s, start_s, other_s if match[2] else None)
+    for part in re.split(r"(?<!e)\+", text):
+        match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", part)
+        times_s = [SECONDS.read(word) for word in match.groups() if word] if match else []
+        if match is None or len(times_s) < 2 or None in times_s:
+            return None
+        length_s, period_s = times_s[0], times_s[1] if match[2] else None
+        if period_s is not None and length_s >= period_s:
+            return None
+        windows.append(Outage(length_s, times_s[-1], period_s))
+    return tuple(windows)
 
 
 def _write_outages(outages: tuple[Outage, ...]) -> str:
@@ -130,7 +125,7 @@ class DirectionSpec:
     tail: str = _setting("normal", "tail", _choice(TAILS), "|".join(TAILS))
     """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
     burst_messages: float = _setting(0.0, "burst", COUNT, "5")
-    """Mean length of a bad stretch in messages (`BurstLoss`); 0: losses are independent."""
+    """Mean length of a bad stretch in messages (`loss_percents`); 0: losses are independent."""
     burst_loss_percent: float = _setting(100.0, "burst_loss", PERCENT, "80%")
     """Loss inside a bad stretch."""
     clear_loss_percent: float = _setting(0.0, "clear_loss", PERCENT, "0.1%")
@@ -154,17 +149,12 @@ class DirectionSpec:
         if not self.burst_messages:
             return
         clear, loss, burst = self.clear_loss_percent, self.loss_percent, self.burst_loss_percent
-        if not (clear <= loss and clear < burst):
-            raise UserError(
-                f"loss {loss:g}% in bursts of {burst:g}% is impossible with {clear:g}% outside of"
-                " them: clear_loss is at most loss, and below burst_loss"
-            )
         # Good stretches last one message at least, so bad ones cannot fill more than this.
         most = self.burst_messages / (self.burst_messages + 1.0)
-        if self.bad_share > most:
+        if not (clear <= loss and clear < burst and self.bad_share <= most):
             raise UserError(
-                f"loss {loss:g}% is too much for bursts of {self.burst_messages:g} messages: at"
-                f" most {clear + most * (burst - clear):.4g}%, or longer bursts"
+                f"loss {loss:g}% is impossible in bursts of {self.burst_messages:g} messages with"
+                f" {burst:g}% inside and {clear:g}% outside of them"
             )
 
     @property
@@ -216,42 +206,34 @@ def parse_spec(text: str) -> LatencySpec:
     if text.strip() in ("", "none"):
         return LatencySpec()
     given: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
-    for part in map(str.strip, text.split(",")):
-        prefix, dot, rest = part.partition(".")
-        if not dot or prefix not in DIRECTIONS:
-            prefix, rest = "", part
-        for name, value in _parse_part(rest, text):
-            if name in given[prefix]:
-                raise UserError(f"latency {text!r} sets {name} twice")
-            given[prefix][name] = value
     try:
-        ways = ({**given[""], **given[way]} for way in DIRECTIONS)
-        return LatencySpec(
-            *(DirectionSpec(**{SETTINGS[name].name: way[name] for name in way}) for way in ways)
-        )
+        for part in map(str.strip, text.split(",")):
+            prefix, dot, rest = part.partition(".")
+            if not dot or prefix not in DIRECTIONS:
+                prefix, rest = "", part
+            for name, value in _parse_part(rest):
+                if name in given[prefix]:
+                    raise UserError(f"{name} is set twice")
+                given[prefix][name] = value
+        return LatencySpec(*(DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS))
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
 
 
-def _parse_part(part: str, text: str) -> list[tuple[str, Any]]:
-    """Return names and values of a part: a setting, or delay and jitter in their short form."""
+def _parse_part(part: str) -> Iterator[tuple[str, Any]]:
+    """Yield field and value of a setting, or of delay and jitter in their short form."""
     name, is_named, word = part.partition("=")
     pairs = [(name, word)]
-    if not is_named and part[:1].isdigit() and part.count("+-") + part.count("±") < 2:
-        pairs = list(zip(("delay", "jitter"), re.split(r"\+-|±", part), strict=False))
-    found = []
+    if not is_named and (match := re.fullmatch(r"(\d.*?)(?:(?:\+-|±)(.*))?", part)):
+        pairs = [("delay", match[1])] + ([] if match[2] is None else [("jitter", match[2])])
     for name, word in pairs:
         if name not in SETTINGS:
-            raise UserError(f"latency {text!r}: {part!r} is not understood; write {GRAMMAR}")
-        setting = SETTINGS[name].metadata
-        value = setting["kind"].read(word)
-        if value is None:
-            raise UserError(
-                f"latency {text!r}: {part!r} is not understood; write it like"
-                f" {name}={setting['example']}{setting['kind'].limit}"
-            )
-        found.append((name, value))
-    return found
+            raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
+        row = SETTINGS[name]
+        if (value := row.metadata["kind"].read(word)) is None:
+            example = row.metadata["example"]
+            raise UserError(f"{part!r} is not understood; write it like {name}={example}")
+        yield row.name, value
 
 
 LOGNORMAL_SIGMA = 1.0
@@ -285,13 +267,14 @@ at least ``delay - 0.76 jitter`` with ``lognormal`` and ``delay - 0.58 jitter`` 
 """
 
 
-class BurstLoss:
-    """Losses in bursts: a Markov chain with a good and a bad state, and a loss in each.
+def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[float]:
+    """Yield each message's chance to be lost, in percent.
 
-    The model is that of Gilbert (1960, Capacity of a burst-noise channel) as Elliott (1963,
-    Estimates of error rates for codes on burst-noise channels) extended it. The chain begins in its
-    stationary state and steps once per message (not with time: an idle link does not recover). With
-    netem's ``loss gemodel p r 1-h 1-k``::
+    Losses in bursts are a Markov chain with a good and a bad state, and a loss in each: the model
+    of Gilbert (1960, Capacity of a burst-noise channel) as Elliott (1963, Estimates of error rates
+    for codes on burst-noise channels) extended it. The chain begins in its stationary state and
+    steps once per message (not with time: an idle link does not recover). With netem's
+    ``loss gemodel p r 1-h 1-k``::
 
         r   = 1 / burst                     bad to good; a bad stretch has 1/r messages on average
         p   = r s / (1 - s)                 good to bad
@@ -300,22 +283,15 @@ class BurstLoss:
 
     so that ``loss`` stays the overall rate and rows with and without bursts compare.
     """
-
-    def __init__(self, spec: DirectionSpec, rng: np.random.Generator) -> None:
-        share = spec.bad_share
-        self._loss_percent = {True: spec.burst_loss_percent, False: spec.clear_loss_percent}
-        self._to_good = 1.0 / spec.burst_messages
-        self._to_bad = self._to_good * share / (1.0 - share)
-        self._rng = rng
-        self._bad = bool(rng.random() < share)
-
-    def percent(self) -> float:
-        """Return the chance of the next message to be lost, in percent, and step the chain."""
-        percent = self._loss_percent[self._bad]
-        leave = self._to_good if self._bad else self._to_bad
-        if self._rng.random() < leave:
-            self._bad = not self._bad
-        return percent
+    if not spec.burst_messages:
+        yield from itertools.repeat(spec.loss_percent)
+    share, to_good = spec.bad_share, 1.0 / spec.burst_messages
+    to_bad = to_good * share / (1.0 - share)
+    bad = rng.random() < share
+    while True:
+        yield spec.burst_loss_percent if bad else spec.clear_loss_percent
+        if rng.random() < (to_good if bad else to_bad):
+            bad = not bad
 
 
 class LatencyModel:
@@ -327,12 +303,10 @@ class LatencyModel:
 
     def __init__(self, spec: DirectionSpec, seed: np.random.SeedSequence) -> None:
         self.spec = spec
-        bursts, reorder, duplicate = seed.spawn(3)
         self._rng = np.random.default_rng(seed)
-        self._reorder_rng = np.random.default_rng(reorder)
-        self._duplicate_rng = np.random.default_rng(duplicate)
-        burst_rng = np.random.default_rng(bursts)
-        self._bursts = BurstLoss(spec, burst_rng) if spec.burst_messages else None
+        bursts, reorder, duplicate = map(np.random.default_rng, seed.spawn(3))
+        self._reorder_rng, self._duplicate_rng = reorder, duplicate
+        self._loss_percents = loss_percents(spec, bursts)
         self._shape = SHAPES[spec.tail]
         self._line_free_s = self._newest_arrival_s = float("-inf")
 
@@ -341,8 +315,7 @@ class LatencyModel:
 
         Empty if it is lost, two times if it is duplicated. ``size_bytes`` matters with a rate.
         """
-        loss_percent = self._bursts.percent() if self._bursts else self.spec.loss_percent
-        lost = self._rng.random() * 100.0 < loss_percent
+        lost = self._rng.random() * 100.0 < next(self._loss_percents)
         draw = self._rng.standard_normal()
         held_back = self._reorder_rng.random() * 100.0 < self.spec.reorder_percent
         duplicated = self._duplicate_rng.random() * 100.0 < self.spec.duplicate_percent
@@ -351,9 +324,9 @@ class LatencyModel:
         if left_s is None or lost or any(outage.covers(left_s) for outage in self.spec.outages):
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
-        times = sorted(left_s + self._under_way_s(draw) + extra_s for draw in draws)
+        delays_ms = (self.spec.delay_ms + self.spec.jitter_ms * self._shape(d) for d in draws)
+        times = sorted(left_s + max(0.0, delay_ms) * 1e-3 + extra_s for delay_ms in delays_ms)
         if self.spec.order == "kept":
-            # What would arrive before an earlier message arrives with it.
             times = [max(arrival_s, self._newest_arrival_s) for arrival_s in times]
             self._newest_arrival_s = times[-1]
         return tuple(times)
@@ -367,10 +340,6 @@ class LatencyModel:
             return None
         self._line_free_s = begin_s + size_bytes / (self.spec.rate_kbps * 1e3 / 8)
         return self._line_free_s
-
-    def _under_way_s(self, draw: float) -> float:
-        under_way_ms = self.spec.delay_ms + self.spec.jitter_ms * self._shape(draw)
-        return max(0.0, under_way_ms) * 1e-3
 
 
 class Network(NamedTuple):
