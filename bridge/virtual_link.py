@@ -7,9 +7,9 @@ command is held from tick to tick; when none has arrived for 2 T, or when the co
 `VirtualLink` serves lock-step and training under latency. The caller gives the answers: those of a
 real edge runtime, or of a function. An answer takes no virtual time.
 
-In lock-step states come faster than in real time: a real edge runtime would not notice a gap in
-virtual time. So the link runs the safety machine on virtual time itself, from standby at each
-episode's start, and turns into a safe stop what that machine would not drive.
+A real edge runtime does not notice a gap in virtual time. So the link runs the safety machine on
+virtual time itself, from standby at each episode's start, and turns into a safe stop what that
+machine would not drive.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import heapq
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from functools import partial
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -72,9 +73,7 @@ class CommandHold:
     def __init__(self, now_s: float, period_s: float) -> None:
         self._period_s, self._silence_s = period_s, BRAKE_PERIODS * period_s
         self.newest: Command | None = None
-        self._heard_s = now_s
-        self._driven_s = now_s
-        self._sent_s = now_s
+        self._heard_s = self._driven_s = self._sent_s = now_s
         self._fresh = False
 
     @property
@@ -115,22 +114,20 @@ class CommandHold:
             brake_reason = NO_COMMAND
         elif command is not None and command.mode == SAFE_STOP:
             brake_reason = command.reason or UNKNOWN_SAFE_STOP
-        obeys = command is not None and not brake_reason
-        if command is not None and obeys and plan:
+        elif command is not None and plan:
             ridden = min(int((silent_s + ROUNDING_S) / self._period_s), len(plan))
-            action = plan[ridden - 1] if ridden else command.action
-            command = msgspec.structs.replace(command, action=action)
-        decision = Decision(
+            if ridden:
+                command = msgspec.structs.replace(command, action=plan[ridden - 1])
+        fresh, self._fresh = self._fresh, False
+        return Decision(
             command=command,
-            fresh=self._fresh,
+            fresh=fresh,
             brake_reason=brake_reason,
             undriven_s=now_s - self._driven_s if edge_silence_s is None else edge_silence_s,
-            command_age_s=now_s - self._sent_s if obeys else None,
+            command_age_s=now_s - self._sent_s if command and not brake_reason else None,
             ridden=ridden,
             waits=command is None and edge_silence_s is None,
         )
-        self._fresh = False
-        return decision
 
 
 STATE_BYTES = 122  # Besides its observation
@@ -150,13 +147,6 @@ class Arrival(Generic[Message]):
     message: Message
     overtaken: bool
     """An equally new or newer state came before: the edge runtime rejects this without answer."""
-
-
-@dataclass(frozen=True)
-class _Answer:
-    command: Command
-    sent_s: float  # Virtual time of the state's tick
-    computing_s: float
 
 
 class VirtualLink(Generic[Message]):
@@ -186,8 +176,8 @@ class VirtualLink(Generic[Message]):
         self.hold = CommandHold(0.0, period_s)
         self._link = make_network(spec, seed)
         self._on_heard, self._on_stale = on_heard, on_stale
-        self._under_way: list[tuple[float, int, Any]] = []
-        """A heap by arrival time; messages of the same time keep their order."""
+        # A heap by arrival time; messages of the same time keep their order.
+        self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
         self._numbers = itertools.count()
         self._newest_at_edge = -1
         self._safety = Safety(period_s)
@@ -205,25 +195,18 @@ class VirtualLink(Generic[Message]):
         tick_s = step * self._period_s
         self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
         for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
-            self._push(arrival_s, (step, message))
+            self._push(arrival_s, partial(self._arrive_at_edge, step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
         """Let time run to the next state's arrival at the edge runtime; None at window end."""
         while self._under_way and self._under_way[0][0] <= self._window_end_s + ROUNDING_S:
-            now_s, _, message = heapq.heappop(self._under_way)
-            if isinstance(message, _Answer):
-                self._arrive_at_vehicle(message, now_s)
-                continue
-            step, content = message
-            overtaken = step <= self._newest_at_edge
-            if not overtaken:
-                self._newest_at_edge = step
-                self._note_arrival(step, now_s)
-            return Arrival(step, now_s, content, overtaken)
+            now_s, _, arrive = heapq.heappop(self._under_way)
+            if arrival := arrive(now_s):
+                return arrival
         return None
 
-    def _push(self, arrival_s: float, message: tuple[int, Message] | _Answer) -> None:
-        heapq.heappush(self._under_way, (arrival_s, next(self._numbers), message))
+    def _push(self, arrival_s: float, arrive: Callable[[float], Arrival[Message] | None]) -> None:
+        heapq.heappush(self._under_way, (arrival_s, next(self._numbers), arrive))
 
     def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
         """Send the answer to the newest state back; ``computing_s`` is reported only.
@@ -237,9 +220,8 @@ class VirtualLink(Generic[Message]):
         if command.plan:  # as long as the edge runtime's own silence
             ride_s = len(command.plan) * self._period_s
             self._safety = self._safety._replace(ride_s=ride_s)
-        answer = _Answer(command, arrival.step * self._period_s, computing_s)
         for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
-            self._push(arrival_s, answer)
+            self._push(arrival_s, partial(self._arrive_at_vehicle, command, computing_s))
 
     def decide(self, edge_silence_s: float | None = None) -> Decision:
         """Decide this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
@@ -248,7 +230,14 @@ class VirtualLink(Generic[Message]):
         acts_s = self._admitted_s if answered else self._window_end_s
         return self.hold.decide(acts_s, edge_silence_s)
 
-    def _note_arrival(self, step: int, now_s: float) -> None:
+    def _arrive_at_edge(self, step: int, message: Message, now_s: float) -> Arrival[Message]:
+        overtaken = step <= self._newest_at_edge
+        if not overtaken:
+            self._newest_at_edge = step
+            self._judge(step, now_s)
+        return Arrival(step, now_s, message, overtaken)
+
+    def _judge(self, step: int, now_s: float) -> None:
         """Let the edge runtime's safety machine judge the arrival of a newest state."""
         gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
@@ -263,11 +252,11 @@ class VirtualLink(Generic[Message]):
         fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
         self._safety = advance(self._safety, fresh)
 
-    def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
-        answered_step = self.hold.newest_step
-        if not self.hold.admit(answer.command, now_s, answer.sent_s):
+    def _arrive_at_vehicle(self, command: Command, computing_s: float, now_s: float) -> None:
+        answered_step, sent_s = self.hold.newest_step, command.step * self._period_s
+        if not self.hold.admit(command, now_s, sent_s):
             self._on_stale()
             return
         self._admitted_s = now_s
-        if answer.command.step > answered_step:
-            self._on_heard(now_s - answer.sent_s + answer.computing_s)
+        if command.step > answered_step:
+            self._on_heard(now_s - sent_s + computing_s)
