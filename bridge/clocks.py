@@ -1,9 +1,8 @@
 """The clocks: each carries one tick's state out and brings the vehicle's decision back.
 
-Lock-step waits for each answer, and latency passes in virtual time (`virtual_link.py`): states are
-really published in their virtual order of arrival, and each real answer is awaited before it goes
-its virtual way back. Computing takes no virtual time, so the same seed gives the same run on a fast
-and a slow machine.
+In lock-step latency passes in virtual time (`virtual_link.py`): states are published in their
+virtual order of arrival, and each real answer is awaited before it goes its virtual way back.
+Computing takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
 
 Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
 after the episode's start; its state goes out through the delay line, and the vehicle acts at the
@@ -13,13 +12,13 @@ latest T / 4 after the tick on the newest command that has arrived. With a vehic
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import sched
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -46,34 +45,36 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Stop reasons of wall time. In lock-step they mean that the machine stalled."""
 
 
+@dataclass(eq=False)
 class _Clock:
-    """Drives the exchange of one episode at a time: ``begin``, ``exchange`` ..., ``finish``."""
+    """Drives the exchange of one episode at a time: ``begin``, ``exchange`` ..., ``finish``.
 
-    def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
-    ) -> None:
-        self._period_s = task.control_period_s
+    ``begin`` takes the seed of the network's delays and losses.
+    """
+
+    publish: Publish
+    check: CommandCheck
+    spec: LatencySpec
+    task: Task
+    latencies_ms: list[float] = field(default_factory=list)
+    """From state sent to command received, injected delays included; one per answered state."""
+    tick_overruns: int = 0
+    """Ticks that began so late that the simulation slipped behind the wall clock."""
+    missed_ticks: int = 0
+    """Whole ticks of the wall clock that went by without a state because of it."""
+    wall_clock_stalls: int = 0
+    """States of lock-step that the edge runtime answered too late in wall time, not at all, or with
+    a stop for that: it was gone or starved. Always 0 in real time."""
+
+    def __post_init__(self) -> None:
+        self._period_s = self.task.control_period_s
         self._silence_s = BRAKE_PERIODS * self._period_s
-        self._window_s = COMMAND_WINDOW * self._period_s
-        self._observation_bytes = Layout(task).size
-        self.latencies_ms: list[float] = []
-        """From state sent to command received, injected delays included; one per answered state."""
-        self.tick_overruns = 0
-        """Ticks that began so late that the simulation slipped behind the wall clock."""
-        self.missed_ticks = 0
-        """Whole ticks of the wall clock that went by without a state because of it."""
-        self.wall_clock_stalls = 0
-        """States of lock-step that the edge runtime answered too late in wall time, not at all, or
-        with a stop for that: it was gone or starved. Always 0 in real time."""
-        self.check = check
-        self._publish = publish
-        self._spec = spec
         self._hold = CommandHold(0.0, self._period_s)
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
     def rejected(self) -> Counter[str]:
-        """Return the counts of what was not believed so far, by reason."""
+        """Return what was not believed so far, by reason; of feedback as ``feedback_REASON``."""
         return Counter(dict(self.check.rejected))  # Another thread may go on counting
 
     def newest_answer(self) -> tuple[int, float] | None:
@@ -83,17 +84,13 @@ class _Clock:
             return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
-        """Send the final state at once, and forget whatever is still under way.
-
-        It says that the simulation has ended, which no radio link carries: no delay or loss is
-        injected, and no answer is awaited.
-        """
+        """Send the final state past the injected network, and forget whatever is under way."""
         with self._arrived:
             self.check.end(state.step, self._hold.newest_step)
-        self._publish(self._stamped(state))
+        self.publish(self._stamped(state))
 
     def close(self) -> None:
-        """Stop any thread."""
+        pass
 
     def _stamped(self, state: State) -> bytes:
         """Encode the state as it leaves now: with the wall clock and the commands heard."""
@@ -104,29 +101,25 @@ class _Clock:
 class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
-    def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
-    ) -> None:
-        super().__init__(publish, check, spec, task)
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode at virtual time 0; ``seed`` decides the network's delays and losses."""
         self.check.begin(episode)
         self._link: VirtualLink[State] = VirtualLink(
-            self._spec,
+            self.spec,
             seed,
             self._period_s,
-            self._observation_bytes,
+            Layout(self.task).size,
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
             on_stale=lambda: self.check.reject(Reason.STALE.value),
         )
         self._hold = self._link.hold
-        self._answered_at_s: float | None = None
+        self._heard_s = 0.0  # Monotonic time of the last answer, or of the first state
         self._edge_silent = False
 
     def receive(self, payload: bytes) -> None:
-        """Queue one command with the time at which it came."""
         self._inbox.put((payload, time.monotonic()))
 
     def exchange(self, state: State) -> Decision:
@@ -135,7 +128,7 @@ class LockStepClock(_Clock):
         self._link.send_state(state.step, state)
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
-        return self._link.decide(self._wall_silence_s())
+        return self._link.decide(time.monotonic() - self._heard_s if self._edge_silent else None)
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
@@ -144,7 +137,7 @@ class LockStepClock(_Clock):
         while not self._inbox.empty():
             self.check.read(self._inbox.get()[0], time.time_ns())
         published_s = time.monotonic()
-        self._publish(payload)
+        self.publish(payload)
         if arrival.overtaken:
             return  # The edge runtime rejects it as stale, as it should, and does not answer.
         if (answer := self._await_answer(arrival.step, published_s)) is not None:
@@ -152,8 +145,15 @@ class LockStepClock(_Clock):
             self._link.answer(arrival, command, computing_s=received_s - published_s)
 
     def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
-        """Wait in wall time for the answer to exactly this state; return it with its arrival."""
-        deadline_s = self._deadline_s(published_s)
+        """Wait in wall time for the answer to exactly this state; return it with its arrival.
+
+        At most until 2 T after the last answer, and T after this state at least. Once the edge
+        runtime is silent, T for each state is also the pace of the braking steps.
+        """
+        self._heard_s = self._heard_s or published_s
+        deadline_s = published_s + self._period_s
+        if not self._edge_silent:
+            deadline_s = max(deadline_s, self._heard_s + self._silence_s)
         while (wait_s := deadline_s - time.monotonic()) > 0:
             try:
                 payload, received_s = self._inbox.get(timeout=wait_s)
@@ -162,7 +162,7 @@ class LockStepClock(_Clock):
             if (command := self.check.read(payload, time.time_ns())) is None:
                 continue
             if command.step == step:
-                self._answered_at_s, self._edge_silent = received_s, False
+                self._heard_s, self._edge_silent = received_s, False
                 self.wall_clock_stalls += command.reason in WALL_CLOCK_REASONS
                 return command, received_s
             if command.mode != SAFE_STOP:  # In safe stop the edge repeats its last answer.
@@ -171,48 +171,28 @@ class LockStepClock(_Clock):
         self.wall_clock_stalls += 1
         return None
 
-    def _deadline_s(self, published_s: float) -> float:
-        """Return when to stop waiting: 2 T after the last answer, T after this state at least.
-
-        Once the edge runtime is silent, T for each state is also the pace of the braking steps.
-        """
-        answered_at_s = published_s if self._answered_at_s is None else self._answered_at_s
-        if self._edge_silent:
-            return published_s + self._period_s
-        return max(answered_at_s + self._silence_s, published_s + self._period_s)
-
-    def _wall_silence_s(self) -> float | None:
-        """Return the wall time without an answer if the last published state got none."""
-        if self._edge_silent and self._answered_at_s is not None:
-            return time.monotonic() - self._answered_at_s
-        return self._silence_s if self._edge_silent else None
-
 
 class RealTimeClock(_Clock):
     """The clock of ``--clock realtime``.
 
-    The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
-    directions.
+    The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both.
     """
 
-    def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
-    ) -> None:
-        super().__init__(publish, check, spec, task)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._window_s = COMMAND_WINDOW * self._period_s
         self._line = DelayLine()
         self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode now; ``seed`` decides the network's delays and losses."""
         with self._arrived:
             self.check.begin(episode)
             self._start_s = self._begun_s = time.monotonic()
-            self._network = make_network(self._spec, seed)
+            self._network = make_network(self.spec, seed)
             self._hold = CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
-        """Send one command down the line to the vehicle."""
         self._send(self._network.down, payload, self._arrive_at_vehicle)
 
     def exchange(self, state: State) -> Decision:
@@ -227,22 +207,19 @@ class RealTimeClock(_Clock):
             return self._hold.decide(time.monotonic())
 
     def finish(self, state: State) -> None:
-        """Forget what is under way and publish the final state at once."""
         self._line.clear()
         super().finish(state)
 
     def close(self) -> None:
-        """Stop the delay line."""
         self._line.close()
 
     def _send_state(self, state: State) -> float:
-        """Wait for the state's tick, send the state, and return the tick's time."""
         tick_s = self._wait_for_tick(state.step)
         payload = self._stamped(state)
         with self._arrived:
             self._sent_s[state.step] = time.monotonic()
             self.check.sent(state.step)
-        self._send(self._network.up, payload, self._publish)
+        self._send(self._network.up, payload, self.publish)
         return tick_s
 
     def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
@@ -281,7 +258,7 @@ class RealTimeClock(_Clock):
             self._arrived.notify()
 
     def _admitted(self, command: Command) -> None:
-        """Look at a command that the vehicle takes; the caller holds the condition."""
+        pass  # The caller holds the condition.
 
 
 POLL_S = 0.02
@@ -292,28 +269,23 @@ STANDSTILL_WAIT_S = 5.0
 class VehicleClock(RealTimeClock):
     """The clock of ``--loop vehicle``. ``tracking`` keeps what was asked, and what became of it."""
 
-    def __init__(
-        self, publish: Publish, check: CommandCheck, spec: LatencySpec, task: Task
-    ) -> None:
+    def __post_init__(self) -> None:
         self.tracking = TrackingLog()
         self.feedback_ages_ms: list[float] = []
         """At each tick's end, of the feedback that moved the car."""
         self.moving_starts = 0
-        self._action_names = [row.name for row in task.action]
-        self.feedback_check = FeedbackCheck(check, task)
-        super().__init__(publish, check, spec, task)
+        self.feedback_check = FeedbackCheck(self.check)
+        super().__post_init__()
         self.tracking.end()  # No episode has begun.
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode now; the vehicle stands, or is counted as moving."""
         super().begin(episode, seed)
         with self._arrived:
             # Its own stream, so that commands meet the same luck as without it.
-            self._feedback_way = make_network(self._spec, seed + 1).down
+            self._feedback_way = make_network(self.spec, seed + 1).down
             self.tracking.begin()
 
     def receive_feedback(self, payload: bytes) -> None:
-        """Send one feedback down the line to the simulation, on Zenoh's thread."""
         received_s = time.monotonic()
         arrive = partial(self._feedback_arrives, received_s=received_s)
         self._send(self._feedback_way, payload, arrive)
@@ -333,15 +305,12 @@ class VehicleClock(RealTimeClock):
         )
 
     def rejected(self) -> Counter[str]:
-        """Return the counts of commands, and of feedback as ``feedback_REASON``."""
-        counts = dict(self.feedback_check.rejected)
-        feedback = {f"feedback_{name}": count for name, count in counts.items()}
-        return super().rejected() + Counter(feedback)
+        feedback = dict(self.feedback_check.rejected).items()
+        return super().rejected() + Counter({f"feedback_{name}": n for name, n in feedback})
 
     def report(self) -> dict[str, Any]:
-        """Return the report's part ``vehicle``."""
         return {
-            **self.tracking.report(self._action_names),
+            **self.tracking.report([row.name for row in self.task.action]),
             "feedback_age_ms": quantiles(self.feedback_ages_ms),
             "moving_starts": self.moving_starts,
         }
@@ -359,7 +328,6 @@ class VehicleClock(RealTimeClock):
         return decision
 
     def finish(self, state: State) -> None:
-        """Publish the final state at once; the vehicle is to stop."""
         with self._arrived:
             self.tracking.end()
         super().finish(state)
@@ -377,10 +345,10 @@ class VehicleClock(RealTimeClock):
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Return whether a feedback, of any session, satisfies ``holds`` before ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
-        while time.monotonic() < give_up_s:
+        while (now_s := time.monotonic()) < give_up_s:
             with self._arrived:
                 heard, heard_s = self.feedback_check.heard, self.feedback_check.heard_s
-            if heard is not None and time.monotonic() - heard_s <= self._silence_s and holds(heard):
+            if heard is not None and now_s - heard_s <= self._silence_s and holds(heard):
                 return True
             time.sleep(POLL_S)
         return False
@@ -394,7 +362,7 @@ class DelayLine:
     """
 
     def __init__(self) -> None:
-        self._actions = sched.scheduler(time.monotonic)  # Those of the same time keep their order
+        self.clear()
         self._changed = threading.Event()
         self._closed = False
         self._failure: Exception | None = None
@@ -403,22 +371,20 @@ class DelayLine:
 
     def push(self, release_s: float, action: Callable[[], None]) -> None:
         """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
-        self._raise_failure()
-        self._actions.enterabs(release_s, 0, action)
+        if self._failure is not None:
+            raise self._failure
+        self._actions.enterabs(release_s, 0, action)  # Those of the same time keep their order
         self._changed.set()
 
     def clear(self) -> None:
-        """Forget what is still under way."""
-        for event in self._actions.queue:
-            with contextlib.suppress(ValueError):  # It has just left the queue.
-                self._actions.cancel(event)
+        self._actions = sched.scheduler(time.monotonic)
 
     def close(self) -> None:
-        """Stop the thread and wait for it."""
         self._closed = True
         self._changed.set()
         self._thread.join()
-        self._raise_failure()
+        if self._failure is not None:
+            raise self._failure
 
     def _run(self) -> None:
         try:
@@ -427,10 +393,6 @@ class DelayLine:
                 self._changed.clear()
         except Exception as error:  # Handed to whoever uses the line.
             self._failure = error
-
-    def _raise_failure(self) -> None:
-        if self._failure is not None:
-            raise self._failure
 
 
 Clock = LockStepClock | RealTimeClock

@@ -1,7 +1,6 @@
 """Validation of the commands, feedback and health that the simulator hears. No socket.
 
-What is not believed is counted by reason. In the loop with a vehicle, feedback moves the car: it is
-checked as commands are, and counts for 2 T.
+What is not believed is counted by reason.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class CommandCheck:
         self.session = session
         self.rejected: Counter[str] = Counter()
         self.policy_ids: list[str] = []
-        self._actions, self._period_s = task.action, task.control_period_s
+        self.actions, self.period_s = task.action, task.control_period_s
         self.newest = (0, -1)  # Episode and step of the newest state that was sent
         self._ended = (-1, -1)
         self._stamps: deque[int] = deque(maxlen=64)  # Of recent commands: a copy counts once
@@ -50,26 +49,22 @@ class CommandCheck:
         """The next state's fields about this session's commands; empty before the first."""
 
     def begin(self, episode: int) -> None:
-        """Note that an episode begins: answers to earlier episodes are stale from now on."""
+        """Begin an episode: answers to earlier ones are stale from now on."""
         self.newest = (episode, -1)
 
     def sent(self, step: int) -> None:
-        """Note that a state has been sent, so that its answer can be told from an invention."""
+        """Note a state sent, so that its answer can be told from an invention."""
         self.newest = (self.newest[0], step)
 
     def end(self, final_step: int, answered_step: int) -> None:
-        """Note that the episode has ended, and up to which step its states were answered.
-
-        The answers to those after it are still on their way, and come too late without a fault.
-        """
+        """End the episode: answers after ``answered_step`` come too late without a fault."""
         self.sent(final_step)
         self._ended = (self.newest[0], answered_step)
 
     def read(self, payload: bytes, now_ns: int = 0) -> Command | None:
-        """Return the command if it answers a state of this episode; None otherwise.
+        """Return the command if it answers a state of this episode, else None.
 
-        An answer that comes after its episode's end is None, too, but not counted. ``now_ns``
-        is the wall clock.
+        An answer after its episode's end is not counted. ``now_ns`` is the wall clock.
         """
         command = decode_command(payload)
         if isinstance(command, Rejection):
@@ -82,47 +77,46 @@ class CommandCheck:
         if fault := self._fault(command):
             self.reject(fault)
             return None
-        if self._overtaken(command):
+        if self._comes_too_late(command):
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
-        is_stop = command.mode == SAFE_STOP
-        if is_stop and _action_fault(command.action, self._actions, COMMAND_ROUNDING):
+        if command.mode == SAFE_STOP and _action_fault(command.action, self.actions):
             # The mode alone makes it a stop; its action is replaced by a valid one.
-            stop = [row.stop or min(max(0.0, row.low), row.high) for row in self._actions]
+            stop = [row.stop or min(max(0.0, row.low), row.high) for row in self.actions]
             return msgspec.structs.replace(command, action=stop)
         return command
 
     def reject(self, reason: str) -> None:
-        """Count one rejected command."""
         self.rejected[reason] += 1
 
     def _fault(self, command: Command) -> str:
-        """Return why a well-formed command answers nothing in this episode; empty if it does."""
         if command.session != self.session:
             return Reason.FOREIGN_SESSION.value
         plan = command.plan or []
         for action in (command.action, *plan) if command.mode == DRIVE else ():
-            if fault := _action_fault(action, self._actions, COMMAND_ROUNDING):
+            if fault := _action_fault(action, self.actions):
                 return fault
-        if len(plan) * self._period_s > MAX_RIDE_S + ROUNDING_S:
+        if len(plan) * self.period_s > MAX_RIDE_S + ROUNDING_S:
             return "plan_too_long"  # It would keep the vehicle going for longer than any may
         if (command.episode, command.step) > self.newest:
-            return "unknown_step"  # It answers a state never sent
-        if command.episode < self.newest[0] and not self._overtaken(command):
-            return Reason.STALE.value
-        return ""
+            return UNKNOWN_STEP
+        is_old = command.episode < self.newest[0] and not self._comes_too_late(command)
+        return Reason.STALE.value if is_old else ""
 
-    def _overtaken(self, command: Command) -> bool:
+    def _comes_too_late(self, command: Command) -> bool:
         ended_episode, answered_step = self._ended
         return command.episode == ended_episode and command.step > answered_step
 
 
+UNKNOWN_STEP = "unknown_step"  # It answers a state never sent
 COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
 """Of an action's whole range: a policy clamps to the last bit, an actuator is measured."""
 
 
-def _action_fault(values: Sequence[float], actions: Sequence[Action], rounding: float) -> str:
+def _action_fault(
+    values: Sequence[float], actions: Sequence[Action], rounding: float = COMMAND_ROUNDING
+) -> str:
     if len(values) != len(actions):
         return "action_size"  # Another number of actions than the environment's
     for value, row in zip(values, actions, strict=True):
@@ -147,14 +141,13 @@ class FeedbackCheck:
     another board, with another clock, may be there.
     """
 
-    def __init__(self, commands: CommandCheck, task: Task) -> None:
+    def __init__(self, commands: CommandCheck) -> None:
         self.rejected: Counter[str] = Counter()
         self.heard: Feedback | None = None
         """The last readable feedback, of whatever session: a vehicle is there."""
         self.heard_s = 0.0
-        self._commands = commands
-        self._actions, self._silence_s = task.action, BRAKE_PERIODS * task.control_period_s
-        self._met = False
+        self._commands, self._silence_s = commands, BRAKE_PERIODS * commands.period_s
+        self._met = False  # The vehicle has heard of this session.
         self._newest: Feedback | None = None
         self._newest_s = self._received_s = 0.0
 
@@ -172,11 +165,9 @@ class FeedbackCheck:
             return None
         self.heard, self.heard_s = feedback, now_s
         own = feedback.session in (self._commands.session, NOT_COMMANDED)
-        if not own and not self._met:
-            return None
-        fault = self._fault(feedback, now_s) if own else Reason.FOREIGN_SESSION.value
-        if fault:
-            self.rejected[fault] += 1
+        if fault := self._fault(feedback, now_s) if own else Reason.FOREIGN_SESSION.value:
+            if own or self._met:
+                self.rejected[fault] += 1
             return None
         self._met = self._met or feedback.session == self._commands.session
         self._newest, self._newest_s = feedback, now_s
@@ -211,18 +202,15 @@ class FeedbackCheck:
         )
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
-        """Return why a well-formed feedback of this session is not believed; empty if it is."""
-        if fault := _action_fault(feedback.action, self._actions, FEEDBACK_ROUNDING):
+        if fault := _action_fault(feedback.action, self._commands.actions, FEEDBACK_ROUNDING):
             return fault
         if (feedback.episode, feedback.step) > self._commands.newest:
-            return "unknown_step"  # It answers a state never sent
-        newest = self._newest
-        if newest is None:
-            return ""
-        if feedback.sent_ns == newest.sent_ns:
+            return UNKNOWN_STEP
+        newest_ns = -1 if self._newest is None else self._newest.sent_ns
+        if feedback.sent_ns == newest_ns:
             return Reason.DUPLICATE.value
         in_order = now_s - self._newest_s <= self._silence_s
-        return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
+        return Reason.STALE.value if in_order and feedback.sent_ns < newest_ns else ""
 
 
 OVERTAKEN_S = 5.0  # At most, by a message or an answer that came later
@@ -248,8 +236,7 @@ class EdgeCounts:
         if isinstance(health, Health):
             self.observe(health)
         else:
-            with self._lock:
-                self.unreadable = self.unreadable + Counter([f"health_{health.reason.value}"])
+            self.unreadable = self.unreadable + Counter([f"health_{health.reason.value}"])
 
     def observe_status(self, payload: bytes) -> None:
         """Take the JSON answer to the status query, which holds the fields of a health message."""

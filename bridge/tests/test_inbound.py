@@ -28,7 +28,7 @@ def checking(task=TASK):
 
 
 def checking_feedback():
-    return inbound.FeedbackCheck(checking(), TASK)
+    return inbound.FeedbackCheck(checking())
 
 
 BOTH = [
