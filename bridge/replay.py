@@ -48,17 +48,17 @@ EXAMPLE = examples(
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="F.mcap", help="a file of bridge record")
-    parser.add_argument("--policy", metavar="POLICY.onnx", required=True, help="the policy to run")
+    add = parser.add_argument
+    add("recording", metavar="F.mcap", help="a file of bridge record")
+    add("--policy", metavar="POLICY.onnx", required=True, help="the policy to run")
     add_trust(parser)
     config = "settings of the recorded edge runtime, if a vehicle's model or scale was not default"
-    parser.add_argument("--config", metavar="FILE.toml", help=config)
+    add("--config", metavar="FILE.toml", help=config)
     several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
     apart = "largest difference of two equal actions, in the unit of the action"
-    parser.add_argument(
-        "--tolerance", metavar="X", type=not_negative_number, default=DEFAULT_TOLERANCE, help=apart
-    )
+    kind = not_negative_number
+    add("--tolerance", metavar="X", type=kind, default=DEFAULT_TOLERANCE, help=apart)
     add_options(parser, "--out")
 
 
@@ -68,8 +68,8 @@ def run(arguments: Any) -> int:
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
     replayed = replay(drive, policy, config)
-    states = [key_of(state) for state in drive.states()]
-    recording, dropped = drive.recording, drive.recording.metadata.get("dropped", "")
+    states, recording = list(map(key_of, drive.states())), drive.recording
+    dropped = recording.metadata.get("dropped", "")
     report = {
         "recording": str(arguments.recording),
         "vehicle_id": drive.vehicle_id,
@@ -77,7 +77,6 @@ def run(arguments: Any) -> int:
         "recorded_policy_ids": drive.policy_ids,
         "cut_off": recording.cut_off,
         "damaged_places": recording.damaged_places,
-        "damaged_bytes": recording.damaged_bytes,
         "dropped": int(dropped) if dropped.isdecimal() else 0,  # Other programs do not say
         **compare(drive.answers, replayed, states, arguments.tolerance),
     }
@@ -98,8 +97,8 @@ def run(arguments: Any) -> int:
 def _text(answer: Mapping[str, Any] | None) -> str:
     if answer is None:
         return "nothing"
-    reason = f" ({printable(answer['reason'])})" if answer["reason"] else ""
-    return f"{answer['mode']} {[round(x, 4) for x in answer['action']]}{reason}"
+    action = [round(x, 4) for x in answer["action"]]
+    return printable(f"{answer['mode']} {action} {answer['reason']}".strip())
 
 
 class Answer(NamedTuple):
@@ -121,7 +120,6 @@ class Answers(dict[Key, Answer]):
     _repeated: Key | None = None  # Has only a repeated stop so far
 
     def note(self, key: Key, decision: Command | Order) -> None:
-        """Take the next decision of a drive."""
         plan = tuple(value for action in decision.plan or () for value in action)
         answer = Answer(decision.mode, decision.reason, (*decision.action, *plan))
         if key not in self or key == self._repeated:
@@ -142,10 +140,12 @@ class Exchange(NamedTuple):
 
 
 class RecordedDrive:
-    """One vehicle's part of a recording; states are read from the file when they are needed."""
+    """One vehicle's part of a recording; states are read from the file when they are needed.
+
+    Raises UserError where nothing can be replayed.
+    """
 
     def __init__(self, path: Path, vehicle_id: str | None) -> None:
-        """Read everything but the states; UserError where nothing can be replayed."""
         self.recording = Recording(path)
         self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
         self.answers = Answers()
@@ -155,7 +155,7 @@ class RecordedDrive:
         self.task: Task | None = None  # As the simulator's scenes say
         self.plan_periods = 0  # Of the runtime's ride-through
         self.runtime_starts_s: list[float] = []
-        self._zero_ns: int | None = None
+        self._zero_ns = 0  # Arrival of the first message
         self._lead_s: float | None = None  # Of the recorder's clock before the runtime's
         for heard, message in valid_messages(self.recording, self.vehicle_id):
             self._take(heard, message)
@@ -174,8 +174,7 @@ class RecordedDrive:
                     yield state
 
     def _take(self, heard: Heard, message: Any) -> None:
-        if self._zero_ns is None:
-            self._zero_ns = heard.arrived_ns
+        self._zero_ns = self._zero_ns or heard.arrived_ns
         heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
         if heard.topic == "scene":
             self.task = self.task or message.task
@@ -201,17 +200,15 @@ class RecordedDrive:
             arrived_s = max(arrived_s, before.arrived_s) if before else arrived_s
             by_watchdog = command.inference_ns == 0
             begun_s = arrived_s if by_watchdog else sent_s - command.inference_ns * 1e-9
-            begun_s = max(arrived_s, begun_s)
-            times = arrived_s, begun_s, sent_s
+            times = arrived_s, max(arrived_s, begun_s), sent_s
             self.exchanges[key] = Exchange(*times, command.received_ns, by_watchdog)
 
     def _sent_s(self, command: Command, heard_s: float) -> float:
-        """When the command was sent, in the recorder's time.
+        """Return when the command was sent, in the recorder's time.
 
-        The recorder's clock leads a runtime's by as much as at its first command, until one of the
-        clocks is set.
+        The recorder's clock leads a runtime's as at its first command, until a clock is set.
         """
-        stamp_s = (command.sent_ns - (self._zero_ns or 0)) * 1e-9
+        stamp_s = (command.sent_ns - self._zero_ns) * 1e-9
         lead_s = heard_s - stamp_s
         if self._lead_s is None or abs(lead_s - self._lead_s) > CLOCK_STEP_S:
             self._lead_s = lead_s
@@ -219,7 +216,6 @@ class RecordedDrive:
 
 
 def key_of(message: State | Command) -> Key:
-    """Return what a state and its command have in common."""
     return message.session, message.episode, message.step
 
 
@@ -241,7 +237,20 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Answers:
         limits = vehicle_limits(name, config.vehicle_settings, policy.manifest)
     except UserError as error:
         raise UserError(f"{error} (--config FILE.toml: the settings it was driven by)") from None
-    return _Replay(drive, policy, shared_limits(policy.manifest.action, limits)).run()
+    limits = shared_limits(policy.manifest.action, limits)
+    answers, controller, starts_s = Answers(), None, drive.runtime_starts_s[1:]
+    for state in drive.states():
+        if (exchange := drive.exchanges.get(key_of(state))) is None:
+            continue
+        recorded = drive.answers[key_of(state)]
+        if controller is None or (starts_s and exchange.arrived_s >= starts_s[0]):
+            starts_s = [start_s for start_s in starts_s if start_s > exchange.arrived_s]
+            needs_rearm, armed = drive.vehicle != NONE, recorded.reason != Event.NOT_ARMED.value
+            controller = controller_of(policy, limits, drive.plan_periods, needs_rearm, armed)
+        for order in _orders(controller, policy, state, exchange, recorded):
+            if not order.ridden:
+                answers.note(key_of(order.answers.state), order)
+    return answers
 
 
 def controller_of(
@@ -253,63 +262,41 @@ def controller_of(
     return Controller(ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s))
 
 
-class _Replay:
-    def __init__(self, drive: RecordedDrive, policy: Policy, limits: Limits) -> None:
-        self._drive, self._policy, self._limits = drive, policy, limits
-        self._answers = Answers()
+def _orders(
+    controller: Controller, policy: Policy, state: State, exchange: Exchange, recorded: Answer
+) -> Iterator[Order]:
+    """Yield what the runtime decides until it has answered the state."""
+    finished_s = exchange.sent_s
+    if exchange.by_watchdog:
+        too_long = recorded.reason == Event.TOO_LONG.value
+        waited_s = policy.manifest.control_period_s * too_long
+        finished_s = exchange.begun_s + waited_s + JUST_AFTER_S
+    yield from _watchdog(controller, exchange.begun_s)
+    if recorded.mode == DRIVE and controller.waits_for_rearm:
+        controller.rearm(exchange.arrived_s)
+    controller.begin(Received(state, exchange.arrived_s, exchange.arrived_ns), exchange.begun_s)
+    output, layout = None, policy.layout
+    if layout.refusal(state.observation) is None and not is_foreign(state, layout.task_text):
+        output, _ = infer(policy, layout.arrays(state.observation))
+    yield from _watchdog(controller, finished_s)
+    # How long a vehicle's fault stood is not recorded, and need not be: the stop is latched.
+    fault = Event.VEHICLE.value
+    if recorded.reason == fault and controller.safety.reason != fault:
+        controller.vehicle_fault = fault
+    if order := controller.finish(output, 1, finished_s):
+        yield order
+    controller.vehicle_fault = ""
 
-    def run(self) -> Answers:
-        drive = self._drive
-        starts_s, controller = drive.runtime_starts_s[1:], None
-        for state in drive.states():
-            if (exchange := drive.exchanges.get(key_of(state))) is None:
-                continue
-            recorded = drive.answers[key_of(state)]
-            if controller is None or (starts_s and exchange.arrived_s >= starts_s[0]):
-                starts_s = [start_s for start_s in starts_s if start_s > exchange.arrived_s]
-                needs_rearm, armed = drive.vehicle != NONE, recorded.reason != Event.NOT_ARMED.value
-                controller = controller_of(
-                    self._policy, self._limits, drive.plan_periods, needs_rearm, armed
-                )
-            self._answer(controller, state, exchange, recorded)
-        return self._answers
 
-    def _answer(
-        self, controller: Controller, state: State, exchange: Exchange, recorded: Answer
-    ) -> None:
-        finished_s = exchange.sent_s
-        if exchange.by_watchdog:
-            waited_s = self._policy.manifest.control_period_s
-            waited_s *= recorded.reason == Event.TOO_LONG.value
-            finished_s = exchange.begun_s + waited_s + JUST_AFTER_S
-        self._pass_time(controller, exchange.begun_s)
-        if recorded.mode == DRIVE and controller.waits_for_rearm:
-            controller.rearm(exchange.arrived_s)
-        controller.begin(Received(state, exchange.arrived_s, exchange.arrived_ns), exchange.begun_s)
-        output, layout = None, self._policy.layout
-        if layout.refusal(state.observation) is None and not is_foreign(state, layout.task_text):
-            output, _ = infer(self._policy, layout.arrays(state.observation))
-        self._pass_time(controller, finished_s)
-        # How long a vehicle's fault stood is not recorded, and need not be: the stop is latched.
-        fault = Event.VEHICLE.value
-        if recorded.reason == fault and controller.safety.reason != fault:
-            controller.vehicle_fault = fault
-        self._note(controller.finish(output, 1, finished_s))
-        controller.vehicle_fault = ""
-
-    def _pass_time(self, controller: Controller, until_s: float) -> None:
-        """Run the watchdog up to a moment."""
-        last_s = None
-        for _ in range(MOST_REPETITIONS):
-            due_s = controller.next_deadline_s()
-            if due_s in (None, last_s) or due_s + JUST_AFTER_S > until_s:
-                return
-            self._note(controller.tick(due_s + JUST_AFTER_S))
-            last_s = due_s
-
-    def _note(self, order: Order | None) -> None:
-        if order is not None and not order.ridden:
-            self._answers.note(key_of(order.answers.state), order)
+def _watchdog(controller: Controller, until_s: float) -> Iterator[Order]:
+    last_s = None
+    for _ in range(MOST_REPETITIONS):
+        due_s = controller.next_deadline_s()
+        if due_s in (None, last_s) or due_s + JUST_AFTER_S > until_s:
+            return
+        if order := controller.tick(due_s + JUST_AFTER_S):
+            yield order
+        last_s = due_s
 
 
 def compare(
@@ -329,17 +316,18 @@ def compare(
     differences: list[dict[str, Any]] = []
     largest = 0.0
     for key in answered:
-        ours, theirs = recorded[key], replayed.get(key)
+        ours, theirs = recorded[key], replayed.get(key, Answer("", "", ()))
         kind = f"{ours.mode}: {ours.reason}".removesuffix(": ")
         kinds[kind] += 1
-        pairs = zip(ours.action, theirs.action if theirs else (), strict=False)
+        pairs = zip(ours.action, theirs.action, strict=False)
         distance = max((abs(a - b) for a, b in pairs), default=0.0)
         largest = max(largest, distance)
-        if theirs is None or _form(ours) != _form(theirs) or distance > tolerance:
+        same = ours[:2] == theirs[:2] and len(ours.action) == len(theirs.action)
+        if not same or distance > tolerance:
             wrong[kind] += 1
             place = dict(zip(("session", "episode", "step"), key, strict=True))
-            each = {"recorded": ours._asdict(), "replayed": theirs and theirs._asdict()}
-            differences.append({**place, **each})
+            replay = theirs._asdict() if key in replayed else None
+            differences.append({**place, "recorded": ours._asdict(), "replayed": replay})
     return {
         "states": len(states),
         "compared": len(answered),
@@ -353,7 +341,3 @@ def compare(
         },
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
-
-
-def _form(answer: Answer) -> tuple[str, str, int]:
-    return answer.mode, answer.reason, len(answer.action)
