@@ -17,7 +17,6 @@ import tempfile
 from argparse import Namespace
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ import gymnasium
 import msgspec
 import numpy as np
 
-from bridge.clocks import LOCKSTEP, WALL_CLOCK_REASONS, LockStepClock
+from bridge.clocks import LockStepClock
 from bridge.environments import Adapter, Environment, describe, make_environment, scene_of
 from bridge.episode import EpisodeRunner, policy_action
 from bridge.inbound import CommandCheck
@@ -65,7 +64,6 @@ class RecordedEpisode:
     """Of each step: the action, and whether the brake was pressed."""
 
     def take(self, payload: bytes, message: Any) -> None:
-        """Keep a message that is of this episode."""
         origin = message.origin if isinstance(message, Scene) else message
         key = getattr(origin, "session", None), getattr(message, "episode", None)
         if key != (self.origin.session, self.episode):
@@ -90,21 +88,13 @@ class RecordedEpisode:
         """Whether it is recorded to its end."""
         return any(state.final for state in self.states.get(self.steps, ()))
 
-    @property
-    def has_wall_time(self) -> bool:
-        """Whether wall time had a part in it: another clock, or a machine that stood still."""
-        virtual = (self.origin.clock, self.origin.loop) == (LOCKSTEP, "policy")
-        return not virtual or any(c.reason in WALL_CLOCK_REASONS for c in self.commands.values())
-
     def step_at(self, at_s: float) -> int:
         """Return the first step from that time on; UserError where it is not recorded."""
         period_s = self.task.control_period_s
         step = math.ceil(at_s / period_s - 1e-6)
         if step >= self.steps:
-            end = "lasts" if self.ended else "is recorded without a gap for"
-            raise UserError(
-                f"{self.path}: the drive {end} {self.steps * period_s:g} s; fork before"
-            )
+            end_s = self.steps * period_s
+            raise UserError(f"{self.path}: the drive is known for {end_s:g} s; fork before")
         return step
 
     def environment(self, named: str | None = None, option: str = "--env") -> Environment:
@@ -118,21 +108,20 @@ class RecordedEpisode:
             raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
         return made
 
-    def difference(self, step: int, observation: dict[str, bytes], environment: Any) -> str:
-        """Name what differs between a rebuilt step and the recorded one; empty for nothing."""
-        for state in self.states.get(step, ()):
-            for name, data in observation.items():
-                if state.observation.get(name) != data:
-                    return f"the observation {name!r}"
-        known, scene = self.scenes.get(step), scene_of(environment)
-        same = known is None or scene is None or _own_scene(ENCODER.encode(scene)) == known
-        return "" if same else "the scene"
-
     def check(self, step: int, observation: dict[str, bytes], environment: Any) -> None:
         """Raise UserError where a rebuilt step is not as it was recorded."""
-        if found := self.difference(step, observation, environment):
+        differs = {
+            f"the observation {name!r}"
+            for state in self.states.get(step, ())
+            for name, data in observation.items()
+            if state.observation.get(name) != data
+        }
+        known, scene = self.scenes.get(step), scene_of(environment)
+        if known is not None and scene is not None and _own_scene(ENCODER.encode(scene)) != known:
+            differs.add("the scene")
+        if differs:
             where = f"at step {step} ({step * self.task.control_period_s:g} s)"
-            why = f"{where} {found} is another than recorded"
+            why = f"{where} {min(differs)} is another than recorded"
             raise UserError(f"{self.path}: the drive cannot be rebuilt: {why}")
 
     def redo(self, step: int, adapter: Adapter) -> np.ndarray:
@@ -149,10 +138,7 @@ def _own_scene(payload: bytes) -> bytes:
 
 
 def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
-    """Read an episode; ``number`` None: the only one.
-
-    UserError for a recording that does not say how its episodes were begun.
-    """
+    """Read an episode; ``number`` None: the only one."""
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
     begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
@@ -162,10 +148,8 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
             begun.setdefault((message.origin.session, message.episode), about)
     recording.say_missing()
     if not begun:
-        why = "it was recorded by an earlier version, or without its scenes"
-        raise UserError(f"{path} does not say how its drives were begun: {why}")
-    if number is None and len(begun) == 1:
-        number = 0
+        raise UserError(f"{path} does not say how its drives were begun: it holds no scenes")
+    number = 0 if number is None and len(begun) == 1 else number
     if number is None or number >= len(begun):
         which = f"--episode says which, 0 to {len(begun) - 1}"
         raise UserError(f"{path} holds {counted(len(begun), 'drive')}; {which}")
@@ -186,7 +170,6 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
         return getattr(self.env, name)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Rebuild the drive until the fork, with its own seed; UserError where that fails."""
         drive, adapter = self._drive, Adapter(self.env, self._drive.task)
         options = {"standing": True} if drive.origin.standing else None
         seen, info = self.env.reset(seed=drive.origin.seed, options=options)
@@ -215,29 +198,26 @@ class ForkedDrive(LockStepClock):
         out: RecordingWriter | None = None,
     ) -> None:
         self._drive, self._environment, self._fork, self._out = drive, environment, fork, out
-        self._recorded, self._task, self._step = parse_spec(drive.origin.latency), drive.task, 0
+        self._recorded, task, self._step = parse_spec(drive.origin.latency), drive.task, 0
         self.network, self._policy, self._now_s = network or self._recorded, policy, 0.0
         self.first_difference: int | None = None
         """The first step whose action or brake is not as recorded."""
         if policy is not None:
-            if policy.manifest.text != drive.task.text:
-                theirs, ours = policy.manifest.text, drive.task.text
-                raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {ours!r}")
-            self._task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
+            if policy.manifest.text != task.text:
+                theirs = policy.manifest.text
+                raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {task.text!r}")
+            task = msgspec.structs.replace(task, action=policy.manifest.action)
             plans = max((len(command.plan or ()) for command in drive.commands.values()), default=0)
             limits = shared_limits(policy.manifest.action, {})
             self._controller = controller_of(policy, limits, plans, needs_rearm=False)
-        check = CommandCheck("", self._task)
-        super().__init__(lambda payload: None, check, self._recorded, self._task)
+        super().__init__(lambda payload: None, CommandCheck("", task), self._recorded, task)
 
     def run(self) -> EpisodeResult:
         """Drive to the end. UserError where the drive cannot be rebuilt until the fork."""
-        origin = msgspec.structs.replace(
-            self._drive.origin, session="fork", latency=str(self.network)
-        )
-        runner = EpisodeRunner(
-            self._environment, self, self._show, lambda *_: None, self._task, origin, self._apply
-        )
+        changed = {"session": "fork", "latency": str(self.network)}
+        origin = msgspec.structs.replace(self._drive.origin, **changed)
+        shown = self._show, lambda *_: None
+        runner = EpisodeRunner(self._environment, self, *shown, self.task, origin, self._apply)
         result = runner.run(0, origin.seed)
         if result.steps <= self._fork:
             self._drive.check(result.steps, self._last.observation, self._environment)
@@ -255,7 +235,6 @@ class ForkedDrive(LockStepClock):
         return super().exchange(state)
 
     def finish(self, state: State) -> None:
-        """Record the final state."""
         self._last = state
         self._write("state", state, state.sim_time_s)
 
@@ -280,9 +259,9 @@ class ForkedDrive(LockStepClock):
             command = command if given else answer
         self._write("state", state, arrival.arrived_s)
         if command is not None:
-            stamps = dict.fromkeys(("received_ns", "sent_ns"), sent_ns) | {"inference_ns": 0}
-            place = {"session": state.session, "episode": state.episode}
-            told = msgspec.structs.replace(command, **place, **stamps)
+            stamps: dict[str, Any] = {"received_ns": sent_ns, "sent_ns": sent_ns, "inference_ns": 0}
+            stamps |= {"session": state.session, "episode": state.episode}
+            told = msgspec.structs.replace(command, **stamps)
             self._write("command", told, arrival.arrived_s)
             self._link.answer(arrival, command)
 
@@ -314,6 +293,10 @@ class ForkedDrive(LockStepClock):
         return self._drive.began_ns + round(at_s * 1e9)
 
 
+def _seconds(text: str) -> float:
+    return cli.seconds(text.removesuffix("s"))
+
+
 def add_place(parser: Any) -> None:
     """Declare the options that say where a recording is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
@@ -323,10 +306,6 @@ def add_place(parser: Any) -> None:
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 
-def _seconds(text: str) -> float:
-    return cli.seconds(text.removesuffix("s"))
-
-
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
     """Return the drive that the options name, and the step of its fork."""
     drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
@@ -334,19 +313,20 @@ def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
 
 
 def _add_fork_arguments(parser: Any) -> None:
-    parser.add_argument("recording", metavar="F.mcap", type="path", help="a file of bridge record")
+    add = parser.add_argument
+    add("recording", metavar="F.mcap", type="path", help="a file of bridge record")
     add_place(parser)
     module = "the environment, if it is in a module: no file decides what is imported"
-    parser.add_argument("--env", metavar="ENV", help=module)
+    add("--env", metavar="ENV", help=module)
     add_options(parser, "--out")
     policy = "the policy that drives on (default: the drive is rebuilt to its end)"
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     record = "record the fork, as `bridge record` does; with --human a directory"
-    parser.add_argument("--policy", metavar="POLICY.onnx", type="path", help=policy)
+    add("--policy", metavar="POLICY.onnx", type="path", help=policy)
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
-    parser.add_argument("--human", metavar="web", help=human)
-    parser.add_argument("--record", metavar="G.mcap", help=record)
+    add("--human", metavar="web", help=human)
+    add("--record", metavar="G.mcap", help=record)
 
 
 def _run_fork(asked: Namespace) -> int:
@@ -373,7 +353,6 @@ def _run_fork(asked: Namespace) -> int:
             out.finish(dropped=0)
             write_atomic(record, made.read_bytes())
     first, period_s = forked.first_difference, drive.task.control_period_s
-    policy_ids = {command.policy_id for command in drive.commands.values()}
     report = {
         "recording": asked.recording,
         "episode": drive.number,
@@ -381,37 +360,32 @@ def _run_fork(asked: Namespace) -> int:
         "at_s": round(fork * period_s, 6),
         "latency_spec": str(forked.network),
         "policy_id": "" if policy is None else policy.policy_id,
-        "recorded_policy_ids": sorted(policy_ids),
-        "recorded_states": sum(map(len, drive.states.values())),
+        "recorded_policy_ids": sorted({each.policy_id for each in drive.commands.values()}),
         "recorded": None if recorded is None else asdict(recorded),
         "fork": asdict(found),
         "differs_from_s": None if first is None else round(first * period_s, 6),
     }
     write_json_out(asked.out, report)
     how = "the same to the bit" if first is None else f"another from {first * period_s:g} s on"
-    if drive.has_wall_time:
-        how += "; wall time was in the recorded drive, so it need not be the same"
-    at = f"forked at {fork * period_s:g} s: {_ended(found)}; {how}"
-    print(printable(f"recorded: {_ended(recorded)}; {at}"))
+    ends = [
+        f"{end.outcome} after {end.time_s:g} s, {end.distance_m:.2f} m" if end else "not to its end"
+        for end in (recorded, found)
+    ]
+    at = f"forked at {fork * period_s:g} s"
+    print(printable(f"recorded: {ends[0]}; {at}: {ends[1]}; {how}"))
     return 0
-
-
-def _ended(result: EpisodeResult | None) -> str:
-    if result is None:
-        return "not to its end"
-    return f"{result.outcome} after {result.time_s:g} s, {result.distance_m:.2f} m"
 
 
 def _hand_over(asked: Namespace) -> int:
     """Let the trainer's command take this process's place: it has the screen and the signals."""
     if asked.latency is not None or asked.out is not None:
         raise UserError("--human takes no --latency and no --out: it drives without a network")
-    given = {"--at": asked.at, "--human": asked.human, "--episode": asked.episode}
-    given |= {"--vehicle-id": asked.vehicle_id, "--scenario": asked.env, "--out": asked.record}
-    given |= {"--policy": asked.policy, "--public-key": asked.public_key}
-    words = [str(w) for pair in given.items() if pair[1] is not None for w in pair]
-    if find_spec("trainer") is None:
-        raise UserError("this needs the trainer, which is not installed here")
+    given = {
+        "--at": asked.at, "--human": asked.human, "--episode": asked.episode,
+        "--vehicle-id": asked.vehicle_id, "--scenario": asked.env, "--out": asked.record,
+        "--policy": asked.policy, "--public-key": asked.public_key,
+    }  # fmt: skip
+    words = [str(word) for pair in given.items() if pair[1] is not None for word in pair]
     command = [sys.executable, "-m", "trainer", "drive", "--from", asked.recording, *words]
     os.execv(sys.executable, command)
 

@@ -190,7 +190,7 @@ def of_a_module(topic, message):
         (a_pixel, "at step 12 (1.2 s) the observation 'frames' is another than recorded"),
         (a_car, "at step 31 (3.1 s) the scene is another than recorded"),
         (an_action, "at step 6 (0.6 s) the "),
-        (without_a_scene, "is recorded without a gap for 0.8 s"),
+        (without_a_scene, "is known for 0.8 s"),
         (without_origins, "does not say how its drives were begun"),
         (of_a_module, f"was driven in {TOY}: a module is imported only"),
     ],
