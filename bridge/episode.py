@@ -1,8 +1,4 @@
-"""Drive one episode of an environment over the wire.
-
-Each tick sends a state, takes the decision back, and steps the environment with the policy's
-command, or with what a vehicle made of it.
-"""
+"""Drive one episode of an environment over the wire."""
 
 from __future__ import annotations
 
@@ -81,10 +77,6 @@ class EpisodeRunner:
         """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
         self.ridden_steps = 0
         """Ticks in which an action of an earlier command's plan was done."""
-        self._ridden = 0  # `Decision.ridden` of the tick before
-        self._under_way: State | None = None
-        self._applied: tuple[list[float] | None, bool] = (None, False)
-        self._options = {"standing": True} if self.origin.standing else None
 
     def show_task(self, seed: int) -> None:
         """Send one state, which is final, so that the edge runtime compares the task as well.
@@ -100,7 +92,7 @@ class EpisodeRunner:
         Where it is cut short (^C, a fault of the environment) a final state goes out as well, so
         that the edge runtime stands by instead of stopping for a link that seems to be lost.
         """
-        self._under_way = None
+        self._under_way: State | None = None
         try:
             return self._drive(episode, seed)
         except BaseException:
@@ -109,17 +101,17 @@ class EpisodeRunner:
             raise
 
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
-        observation, info = self.environment.reset(seed=seed, options=self._options)
+        options = {"standing": True} if self.origin.standing else None
+        observation, info = self.environment.reset(seed=seed, options=options)
         self.clock.begin(episode, seed)
         self._adapter.last = self._adapter.hands_off
-        self._ridden = 0
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
-        self._applied = (None, False)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
+        applied: dict[str, Any] = {}  # What the scene says of the step before
         felt, ended = [], False
         while not ended:
             state = self._state(episode, result.steps, observation, info)
-            self._show(state)
+            self._show(state, applied)
             self._under_way = state
             decision = self.clock.exchange(state)
             if decision.brake_reason == Event.OTHER_TASK.value:
@@ -130,30 +122,32 @@ class EpisodeRunner:
             action = self.apply(self._adapter, decision)
             observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
-            applied = [float(value) for value in action.ravel()]
-            result.actions.append(applied)
-            self._applied = (applied, bool(decision.brake_reason))
+            result.actions.append([float(value) for value in action.ravel()])
             result.reward += finite("reward", reward)
             felt.append(accelerations(info))
-            self.deadline_misses += not decision.fresh
-            self._ridden = decision.ridden
-            self.ridden_steps += decision.ridden > 0
-            if decision.command_age_s is not None:
-                self.command_ages_ms.append(decision.command_age_s * 1e3)
-            self.safe_stops.observe(episode, state.step, decision, _speed_mps(info) or 0.0)
-            self.on_tick(episode, state.step, decision)
+            self._note(episode, state.step, decision, info)
+            braked = bool(decision.brake_reason)
+            applied = {"applied": result.actions[-1], "braked": braked, "ridden": decision.ridden}
             ended = bool(terminated or truncated)
         final = self._state(episode, result.steps, observation, info, final=True)
-        self._show(final)
+        self._show(final, applied)
         self.clock.finish(final)
         self._under_way = None
         result.outcome = outcome_of(info, only_truncated=not terminated)
-        result.distance_m = _number(info, "distance_m")
+        result.distance_m = _number(info, "distance_m") or 0.0
         result.time_s = round(result.steps * self._period_s, 6)
         result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
             of_known, zip(*felt, strict=True)
         )
         return result
+
+    def _note(self, episode: int, step: int, decision: Decision, info: dict[str, Any]) -> None:
+        self.deadline_misses += not decision.fresh
+        self.ridden_steps += decision.ridden > 0
+        if decision.command_age_s is not None:
+            self.command_ages_ms.append(decision.command_age_s * 1e3)
+        self.safe_stops.observe(episode, step, decision, _number(info, "speed_mps") or 0.0)
+        self.on_tick(episode, step, decision)
 
     def _state(
         self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
@@ -165,32 +159,27 @@ class EpisodeRunner:
             sim_time_s=round(step * self._period_s, 6),
             sent_ns=0,  # The clock stamps it when it sends it.
             observation={} if observation is None else self._adapter.pack(observation),
-            speed_mps=_speed_mps(info),
+            speed_mps=_number(info, "speed_mps"),
             final=final,
             task=self.task.text,
         )
 
-    def _show(self, state: State) -> None:
+    def _show(self, state: State, applied: dict[str, Any]) -> None:
         step, round_trip_ms = self.clock.newest_answer() or (None, None)
-        applied, braked = self._applied
         stamps = Scene(
             episode=state.episode, step=state.step, sim_time_s=state.sim_time_s,
             round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.clock.rejected()),
-            task=self.task, origin=self.origin, applied=applied, braked=braked,
-            ridden=self._ridden,
+            task=self.task, origin=self.origin, **applied,
         )  # fmt: skip
         self.publish_scene(self.environment, stamps)
 
 
 def accelerations(info: Mapping[str, Any]) -> list[float | None]:
     """Return |a| of a step in the order of ACCELERATIONS; None where it is unknown."""
-    return [None if info.get(n) is None else abs(finite(n, info[n])) for n in ACCELERATIONS]
+    values = (_number(info, name) for name in ACCELERATIONS)
+    return [None if value is None else abs(value) for value in values]
 
 
-def _speed_mps(info: dict[str, Any]) -> float | None:
-    return None if info.get("speed_mps") is None else _number(info, "speed_mps")
-
-
-def _number(info: dict[str, Any], name: str) -> float:
+def _number(info: Mapping[str, Any], name: str) -> float | None:
     value = info.get(name)
-    return 0.0 if value is None else finite(name, value)
+    return None if value is None else finite(name, value)

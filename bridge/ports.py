@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any, NoReturn
 
 import msgspec
@@ -70,10 +71,11 @@ class SimulatorPort:
         self._zenoh = zenoh_session
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
-        states, ours = key(vehicle_id, "state"), f"phil/{vehicle_id}"
-        self._states = zenoh_session.declare_publisher(states, congestion_control=drop)
-        self._scenes = zenoh_session.declare_publisher(f"{ours}/scene", congestion_control=drop)
-        token = zenoh_session.liveliness().declare_token(f"{ours}/simulator")
+        self._states, self._scenes = (
+            zenoh_session.declare_publisher(f"phil/{vehicle_id}/{topic}", congestion_control=drop)
+            for topic in ("state", "scene")
+        )
+        token = zenoh_session.liveliness().declare_token(f"phil/{vehicle_id}/simulator")
         self._declared: list[Any] = [self._states, self._scenes, token]
         self.hear("health", self.edge_counts.observe_message)
 
@@ -92,9 +94,8 @@ class SimulatorPort:
     def publish_scene(self, environment: Any, stamps: Scene) -> None:
         """Send the scene, or else the environment's picture, if anybody is listening."""
         somebody: Any = self._scenes.matching_status
-        if not somebody.matching:
-            return
-        self._scenes.put(scene_payload(environment, stamps))
+        if somebody.matching:
+            self._scenes.put(scene_payload(environment, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
@@ -129,7 +130,6 @@ class SimulatorPort:
         return any(reply.ok for reply in tokens) or any(True for _ in self._statuses())
 
     def _statuses(self) -> Iterator[bytes]:
-        """Yield the edge runtime's answers to the status query."""
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
             if reply.ok is not None:
                 yield reply.ok.payload.to_bytes()
@@ -161,13 +161,10 @@ def open_port(
         rules = access.rules_for_listener([vehicle_id])
     # Behind a router a client: two peers there would not hear one another.
     if connect is not None:
-        zenoh_session = connect_client(connect, wait_s, tls)
+        session = connect_client(connect, wait_s, tls)
     else:
-        zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
-    with (
-        contextlib.closing(zenoh_session),
-        contextlib.closing(SimulatorPort(zenoh_session, vehicle_id, tls)) as port,
-    ):
+        session = open_session(listen=listen, mode="router", tls=tls, access=rules)
+    with closing(session), closing(SimulatorPort(session, vehicle_id, tls)) as port:
         yield port
 
 
@@ -178,19 +175,14 @@ class WireListener:
         self.simulator_seen = threading.Event()
         self.dropped = 0
         self.end_s = math.inf  # Unix time at which its certificate ends
+        self.queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
         self._simulators: set[str] = set()
-        self._queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
         self._zero_ns = time.time_ns() - time.monotonic_ns()
-
-    @property
-    def waiting(self) -> int:
-        """How many messages wait in the queue."""
-        return self._queue.qsize()
 
     def next(self, timeout_s: float) -> Heard | None:
         """Return the next message, or None after ``timeout_s``."""
         with contextlib.suppress(queue.Empty):
-            return self._queue.get(timeout=timeout_s)
+            return self.queue.get(timeout=timeout_s)
         return None
 
     def until_gone(
@@ -208,7 +200,7 @@ class WireListener:
             now_s = time.monotonic()
             if self._simulators:
                 seen_s = now_s
-            elif now_s - seen_s >= linger_s and not self.waiting:
+            elif now_s - seen_s >= linger_s and self.queue.empty():
                 return
 
     def hear(self, sample: zenoh.Sample) -> None:
@@ -223,7 +215,7 @@ class WireListener:
         """Take a token that comes or goes."""
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
         if "*" in key:
-            return  # no vehicle's own
+            return
         if key.endswith("/simulator"):
             (self._simulators.add if here else self._simulators.discard)(key)
             if here:
@@ -233,7 +225,7 @@ class WireListener:
     def _put(self, key: str, payload: bytes, size: int) -> None:
         topic, arrived_ns = key.rpartition("/")[2], self._zero_ns + time.monotonic_ns()
         try:
-            self._queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
+            self.queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
         except queue.Full:
             self.dropped += 1
 
@@ -253,24 +245,21 @@ def open_listener(
         check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s
     with contextlib.ExitStack() as stack:
-        session = stack.enter_context(contextlib.closing(connect_client(connect, wait_s, tls)))
+        session = stack.enter_context(closing(connect_client(connect, wait_s, tls)))
         listener, keys = WireListener(), f"phil/{vehicle_id}"
         if tls is not None:
             listener.end_s = tls.expires.timestamp()
+        # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
+        hear = zenoh.handlers.Callback(listener.hear, indirect=False)
         for topic in DECODERS:
-            # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
-            hear = zenoh.handlers.Callback(listener.hear, indirect=False)
             stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
         for topic in TOKEN_TOPICS:
             declare, watch = session.liveliness().declare_subscriber, listener.watch
             stack.enter_context(declare(f"{keys}/{topic}", watch, history=True))
         # Where the vehicle never was, nothing would tell the listener to end.
         if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-            if vehicle_id == ANY_VEHICLE:
-                which, hint = "", "start one: python -m bridge simulate"
-            else:
-                which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
-            raise UserError(f"no simulator{which} at {connect}; {hint}")
+            where = f"vehicle {vehicle_id} at {connect}"
+            raise UserError(f"no simulator of {where}; start one, or name another --vehicle-id")
         yield listener
         if tls is not None:
             tls.require_valid(time.time())
@@ -290,7 +279,6 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
-_FOLDER = {"metavar": "DIR", "type": "path"}
 _VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
 _TLS = "folder with ca.pem, cert.pem and key.pem (python -m deploy certs), for tls/... endpoints"
 _UNTIL = "stop after this time, in s (default: when no simulator is left)"
@@ -298,7 +286,7 @@ _NETWORK = "simulated network: " + GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "endpoint for edge runtimes and viewers"},
     "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": "simulator or router"},
-    "--tls": {**_FOLDER, "help": _TLS},
+    "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
     "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
     "--wait-s": {**_SECONDS, "default": 10.0, "help": "longest wait for a simulator, in s"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},
@@ -341,34 +329,35 @@ def _add_router_arguments(parser: Any) -> None:
 
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
-    listens = list(dict.fromkeys(arguments.listen or [DEFAULT_ENDPOINT]))
-    tls, rules, ready = None, None, f"config={arguments.config}"
-    if arguments.config is None:
-        ready = f"listen={','.join(listens)}"
-        tls = tls_for(arguments.tls, *listens)
-    elif arguments.listen or arguments.tls or arguments.vehicle_id:
+    listens, config = arguments.listen or [DEFAULT_ENDPOINT], arguments.config
+    if config and (arguments.listen or arguments.tls or arguments.vehicle_id):
         raise UserError("--config goes with no other option: the file says it all")
+    tls, rules = tls_for(arguments.tls, *listens), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
-        if arguments.config is None:
+        if config is None:
             session = open_session(listen=listens, mode="router", tls=tls, access=rules)
         else:
-            read_bytes(arguments.config, "router's config file")
+            read_bytes(config, "router's config file")
             try:  # as zenohd would
-                session = zenoh.open(zenoh.Config.from_file(arguments.config))
+                session = zenoh.open(zenoh.Config.from_file(config))
             except zenoh.ZError as error:
-                raise UserError(f"Zenoh opens no router with {arguments.config}: {error}") from None
-        with contextlib.closing(session):
-            print(f"ready {ready}", flush=True)
+                raise UserError(f"Zenoh opens no router with {config}: {error}") from None
+        with closing(session):
+            print(f"ready config={config}" if config else f"ready listen={','.join(listens)}")
+            sys.stdout.flush()
             wait_to_be_told(tls)
     return 0
 
 
-ROUTER_EXAMPLE = examples(
-    "python -m bridge router --listen tcp/127.0.0.1:7447",
-    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
-    "    --vehicle-id hunter01 --vehicle-id hunter02",
+ROUTER = Subcommand(
+    examples(
+        "python -m bridge router --listen tcp/127.0.0.1:7447",
+        "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+        "    --vehicle-id hunter01 --vehicle-id hunter02",
+    ),
+    _add_router_arguments,
+    _run_router,
 )
-ROUTER = Subcommand(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

@@ -17,8 +17,7 @@ class ProgressBar:
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.done = what, total, done
-        self._began_s = self._line_s = time.monotonic()
-        self._began_at = done
+        self._line_s = time.monotonic()
         self._bar = Progress(
             *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
             TextColumn("{task.fields[figures]}", markup=False),
@@ -48,14 +47,8 @@ class ProgressBar:
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         self._bar.update(self._task, completed=self.done, figures=text)
-        if not self._bar.disable:
-            return
         now_s = time.monotonic()
-        if told:
-            self.say(told)
-        elif now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total:
+        is_due = now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total
+        if self._bar.disable and (told or is_due):
             self._line_s = now_s
-            each_s = (now_s - self._began_s) / max(self.done - self._began_at, 1)
-            left = f"ETA {each_s * max(self.total - self.done, 0):.0f} s"
-            line = f"{self.what}: {self.done}/{self.total}  {text}  {left}"
-            print(line, file=sys.stderr, flush=True)
+            self.say(told or f"{self.what}: {self.done}/{self.total}  {text}")

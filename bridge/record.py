@@ -111,7 +111,7 @@ def _listen(
     for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
-            writer.write(heard, with_view=listener.waiting < QUEUE_MESSAGES // 2)
+            writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
         if time.monotonic() >= flush_s:
             writer.flush()
             flush_s = time.monotonic() + FLUSH_S

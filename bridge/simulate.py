@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from argparse import Namespace
+from contextlib import ExitStack, closing
 from typing import Any
 
 import msgspec
@@ -33,7 +33,6 @@ from edge_runtime.cli import (
     sigterm_as_interrupt,
 )
 from edge_runtime.files import write_json_out
-from edge_runtime.manifest import Task
 from edge_runtime.run import rearm_command
 from edge_runtime.transport import DEFAULT_ENDPOINT, tls_for
 from edge_runtime.util import UserError, printable
@@ -55,10 +54,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     loop = "the car follows the policy's commands, or (realtime only) the reports of the vehicle"
     loop += " behind the edge runtime"
     standing = "begin every episode at rest (always so with --loop vehicle)"
+    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
     add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
-    period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
@@ -72,51 +71,41 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_options(parser, "--seed", help="episode i is reset with seed + i")
 
 
-def run(arguments: Namespace) -> int:
-    """Run the command."""
-    if arguments.loop == VEHICLE and arguments.clock != REALTIME:
+def run(asked: Namespace) -> int:
+    """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
+    if asked.loop == VEHICLE and asked.clock != REALTIME:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
-    arguments.standing |= arguments.loop == VEHICLE
-    arguments.tls = tls_for(arguments.tls, arguments.connect or arguments.listen)
-    with (
-        contextlib.closing(make_environment(arguments.env, arguments.condition)) as environment,
-        sigterm_as_interrupt(),
-    ):
-        report = _serve(arguments, environment)
-    write_json_out(arguments.out, report)
+    asked.standing |= asked.loop == VEHICLE
+    endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
+    tls = tls_for(asked.tls, endpoint)
+    with ExitStack() as stack:
+        environment = stack.enter_context(closing(make_environment(asked.env, asked.condition)))
+        stack.enter_context(sigterm_as_interrupt())
+        task = describe(environment, asked.period)
+        opened = open_port(asked.listen, asked.vehicle_id, tls, asked.connect, wait_s)
+        port = stack.enter_context(opened)
+        kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
+        check = CommandCheck(port.session, task)
+        clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
+        bar = stack.enter_context(ProgressBar("episodes", asked.episodes))
+        bar.show("waiting for an edge runtime")
+        port.hear("command", clock.receive)
+        port.wait_for_edge(wait_s, endpoint)
+        if isinstance(clock, VehicleClock):
+            port.hear("feedback", clock.receive_feedback)
+            clock.wait_for_vehicle(wait_s, asked.vehicle_id)
+        report = _drive(asked, environment, port, clock, bar)
+    write_json_out(asked.out, report)
     print(summary_line(report))
     return 0
 
 
-def _serve(asked: Namespace, environment: Environment) -> dict[str, Any]:
-    """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
-    endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
-    task = describe(environment, asked.period)
-    with open_port(asked.listen, asked.vehicle_id, asked.tls, asked.connect, wait_s) as port:
-        kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
-        check = CommandCheck(port.session, task)
-        clock = kind(port.publish_state, check, asked.latency, task)
-        with contextlib.closing(clock), ProgressBar("episodes", asked.episodes) as bar:
-            bar.show("waiting for an edge runtime")
-            port.hear("command", clock.receive)
-            port.wait_for_edge(wait_s, endpoint)
-            if isinstance(clock, VehicleClock):
-                port.hear("feedback", clock.receive_feedback)
-                clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-            return _drive(asked, environment, port, clock, bar, task)
-
-
 def _drive(
-    asked: Namespace,
-    environment: Environment,
-    port: SimulatorPort,
-    clock: Clock,
-    bar: ProgressBar,
-    task: Task,
+    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock, bar: ProgressBar
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
-    network, manifest = str(asked.latency), port.edge_manifest()
+    network, task, manifest = str(asked.latency), clock.task, port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
     runner = EpisodeRunner(
@@ -149,29 +138,25 @@ def _drive(
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
-    return make_report(
-        results,
-        runner.safe_stops.events,
-        clock.latencies_ms,
-        runner.command_ages_ms,
-        facts={
-            "scenario": task.task,
-            **how,
-            "latency_spec": network,
-            "policy_ids": clock.check.policy_ids,
-            "deadline_misses": runner.deadline_misses,
-            "ridden_steps": runner.ridden_steps,
-            "tick_overruns": clock.tick_overruns,
-            "missed_ticks": clock.missed_ticks,
-            "wall_clock_stalls": clock.wall_clock_stalls,
-            "edge_changes": edge.changes,
-            "rejected": dict(edge.rejected + by_simulator),
-            "rejected_by_edge": dict(edge.rejected),
-            "rejected_by_simulator": dict(by_simulator),
-            "wall_s": wall_s,
-            "vehicle": vehicle.report() if vehicle else None,
-        },
-    )
+    facts = {
+        "scenario": task.task,
+        **how,
+        "latency_spec": network,
+        "policy_ids": clock.check.policy_ids,
+        "deadline_misses": runner.deadline_misses,
+        "ridden_steps": runner.ridden_steps,
+        "tick_overruns": clock.tick_overruns,
+        "missed_ticks": clock.missed_ticks,
+        "wall_clock_stalls": clock.wall_clock_stalls,
+        "edge_changes": edge.changes,
+        "rejected": dict(edge.rejected + by_simulator),
+        "rejected_by_edge": dict(edge.rejected),
+        "rejected_by_simulator": dict(by_simulator),
+        "wall_s": wall_s,
+        "vehicle": vehicle.report() if vehicle else None,
+    }
+    stops, ages_ms = runner.safe_stops.events, runner.command_ages_ms
+    return make_report(results, stops, clock.latencies_ms, ages_ms, facts)
 
 
 def _shown_on(bar: ProgressBar, port: SimulatorPort, rearm: str) -> OnTick:
@@ -180,9 +165,8 @@ def _shown_on(bar: ProgressBar, port: SimulatorPort, rearm: str) -> OnTick:
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
         nonlocal waited
-        reason = printable(decision.brake_reason)
-        doing = f"braking: {reason}" if reason else "driving"
-        bar.show(f"step {step:3d}  {doing[:40]}")
+        doing = f"braking: {decision.brake_reason}" if decision.brake_reason else "driving"
+        bar.show(f"step {step:3d}  {printable(doing)[:40]}")
         newest = port.edge_counts.newest
         waits = newest is not None and newest.needs_rearm
         if waits and not waited:

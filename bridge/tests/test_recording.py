@@ -273,7 +273,7 @@ def test_a_feed_that_falls_behind_drops_and_counts():
             session.put("phil/v/state", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: feed.dropped == 5, "the queue to be full")
         subscriber.undeclare()
-    assert feed.waiting == QUEUE_MESSAGES
+    assert feed.queue.qsize() == QUEUE_MESSAGES
 
 
 def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):

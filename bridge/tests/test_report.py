@@ -58,7 +58,7 @@ def test_a_limit_of_steps_is_a_timeout_where_another_episode_tells(outcomes, suc
 def test_no_progress_tells_of_less_than_nothing_to_come(capsys):
     with ProgressBar("training", 10) as bar:
         bar.advance({"return": "3.0"}, 14)  # An episode is driven to its end.
-    assert capsys.readouterr().err == "training: 14/10  return 3.0  ETA 0 s\n"
+    assert capsys.readouterr().err == "training: 14/10  return 3.0\n"
 
 
 def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tmp_path):
