@@ -1,16 +1,14 @@
 """Both ends: what each hears."""
 
 import contextlib
-import itertools
-import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
-import gymnasium
 import pytest
-import zenoh
 
 from bridge import ports
 from bridge.messages import Scene, decode_scene
@@ -56,35 +54,20 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
 
 
 @pytest.mark.parametrize("scene", [None, [], {"vehicles": [object()]}])
-def test_an_environment_that_cannot_be_shown_drives_on(sessions, capsys, monkeypatch, scene):
-    """Only while somebody looks is anything drawn; what is wrong is said once, not at each step."""
+def test_an_environment_that_cannot_be_shown_drives_on(capsys, monkeypatch, scene):
+    """What is wrong is said once, not at each step."""
     monkeypatch.setattr(ports, "_UNDRAWN", set())
-    _, router, client = sessions
-    see_through: Any = gymnasium.Env()
-    see_through.render_mode = "rgb_array"
-    steps = itertools.count()
-
-    def render():
-        raise OSError(f"no picture of step {next(steps)}")
-
-    see_through.render = render
+    render = Mock(side_effect=[OSError("no picture of step 0"), OSError("no picture of step 1")])
+    see_through: Any = SimpleNamespace(render_mode="rgb_array", render=render)
     if scene is not None:
         see_through.scene = lambda: scene
-    heard: list[bytes] = []
-    key = "phil/v1/scene"
-    viewer = client.declare_subscriber(key, lambda one: heard.append(bytes(one.payload)))
-    with contextlib.closing(SimulatorPort(router, "v1")) as port:
-        time.sleep(HEARS_S)
-        for step in range(2):
-            port.publish_scene(see_through, Scene(episode=0, step=step, sim_time_s=0.1 * step))
-        time.sleep(HEARS_S)
-    viewer.undeclare()
-    seen = [decode_scene(payload) for payload in heard]
-    scenes = [scene for scene in seen if isinstance(scene, Scene)]
-    assert [(scene.step, scene.picture) for scene in scenes] == [(0, b""), (1, b"")]
+    for step in range(2):
+        sent = ports.scene_payload(see_through, Scene(episode=0, step=step, sim_time_s=0.1))
+        seen = decode_scene(sent)
+        assert isinstance(seen, Scene)
+        assert (seen.step, seen.picture) == (step, b"")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("the environment cannot be shown: ")
-    assert scene is not None or "OSError('no picture of step 0')" in line
 
 
 @pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])
@@ -137,36 +120,3 @@ def test_a_signal_that_another_thread_takes_ends_the_wait():
         finally:
             process.kill()
     assert process.returncode == 0
-
-
-_LISTENER = """
-import sys
-from contextlib import closing
-from edge_runtime.transport import open_session
-with closing(open_session(connect=sys.argv[1], mode="client")) as session:
-    session.declare_subscriber("phil/v1/command", lambda sample: print("command", flush=True))
-    session.declare_subscriber("phil/v1/state", lambda sample: None)
-    print("ready", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_a_listener_without_a_processor_for_a_moment_loses_no_command(sessions):
-    endpoint, router, _ = sessions
-    command, pipe = [sys.executable, "-c", _LISTENER, endpoint], subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as listener:
-        try:
-            assert listener.stdout is not None
-            assert listener.stdout.readline() == "ready\n"
-            time.sleep(HEARS_S)
-            listener.send_signal(signal.SIGSTOP)
-            for _ in range(300):  # As many as fill what the kernel keeps for it
-                router.put("phil/v1/state", bytes(60_000))
-            time.sleep(0.05)  # Within its lease
-            qos = {"priority": zenoh.Priority.REAL_TIME, "express": True}  # The edge runtime's
-            for _ in range(16):
-                router.put("phil/v1/command", b"own", **qos)
-            listener.send_signal(signal.SIGCONT)
-            assert [listener.stdout.readline() for _ in range(16)] == ["command\n"] * 16
-        finally:
-            listener.kill()
