@@ -1,5 +1,8 @@
 """The vehicle's side of the safety rules: what is believed, held, and braked for."""
 
+from typing import Any
+from unittest.mock import Mock, call
+
 import msgspec
 import numpy as np
 import pytest
@@ -80,19 +83,16 @@ def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
 
 def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     hold = CommandHold(0.0, T)
-    assert hold.admit(make_command(0), now_s=0.01, sent_s=0.01)
+    assert hold.admit(make_command(0), now_s=0.01, sent_s=-0.04)
     assert hold.decide(0.025).brake_reason == ""
     held, braking = hold.decide(0.2), hold.decide(0.22)
     assert (held.brake_reason, held.fresh, held.command) == ("", False, make_command(0))
+    assert held.command_age_s == pytest.approx(0.24)  # As old as the state that it answers
     assert (braking.brake_reason, braking.command_age_s) == (NO_COMMAND, None)  # It obeys none.
     assert braking.undriven_s == pytest.approx(0.21)
     # Without any command it brakes as late.
     hold = CommandHold(5.0, T)
     assert [hold.decide(now_s).brake_reason for now_s in (5.2, 5.201)] == ["", NO_COMMAND]
-    # A command is as old as the state that it answers.
-    hold.admit(make_command(0), now_s=5.26, sent_s=5.2)
-    ages_s = [hold.decide(now_s).command_age_s for now_s in (5.325, 5.425)]
-    assert ages_s == pytest.approx([0.125, 0.225])
 
 
 @given(plan=st.lists(st.floats(-1, 1), max_size=10), now_s=st.lists(st.floats(0, 3), max_size=40))
@@ -215,13 +215,6 @@ def test_feedback_holds_for_2_periods_and_no_longer():
     # A delay on the way makes feedback older, and the vehicle not silent.
     delayed = decide(make_feedback(3), received_s=0.7)
     assert (delayed.brake_reason, delayed.feedback_age_s) == ("", pytest.approx(0.35))
-    # A command that nobody obeys has no age.
-    hold = CommandHold(0.0, T)
-    hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
-    heard, stopped = hold.decide(0.05), make_feedback(3, mode="safe_stop")
-    assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
-    assert decide(stopped, heard=heard).command_age_s is None
-    assert decide(make_feedback(3), after_s=1.0, heard=heard).command_age_s is None
 
 
 @pytest.mark.parametrize(
@@ -249,14 +242,11 @@ class PedalEnv(ToyEnv):
     ("environment", "names", "changes", "applied"),
     [
         (ToyEnv, "pedal", {"action": [0.25]}, [0.25]),
-        (ToyEnv, "pedal", {"action": [1.0009]}, [1.0]),
         (ToyEnv, "pedal", {"action": [0.25], "scenario_speed_mps": 2.0}, [0.25]),
-        (PedalEnv, "pedal", {"action": [0.5]}, [0.5]),
         (PedalEnv, "pedal", {"action": [0.5], "scenario_speed_mps": 2.0}, [0.25]),
         (PedalEnv, "pedal", {"scenario_speed_mps": 2.0, "mode": "safe_stop"}, [0.25]),
         # A pedal takes its own place only.
         (PedalEnv, "x pedal", {"action": [0.7, 0.5], "scenario_speed_mps": 2.0}, [0.7, 0.25]),
-        (PedalEnv, "steering", {"action": [0.75], "scenario_speed_mps": 2.0}, [0.75]),
     ],
 )
 def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied):
@@ -267,25 +257,15 @@ def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied)
     assert (action.dtype, action.tolist()) == (np.float32, pytest.approx(applied))
 
 
-class SteeredEnv(ToyEnv):
-    def __init__(self):
-        super().__init__()
-        self.pressed = []
-        self.brake_action = np.array([0.1], np.float32)
-
-    def press_brake(self, pressed):
-        self.pressed.append(pressed)
-
-
 def test_a_steered_car_brakes_when_its_vehicle_does():
-    environment = SteeredEnv()
+    environment: Any = ToyEnv()
+    environment.press_brake, environment.brake_action = Mock(), np.array([0.1], np.float32)
     adapter = Adapter(environment, describe(environment))
     stop = decide(make_feedback(3, mode="safe_stop", action=[0.5]))
-    assert vehicle_action(adapter, stop).tolist() == [0.5]
-    assert vehicle_action(adapter, decide(make_feedback(3))).tolist() == [0.5]
     silent = decide(make_feedback(3), after_s=1.0)
-    assert vehicle_action(adapter, silent).tolist() == [pytest.approx(0.1)]
-    assert environment.pressed == [True, False, True]
+    for decision, action in ((stop, 0.5), (decide(make_feedback(3)), 0.5), (silent, 0.1)):
+        assert vehicle_action(adapter, decision).tolist() == [pytest.approx(action)]
+    assert environment.press_brake.call_args_list == [call(True), call(False), call(True)]
 
 
 @pytest.mark.parametrize(
