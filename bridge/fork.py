@@ -85,7 +85,6 @@ class RecordedEpisode:
 
     @property
     def ended(self) -> bool:
-        """Whether it is recorded to its end."""
         return any(state.final for state in self.states.get(self.steps, ()))
 
     def step_at(self, at_s: float) -> int:
@@ -109,7 +108,6 @@ class RecordedEpisode:
         return made
 
     def check(self, step: int, observation: dict[str, bytes], environment: Any) -> None:
-        """Raise UserError where a rebuilt step is not as it was recorded."""
         differs = {
             f"the observation {name!r}"
             for state in self.states.get(step, ())
@@ -125,14 +123,12 @@ class RecordedEpisode:
             raise UserError(f"{self.path}: the drive cannot be rebuilt: {why}")
 
     def redo(self, step: int, adapter: Adapter) -> np.ndarray:
-        """Return the recorded action of a step, with the brake as it was."""
         action, braked = self.applied[step]
         adapter.press_brake(braked)
         return adapter.within(action)
 
 
 def _own_scene(payload: bytes) -> bytes:
-    """Return what the environment itself says in an encoded scene."""
     fields = msgspec.msgpack.decode(payload)
     return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in STAMPS})
 
@@ -248,7 +244,7 @@ class ForkedDrive(LockStepClock):
         return action
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
-        """Answer the state: before the fork as the edge runtime did, then as the policy does."""
+        # Before the fork as the edge runtime did, then as the policy does
         if arrival.overtaken:
             return
         sent_ns = self._at_ns(arrival.arrived_s)
@@ -298,7 +294,6 @@ def _seconds(text: str) -> float:
 
 
 def add_place(parser: Any) -> None:
-    """Declare the options that say where a recording is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
     parser.add_argument("--at", metavar="T", type=_seconds, default=0.0, help=at)
     parser.add_argument("--episode", metavar="K", type=cli.not_negative, help=which)
@@ -307,7 +302,6 @@ def add_place(parser: Any) -> None:
 
 
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
-    """Return the drive that the options name, and the step of its fork."""
     drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
     return drive, drive.step_at(asked.at)
 

@@ -1,12 +1,8 @@
 """The simulated network: when a message between two ends arrives, drawn from a seed.
 
-Pure: no clock, no socket, no global. The caller passes the time in and gets the times at which the
-message comes out at the other end: none if it is lost, two if it is duplicated. The same model
-serves lock-step and training (virtual time), and real time (timers).
-
-`LatencySpec` says what the network does in each direction; `parse_spec` reads it as a person writes
-it. The way of a message (`LatencyModel`): queue and line, outage, loss, time under way, held back
-or not, duplicated or not, and in order if order is kept.
+Pure: the caller passes the time in. The same model serves lock-step and training (virtual time),
+and real time (timers). The way of a message (`LatencyModel`): queue and line, outage, loss, time
+under way, held back or not, duplicated or not, and in order if order is kept.
 """
 
 from __future__ import annotations
@@ -70,7 +66,6 @@ class Outage:
     period_s: float | None = None  # From one window's begin to the next; None: there is only one
 
     def covers(self, now_s: float) -> bool:
-        """Return whether a message sent at ``now_s`` falls into a window (its end is outside)."""
         since_s = now_s - self.start_s
         if since_s < 0:
             return False
@@ -112,10 +107,7 @@ def _setting(default: Any, name: str, kind: Kind, example: str) -> Any:
 
 @dataclass(frozen=True)
 class DirectionSpec:
-    """One direction of the network: the table of settings. UserError for impossible bursts.
-
-    Messages are treated one by one, as datagrams are, unless ``order`` is kept.
-    """
+    """One direction of the network: the table of settings. UserError for impossible bursts."""
 
     delay_ms: float = _setting(0.0, "delay", MS, "50ms")  # Mean time under way
     jitter_ms: float = _setting(0.0, "jitter", MS, "10ms")
@@ -165,7 +157,6 @@ class DirectionSpec:
         )
 
     def written(self, prefix: str = "") -> list[str]:
-        """Return the settings that are not the default, as a person writes them."""
         return [
             f"{prefix}{row.metadata['name']}={row.metadata['kind'].write(value)}"
             for row in fields(self)

@@ -36,11 +36,10 @@ from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
-RETRY_S = 0.2
+RETRY_S = 0.1
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
 QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
-EDGE_POLL_S = 0.1
 QUERY_S = 1.0
 _UNDRAWN: set[type[Exception]] = set()  # Already reported
 
@@ -64,11 +63,8 @@ class SimulatorPort:
     def __init__(
         self, zenoh_session: zenoh.Session, vehicle_id: str, tls: TlsFiles | None = None
     ) -> None:
-        self._tls = tls
-        self.session = secrets.token_hex(8)
-        self.vehicle_id = vehicle_id
-        self.edge_counts = EdgeCounts()
-        self._zenoh = zenoh_session
+        self._zenoh, self.vehicle_id, self._tls = zenoh_session, vehicle_id, tls
+        self.session, self.edge_counts = secrets.token_hex(8), EdgeCounts()
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
         self._states, self._scenes = (
@@ -108,10 +104,9 @@ class SimulatorPort:
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
                     f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
                 )
-            time.sleep(EDGE_POLL_S)
+            time.sleep(RETRY_S)
 
     def note_edge_counts(self) -> None:
-        """Ask the edge runtime for its counts, before and after the drive."""
         for status in self._statuses():
             self.edge_counts.observe_status(status)
 
@@ -204,7 +199,6 @@ class WireListener:
                 return
 
     def hear(self, sample: zenoh.Sample) -> None:
-        """Take a message of the wire."""
         key, size = str(sample.key_expr), len(sample.payload)
         if "*" in key:
             return  # put to many vehicles at once: no vehicle's own
@@ -212,7 +206,6 @@ class WireListener:
         self._put(key, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
 
     def watch(self, sample: zenoh.Sample) -> None:
-        """Take a token that comes or goes."""
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
         if "*" in key:
             return
@@ -253,9 +246,9 @@ def open_listener(
         hear = zenoh.handlers.Callback(listener.hear, indirect=False)
         for topic in DECODERS:
             stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
+        declare = session.liveliness().declare_subscriber
         for topic in TOKEN_TOPICS:
-            declare, watch = session.liveliness().declare_subscriber, listener.watch
-            stack.enter_context(declare(f"{keys}/{topic}", watch, history=True))
+            stack.enter_context(declare(f"{keys}/{topic}", listener.watch, history=True))
         # Where the vehicle never was, nothing would tell the listener to end.
         if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
             where = f"vehicle {vehicle_id} at {connect}"
@@ -307,8 +300,7 @@ def add_options(parser: Any, *names: str, **changes: Any) -> None:
 def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
     """Sleep until KeyboardInterrupt (main thread only); UserError when ``tls`` has expired.
 
-    The kernel may hand a signal to any thread, one of Zenoh's too. That does not wake this thread
-    from a lock, so it looks again now and then.
+    A signal that the kernel hands to a thread of Zenoh's wakes nobody from a lock: so it polls.
     """
     while True:
         time.sleep(RETRY_S)
@@ -317,11 +309,11 @@ def wait_to_be_told(tls: TlsFiles | None = None) -> NoReturn:
 
 
 def _add_router_arguments(parser: Any) -> None:
-    help_text = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
-    add_options(parser, "--listen", action="append", help=help_text)
-    add_options(parser, "--tls")
+    listen = f"endpoint for all others; may be repeated (default: {DEFAULT_ENDPOINT})"
     vehicle = "with --tls: a vehicle whose parties have rights here; may be repeated"
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
+    add_options(parser, "--tls")
+    add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
     config = "settings from a file of `python -m deploy router`, without other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bridge.messages import Heard, decode
+from bridge.messages import Heard
 from bridge.ports import add_options
-from bridge.recording import Recording, choose_vehicle, heard_of, valid_messages
+from bridge.recording import Recording, choose_vehicle, valid_messages
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import (
@@ -34,7 +34,7 @@ from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Health, State, is_forei
 
 RUNTIME_ENDED = "runtime_ended"  # Reason of a runtime's farewell, which answers no state
 JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
-CLOCK_STEP_S = 1.0  # Stamps that leap by more than this against the recorder's: the clock was set
+CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock was set
 MOST_REPETITIONS = 1000  # Of a stop; after so many, however long the silence lasts, nothing is new
 RESTART_S = 0.5  # Uptimes that disagree by more than this belong to two runtimes
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
@@ -42,9 +42,7 @@ DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
 
 Key = tuple[str, int, int]  # Session, episode, step
-EXAMPLE = examples(
-    "python -m bridge replay drive.mcap \\\n    --policy my.onnx --public-key keys/policy.pub"
-)
+EXAMPLE = examples("python -m bridge replay drive.mcap --policy my.onnx --public-key policy.pub")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -166,12 +164,10 @@ class RecordedDrive:
     def states(self) -> Iterator[State]:
         """Yield the states in their order, each once: a network may repeat a message."""
         seen: set[Key] = set()
-        for heard in heard_of(self.recording, self.vehicle_id):
-            if heard.topic == "state":
-                state = decode(heard)
-                if isinstance(state, State) and key_of(state) not in seen:
-                    seen.add(key_of(state))
-                    yield state
+        for _, state in valid_messages(self.recording, self.vehicle_id):
+            if isinstance(state, State) and key_of(state) not in seen:
+                seen.add(key_of(state))
+                yield state
 
     def _take(self, heard: Heard, message: Any) -> None:
         self._zero_ns = self._zero_ns or heard.arrived_ns
@@ -256,7 +252,7 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Answers:
 def controller_of(
     policy: Policy, limits: Limits, plan_periods: int, needs_rearm: bool, is_armed: bool = True
 ) -> Controller:
-    """Make the edge runtime's decision logic; its commands carry plans of so many periods."""
+    """Make the edge runtime's decision logic with ride-through of so many periods."""
     period_s, task = policy.manifest.control_period_s, policy.layout.task_text
     ride_s = plan_periods * period_s
     return Controller(ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s))

@@ -41,8 +41,7 @@ COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick sti
 ROUNDING_S = 1e-9
 """Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
 
-NO_COMMAND = "no_command"
-"""Brake reason: the vehicle brakes by itself because nothing arrived for 2 T."""
+NO_COMMAND = "no_command"  # Brake reason: the vehicle brakes by itself after 2 T of silence
 UNKNOWN_SAFE_STOP = "safe_stop"  # Brake reason when a safe_stop command gives none of its own
 
 
@@ -78,7 +77,6 @@ class CommandHold:
 
     @property
     def newest_step(self) -> int:
-        """The step of the newest command; -1 before the first."""
         return -1 if self.newest is None else self.newest.step
 
     def admit(self, command: Command, now_s: float, sent_s: float) -> bool:
@@ -130,10 +128,10 @@ class CommandHold:
         )
 
 
+# On the wire, for links of limited rate: the same for every message, so that a longer session name
+# or another digit does not change a drive.
 STATE_BYTES = 122  # Besides its observation
 COMMAND_BYTES = 217
-"""What the messages take on the wire, for links of limited rate: the same for every message, so
-that a longer session name or another digit does not change a drive."""
 
 Message = TypeVar("Message")
 
@@ -145,8 +143,7 @@ class Arrival(Generic[Message]):
     step: int
     arrived_s: float
     message: Message
-    overtaken: bool
-    """An equally new or newer state came before: the edge runtime rejects this without answer."""
+    overtaken: bool  # One as new came before: the edge runtime rejects this without answer.
 
 
 class VirtualLink(Generic[Message]):

@@ -14,11 +14,8 @@ from unittest.mock import Mock
 
 import msgspec
 import numpy as np
-import onnx
 import pytest
 
-from bridge.environments import describe, make_environment
-from bridge.policy_file import make_policy as make_any_policy
 from bridge.recording import Recording, choose_vehicle, heard_of
 from hil_tests.testing.drives import (
     LEFT_TURN,
@@ -34,25 +31,7 @@ from hil_tests.testing.drives import (
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"
-PARKING = "hil_tests.testing.environments:BridgeParking-v0"
 NETWORK = "60ms+-40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
-GRAPH = """parking (float[b, 6] achieved_goal, float[b, 6] desired_goal, float[b, 6] observation)
-=> (float[b, 2] action) {
-    apart = Sub(desired_goal, achieved_goal) wide = MatMul(apart, turn) action = Tanh(wide)
-}"""
-
-
-def parking_policy(folder: Path) -> Path:
-    """Drives towards its place, more or less."""
-    graph = onnx.parser.parse_graph(GRAPH)
-    turn = np.random.default_rng(1).normal(0.0, 3.0, (6, 2)).astype(np.float32)
-    graph.initializer.append(onnx.numpy_helper.from_array(turn, "turn"))
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    task = describe(make_environment(PARKING))
-    path = folder / "parking.onnx"
-    path.write_bytes(make_any_policy(model.SerializeToString(), task, "test", {}))
-    return path
 
 
 def fork_of(path: Path, *options) -> dict:
@@ -96,13 +75,11 @@ def test_the_recording_of_a_fork_is_forked_to_the_bit(tmp_path):
         path = again
 
 
-@pytest.mark.parametrize("env", [PARKING, TOY])
-def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path, env):
+def test_an_environment_of_others_is_the_same_to_the_bit(tmp_path):
     """The toy's scene has a field that a message has, too."""
-    policy = parking_policy(tmp_path) if env == PARKING else make_policy(tmp_path, "constant", 0.5)
-    path = tmp_path / "drive.mcap"
-    row = record_in_process(path, env, policy, seed=4, latency="50ms+-30ms,loss=5%")
-    found = fork_of(path, "--at", row.time_s / 2, "--policy", policy, "--env", env)
+    path, policy = tmp_path / "drive.mcap", make_policy(tmp_path, "constant", 0.5)
+    row = record_in_process(path, TOY, policy, seed=4, latency="50ms+-30ms,loss=5%")
+    found = fork_of(path, "--at", row.time_s / 2, "--policy", policy, "--env", TOY)
     assert found["differs_from_s"] is None
     assert found["fork"] == found["recorded"] == asdict(row)
 
