@@ -22,15 +22,15 @@ from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_json
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
 from hil_tests.sweep import draw_axes
-from hil_tests.testing.browser import (
+from trainer.drivers import load_driver
+from trainer.environments import make_environment
+from trainer.person.tests.browser import (
     PERSON_DRIVES,
     POLICY_DRIVES,
     open_browser,
     quit_sitting,
     until,
 )
-from trainer.drivers import load_driver
-from trainer.environments import make_environment
 from trainer.pictures import write_figure
 from trainer.training.metrics import read_metrics
 from trainer.util import kept

@@ -34,6 +34,7 @@ from bridge.rerun import (
     shades,
 )
 from bridge.rerun.wire_view import DriveTime, WireLog
+from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.link_quality import FIELDS
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
@@ -44,7 +45,6 @@ from hil_tests.testing.edge import start_edge
 from hil_tests.testing.environments import ToyEnv
 from hil_tests.testing.messages import HEALTH, make_command, make_feedback, make_state
 from hil_tests.testing.policies import TASK
-from hil_tests.testing.viewers import NO_GPU, in_place, listens
 
 
 def scene_with(car_x, **more):

@@ -14,9 +14,9 @@ import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 from hil_tests.processes import wait_until
-from hil_tests.testing.vehicles import LEFT_TURN, PEDAL
 
 from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.rigs import LEFT_TURN, PEDAL
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import hunter, stream
 from edge_runtime.vehicles.core import VehicleState

@@ -3,8 +3,8 @@
 import math
 
 import pytest
-from hil_tests.testing.vehicles import OK, PEDAL, SPEC, HunterRig
 
+from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
 from edge_runtime.vehicles.core import VehicleEvent, VehicleState
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports

@@ -3,10 +3,10 @@
 import math
 
 import pytest
-from hil_tests.testing.vehicles import CARS, CONGESTION, LEFT_TURN, SPEC
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge_runtime.tests.rigs import CARS, CONGESTION, LEFT_TURN, SPEC
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.mapping import SPECS, SetPoint, similarity_to, wish_of
 

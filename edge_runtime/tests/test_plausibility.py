@@ -4,11 +4,11 @@ import math
 
 import pytest
 from hil_tests.testing.policies import T
-from hil_tests.testing.vehicles import SPEC
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
+from edge_runtime.tests.rigs import SPEC
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 from edge_runtime.vehicles.plausibility import (

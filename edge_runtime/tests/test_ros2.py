@@ -12,12 +12,12 @@ import pytest
 import zenoh
 from hil_tests.processes import wait_until
 from hil_tests.testing.edge import Simulator, run_edge
-from hil_tests.testing.vehicles import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import ros2

@@ -18,7 +18,6 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.edge import run_edge
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
-from hil_tests.testing.vehicles import BrokenVehicle
 
 from edge_runtime import log, loop, service
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
@@ -26,6 +25,7 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.manifest import Layout
 from edge_runtime.reach import free_endpoint
 from edge_runtime.service import Notifier, look
+from edge_runtime.tests.rigs import BrokenVehicle
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import encode
 

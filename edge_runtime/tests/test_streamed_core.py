@@ -3,10 +3,10 @@
 import math
 
 import pytest
-from hil_tests.testing.vehicles import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from edge_runtime.vehicles.core import LEADS_TO, Speeds, VehicleEvent, VehicleState
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import Fault, Finding

@@ -8,10 +8,10 @@ import pytest
 from hil_tests.processes import wait_until
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import T
-from hil_tests.testing.vehicles import BrokenVehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge_runtime.tests.rigs import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import base
 from edge_runtime.vehicles.base import VehicleRunner

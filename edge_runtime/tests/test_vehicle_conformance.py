@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 from hil_tests.testing.policies import T
-from hil_tests.testing.vehicles import CAR, PEDAL, HunterRig, MockRig, Ros2Rig, a_manifest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge_runtime.tests.rigs import CAR, PEDAL, HunterRig, MockRig, Ros2Rig, a_manifest
 from edge_runtime.vehicles import make_vehicle
 
 WILD = st.floats(allow_nan=False, allow_infinity=False)

@@ -11,12 +11,12 @@ import pytest
 from hil_tests.processes import wait_until
 from hil_tests.testing.edge import Simulator
 from hil_tests.testing.messages import make_state
-from hil_tests.testing.vehicles import CAR, BrokenVehicle, a_manifest
 
 import edge_runtime
 from edge_runtime.config import BUILT_IN
 from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.rigs import CAR, BrokenVehicle, a_manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import find_vehicle, installed_as, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mock import MockVehicle

@@ -24,7 +24,6 @@ from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests.testing.environments import CAMERA, ROVER, Rover, odd
-from hil_tests.testing.people import QUICK, Puppet
 from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
@@ -50,6 +49,7 @@ from trainer.person.drive import drive
 from trainer.person.interface import Reading
 from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting
+from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
 from trainer.training.delayed import DelayedVehicle
 from trainer.view import ShownStep, sitting_entries

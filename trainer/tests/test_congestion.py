@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from hil_tests.testing.people import drive
 from trainer.environments import make_environment
 from trainer.human.congestion import CongestionHuman
+from trainer.person.tests.people import drive
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
 from trainer.scenarios.traffic import footprint

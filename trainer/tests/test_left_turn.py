@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from hil_tests.testing.people import BRAKE, FULL, NOTHING, drive, episode
 from trainer.drivers import constant_driver
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
+from trainer.person.tests.people import BRAKE, FULL, NOTHING, drive, episode
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear, max_pool2d, relu
 
-from hil_tests.testing.learners import SMALL, make_batch, same_weights, weights_of
 from trainer.learner import equations
 from trainer.learner.config import ALGORITHMS, OVERRULED_ACTION, PHIL, Algorithm, LearnerConfig
 from trainer.learner.networks import Actor, Critic, CriticPair, Picture
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import Losses, TD3Learner
+from trainer.tests.learners import SMALL, make_batch, same_weights, weights_of
 
 COLUMNS = (
     "frames", "actions", "rewards", "next_frames", "terminals", "human", "overruled", "penalised"

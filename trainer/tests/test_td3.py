@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hil_tests.testing.learners import SMALL, make_batch
 from trainer.learner import networks
 from trainer.learner.config import PHIL
 from trainer.learner.networks import FEATURES, Actor, Critic
 from trainer.learner.td3 import TD3Learner
+from trainer.tests.learners import SMALL, make_batch
 
 
 def test_the_networks_are_those_of_tables_a2_to_a4():

@@ -17,11 +17,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from edge_runtime.cli import INTERRUPTED, run_cli
 from edge_runtime.util import UserError
-from hil_tests.testing.learners import same_weights
 from trainer.__main__ import main
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import LearnerConfig
+from trainer.tests.learners import same_weights
 from trainer.tests.loops import rows_of
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory

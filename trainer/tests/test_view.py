@@ -11,13 +11,13 @@ import torch
 from rerun.chunk import RrdReader
 
 from bridge.rerun import HUMAN, POLICY
-from hil_tests.testing.people import recorded_step
 from trainer import view
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
 from trainer.person.recording import Recorder, packed
+from trainer.person.tests.people import recorded_step
 from trainer.training.config import RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun

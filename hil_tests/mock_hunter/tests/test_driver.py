@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge_runtime.tests.rigs import CARS, STREAM_S, Rig
 from edge_runtime.vehicles.core import VehicleState
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
@@ -14,7 +15,6 @@ from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
 from hil_tests.mock_hunter.hunter import MockHunter, make_parameters
-from hil_tests.testing.vehicles import CARS, STREAM_S, Rig
 
 WORDS = {
     **dict.fromkeys(("silent", "bus_off", "late"), "sends no 0x2"),

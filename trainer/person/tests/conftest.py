@@ -7,9 +7,9 @@ from contextlib import closing
 
 import pytest
 
-from hil_tests.testing.browser import READY, find_chromium, first_view, open_browser, until
 from hil_tests.testing.commands import call
 from trainer.person import web
+from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
 from trainer.tests.conftest import one_thread
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from hil_tests.testing.browser import (
+from trainer.person.coach import Coaching, SittingEpisode
+from trainer.person.tests.browser import (
     LIVE,
     OVER,
     READY,
@@ -18,8 +19,7 @@ from hil_tests.testing.browser import (
     reads,
     until,
 )
-from hil_tests.testing.people import LET_GO
-from trainer.person.coach import Coaching, SittingEpisode
+from trainer.person.tests.people import LET_GO
 
 pytestmark = pytest.mark.usefixtures("opened")
 

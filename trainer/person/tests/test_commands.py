@@ -8,10 +8,18 @@ import pytest
 
 from bridge.outcomes import STOPPED
 from hil_tests.testing.commands import call, refusal
-from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, record, recorded_step
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.person.interface import Reading
 from trainer.person.recording import find_recordings, read_steps
+from trainer.person.tests.people import (
+    LET_GO,
+    QUIT,
+    Discarding,
+    Puppet,
+    hold,
+    record,
+    recorded_step,
+)
 from trainer.training.metrics import read_metrics
 from trainer.training.validation import Validation
 from trainer.util import load_torch

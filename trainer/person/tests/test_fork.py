@@ -7,9 +7,9 @@ import pytest
 from bridge.fork import RecordedEpisode, read_episode
 from hil_tests.testing.commands import call
 from hil_tests.testing.drives import record_in_process
-from hil_tests.testing.people import LET_GO, QUIT, Puppet, hold
 from hil_tests.testing.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
+from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
 
 UNJUDGED = ["--out", "run", "--threads", "1", "--set", "batch_size=4"]
 FORK = ["drive", "--human", "web", "--from", "drive.mcap", "--at", "0.95s"]

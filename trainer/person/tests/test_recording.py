@@ -13,9 +13,9 @@ import pytest
 
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
-from hil_tests.testing.people import record, recorded_step
 from trainer.person import recording
 from trainer.person.recording import Recorder, read_steps
+from trainer.person.tests.people import record, recorded_step
 
 
 def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):

@@ -7,12 +7,12 @@ import numpy as np
 from msgspec import structs
 
 from hil_tests.processes import wait_until
-from hil_tests.testing.people import record, recorded_step
 from trainer.human.guide import Guide
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
 from trainer.person.recording import DIRECTORY
+from trainer.person.tests.people import record, recorded_step
 from trainer.person.validation import BehindTheScenes, Candidate
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
-from hil_tests.testing.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 from trainer.drivers import constant_driver
 from trainer.person.drive import drive
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.takeover import MAX_SLEW
+from trainer.person.tests.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 
 
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):

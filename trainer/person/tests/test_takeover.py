@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil_tests.testing.people import LET_GO
 from trainer.person.interface import WISHES, Reading, distance
 from trainer.person.takeover import MAX_SLEW, SILENCE_S, Input, Intent, Seat, TakeOver
+from trainer.person.tests.people import LET_GO
 
 ACTION = st.floats(-1.0, 1.0)
 STEPS = st.lists(st.tuples(ACTION, ACTION, st.booleans()), min_size=1, max_size=60)

@@ -13,7 +13,9 @@ from pathlib import Path
 import aiohttp
 import pytest
 
-from hil_tests.testing.browser import (
+from trainer.person import web
+from trainer.person.interface import open_person
+from trainer.person.tests.browser import (
     WAIT_S,
     hear,
     origin,
@@ -22,8 +24,6 @@ from hil_tests.testing.browser import (
     say,
     view_of_step,
 )
-from trainer.person import web
-from trainer.person.interface import open_person
 from trainer.person.web import MAX_INPUT_BYTES, Cockpit
 
 
