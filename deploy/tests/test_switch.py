@@ -1,7 +1,4 @@
-"""The order of the installer's steps: real folders, and a service that notes what it is told.
-
-Whatever happens before any step, a whole release is current: the old one or the new one.
-"""
+"""The order of the installer's steps: real folders, and a service that notes what it is told."""
 
 import contextlib
 import errno
@@ -198,9 +195,12 @@ def test_on_a_full_disk_or_interrupted_a_whole_release_runs(board, trouble, is_b
     assert NEW not in service.heard
 
 
-def test_a_first_release_that_is_bad_leaves_nothing(board):
+@pytest.mark.parametrize("is_cut_off", [False, True])
+def test_a_first_release_that_is_bad_leaves_nothing(board, monkeypatch, is_cut_off):
     assert board.run("uninstall") == 0
     assert list(board.releases.root.iterdir()) == [board.releases.root / "unit"]
+    if is_cut_off:
+        cut_off(board, monkeypatch)
     board.service.bad = NEW
     assert board.run("install", NEW) == 1
     assert board.service.running is None
@@ -208,54 +208,32 @@ def test_a_first_release_that_is_bad_leaves_nothing(board):
     assert list((board.releases.root / "releases").iterdir()) == []
 
 
-@pytest.fixture
 def cut_off(board, monkeypatch):
-    """The same board, after an upgrade that was killed as it started the new release."""
+    """Kill an upgrade as it starts the new release."""
     with monkeypatch.context() as patch:
         patch.setattr(board.service, "start", lambda limits: kill(""))
         in_a_child(lambda: board.run("install", NEW))
     assert board.releases.linked(CURRENT) == NEW
-    return board
 
 
-def test_an_upgrade_that_was_cut_off_can_be_undone(cut_off):
-    assert cut_off.run("rollback") == 0
-    assert cut_off.releases.linked(CURRENT) == OLD
-    assert cut_off.releases.linked(PREVIOUS) == EARLIER
-
-
-def test_what_was_good_is_known_however_often_it_is_cut_off(cut_off):
-    releases, number = cut_off.releases, 0
+def test_what_was_good_is_known_however_often_it_is_cut_off(board, monkeypatch):
+    cut_off(board, monkeypatch)
+    releases, number = board.releases, 0
     while releases.linked(PREVIOUS) != OLD:
         number += 1
         with at_step(number, releases.root, kill):
-            in_a_child(lambda: cut_off.run("install", NEW))
+            in_a_child(lambda: board.run("install", NEW))
         assert OLD in (releases.good(), releases.linked(PREVIOUS))
     assert number > 10
 
 
-def test_a_bad_upgrade_goes_back_though_it_was_cut_off(cut_off):
-    cut_off.service.bad = NEW
-    assert cut_off.run("install", NEW) == 1
-    assert cut_off.releases.linked(CURRENT) == cut_off.service.running == OLD
-
-
-def test_a_bad_first_release_is_not_kept_though_its_installation_was_cut_off(board, monkeypatch):
-    assert board.run("uninstall") == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(board.service, "start", lambda limits: kill(""))
-        in_a_child(lambda: board.run("install", NEW))
+@pytest.mark.parametrize(("words", "status"), [(["rollback"], 0), (["install", NEW], 1)])
+def test_an_upgrade_that_was_cut_off_is_undone(board, monkeypatch, words, status):
+    cut_off(board, monkeypatch)
     board.service.bad = NEW
-    assert board.run("install", NEW) == 1
-    assert board.releases.linked(CURRENT) is None
-
-
-def test_a_service_that_cannot_be_stopped_does_not_keep_it_from_going_back(board, monkeypatch):
-    stop = mock.Mock(side_effect=[None, UnhealthyError("it does not stop")])
-    monkeypatch.setattr(board.service, "stop", stop)
-    board.service.bad = NEW
-    assert board.run("install", NEW) == 1
+    assert board.run(*words) == status
     assert board.releases.linked(CURRENT) == board.service.running == OLD
+    assert board.releases.linked(PREVIOUS) == EARLIER
 
 
 @pytest.mark.parametrize("error", [UnhealthyError("it ended"), KeyboardInterrupt()])
@@ -267,35 +245,33 @@ def test_what_served_before_stays_when_it_fails(board, words, version, error):
     assert board.releases.linked(PREVIOUS) == EARLIER
 
 
-def test_a_second_signal_while_it_goes_back_changes_nothing(board, monkeypatch):
+@pytest.mark.parametrize("trouble", ["it does not stop", "signals", "nobody reads"])
+def test_nothing_keeps_it_from_going_back(board, monkeypatch, trouble):
     service = board.service
-    service.bad, service.error = NEW, KeyboardInterrupt()
-    stop = service.stop
+    service.bad, stop = NEW, service.stop
+    if trouble == "it does not stop":
+        failing = mock.Mock(side_effect=[None, UnhealthyError(trouble)])
+        monkeypatch.setattr(service, "stop", failing)
+    elif trouble == "signals":
+        service.error = KeyboardInterrupt()
 
-    def stop_and_signal() -> None:
-        stop()
-        if service.releases.linked(CURRENT) == NEW:
-            os.kill(os.getpid(), signal.SIGINT)
+        def stop_and_signal() -> None:
+            stop()
+            if service.releases.linked(CURRENT) == NEW:
+                for number in (signal.SIGINT, signal.SIGHUP):
+                    os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(service, "stop", stop_and_signal)
+        monkeypatch.setattr(service, "stop", stop_and_signal)
+    else:  # as when an ssh link breaks in the middle
+        read, write = os.pipe()
+        os.close(read)
+        monkeypatch.setattr(sys, "stdout", os.fdopen(write, "w"))
     assert board.run("install", NEW) == 1
-    assert service.running == OLD
-
-
-def test_nobody_reads_what_it_says_and_it_goes_on(board, monkeypatch, capfd):
-    """As when an ssh link breaks in the middle."""
-    read, write = os.pipe()
-    os.close(read)
-    with open(write, "w") as pipe:
-        monkeypatch.setattr(sys, "stdout", pipe)
-        board.service.bad = NEW
-        assert board.run("install", NEW) == 1
-        assert board.service.running == OLD
+    assert board.releases.linked(CURRENT) == service.running == OLD
 
 
 def test_only_one_installer_is_at_work_and_only_the_group_can_hold(board):
-    root = board.releases.root
-    assert (root / ".lock").stat().st_mode & 0o777 == 0o600
+    assert (board.releases.root / ".lock").stat().st_mode & 0o777 == 0o600
     assert board.releases.hold.stat().st_mode & 0o777 == 0o640
     with board.releases.locked():
         for words in (["install", NEW], ["rollback"], ["uninstall"]):
