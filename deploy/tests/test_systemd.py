@@ -4,10 +4,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pytest
-from onnx import numpy_helper
 
 from deploy.installer.systemd import (
     CAN_UNIT,
@@ -17,9 +14,6 @@ from deploy.installer.systemd import (
     Systemd,
     UnhealthyError,
 )
-from edge_runtime.policy import MAX_POLICY_MIB
-from hil_tests.testing.commands import run_command
-from hil_tests.testing.policies import write_policy
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "deploy/systemd"
@@ -71,24 +65,6 @@ def test_the_runtime_has_a_watchdog_limits_no_rights_and_nothing_to_write_to():
     assert tries_s < float(unit["StartLimitIntervalSec"])  # or the limit would never be reached
     assert not {"Requires", "BindsTo", "Requisite"} & set(unit)  # the bus is no condition
     assert "bitrate 500000" in (UNITS / CAN_UNIT).read_text()
-
-
-def test_the_largest_policy_fits_the_services_memory(tmp_path):
-    path, mib = tmp_path / "large.onnx", int(settings(MAIN_UNIT)["MemoryMax"].removesuffix("M"))
-    graph = """large (uint8[batch, 2, 45, 80] frames) => (float[batch, 1] action) {
-        pixels = Cast<to = 1>(frames) mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
-        row = Cast<to = 7>(mean) action = Gather(table, row)
-    }"""
-    write_policy(path, graph=graph)
-    model = onnx.load(str(path))
-    rows = ((MAX_POLICY_MIB << 20) - model.ByteSize() - 100) // 4
-    table = numpy_helper.from_array(np.zeros((rows, 1), np.float32), "table")
-    model.graph.initializer.append(table)
-    path.write_bytes(model.SerializeToString())
-    assert path.stat().st_size > (MAX_POLICY_MIB << 20) - 100
-    done = run_command("check", str(path), "--allow-unsigned")
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["memory_mb"] < (mib << 20) / 1e6 - 40  # the rest is `run`'s
 
 
 ACTIVE = "ActiveState=active\nSubState=running\nNRestarts=0\nResult=success\nStatusText=standby"
