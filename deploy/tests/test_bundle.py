@@ -1,9 +1,9 @@
+import contextlib
 import hashlib
 import os
 import re
 import shutil
 import stat
-import tarfile
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -12,10 +12,8 @@ import pytest
 from deploy import bundle as bundle_module
 from deploy.__main__ import main
 from deploy.bundle import (
-    DEFAULT_FOLDER,
     ROOT,
     TARGETS,
-    Inputs,
     build_edge_wheel,
     build_installer,
     gather,
@@ -23,12 +21,11 @@ from deploy.bundle import (
     make_bundle,
     pip,
 )
+from deploy.installer.verify import read_bundle
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import exit_status
-
-MAX_JETPACK5_BYTES = 45_000_000
 
 
 @pytest.fixture(scope="module")
@@ -50,11 +47,6 @@ def driver(tmp_path_factory):
     return next(folder.glob("*.whl"))
 
 
-def read(made) -> dict[str, bytes]:
-    with tarfile.open(made.path) as tar:
-        return {m.name: tar.extractfile(m).read() for m in tar}  # type: ignore[union-attr]
-
-
 def test_the_same_inputs_give_the_same_bytes_and_others_another_version(workshop, tmp_path):
     again = build_edge_wheel(tmp_path)
     assert again.read_bytes() == workshop.edge_wheel.read_bytes()
@@ -66,32 +58,12 @@ def test_the_same_inputs_give_the_same_bytes_and_others_another_version(workshop
     assert len({made.manifest.version for made in (one, two, *changed)}) == 3
 
 
-@pytest.mark.board
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", TARGETS)
-def test_a_whole_bundle_is_the_same_again_and_the_boards_is_small(workshop, tmp_path, name):
-    """With every wheel: pip's index is needed the first time."""
-    target, policy = TARGETS[name], ROOT / "results/policies/left_turn.onnx"
-    try:
-        wheels = gather(target, lock_path(target), ROOT / DEFAULT_FOLDER / name, tmp_path)
-    except UserError as error:
-        if "No matching distribution" in str(error):
-            pytest.skip("no package index can be reached")
-        raise
-    wheels.append(workshop.edge_wheel)
-    inputs = Inputs(policy, policy.with_name("policy.pub"), workshop.key, None, None, wheels)
-    one, two = (make_bundle(inputs, target, tmp_path / folder) for folder in ("one", "two"))
-    assert one.path.read_bytes() == two.path.read_bytes()
-    if name == "jetpack5":
-        assert one.path.stat().st_size < MAX_JETPACK5_BYTES
-
-
 def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, driver, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text('connect = "tls/10.0.0.1:7447"\nvehicle = "rover"\n')
     wheels = [workshop.edge_wheel, driver]
     made = workshop.make(tls=party / "edge-hunter01", config=config, wheels=wheels)
-    contents = read(made)
+    _, contents = read_bundle(str(made.path), workshop.public_key.read_bytes())
     assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
     assert contents.keys() == {
         "manifest.json", "install.pyz", "config.toml", "policy.onnx",
@@ -182,22 +154,18 @@ EMPTY = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 def test_a_full_folder_needs_no_network_and_another_hash_is_not_taken(
     workshop, tmp_path, monkeypatch
 ):
-    lock, kept, place = (tmp_path / name for name in ("lock.txt", "kept", "place"))
-    digest = hashlib.sha256(workshop.edge_wheel.read_bytes()).hexdigest()
-    lock.write_text(f"# a lock\n\nphil-edge-runtime==0.1.0 --hash=sha256:{digest}\n")
-
     def without_network(*words: str) -> None:
         if "--no-index" not in words:
             raise UserError("no network")
         pip(*words)
 
     monkeypatch.setattr(bundle_module, "pip", without_network)
-    kept.mkdir()
-    shutil.copy(workshop.edge_wheel, kept)
-    assert [path.name for path in gather(HERE, lock, kept, place)] == [workshop.edge_wheel.name]
-    lock.write_text(lock.read_text().replace(digest, EMPTY))
-    with pytest.raises(UserError, match="no network"):
-        gather(HERE, lock, kept, tmp_path / "other")
+    lock, wheel = tmp_path / "lock.txt", workshop.edge_wheel
+    for digest, holds in ((hashlib.sha256(wheel.read_bytes()).hexdigest(), True), (EMPTY, False)):
+        lock.write_text(f"# a lock\n\nphil-edge-runtime==0.1.0 --hash=sha256:{digest}\n")
+        with contextlib.nullcontext() if holds else pytest.raises(UserError, match="no network"):
+            found = gather(HERE, lock, wheel.parent, tmp_path / digest)
+    assert [path.name for path in found] == [wheel.name]
 
 
 def test_a_lock_is_written_anew_with_the_hash_of_what_comes(tmp_path, monkeypatch):

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 
 from deploy.__main__ import main
-from deploy.certs import write_key_pair
 from hil_tests.testing.commands import exit_status
 
 PROGRAMS = ["ssh"] + ["scp"] * 4 + ["ssh"] * 2
@@ -65,15 +64,6 @@ def test_a_dry_run_prints_each_command_and_does_none(far, board, push, workshop,
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == PROGRAMS
     assert far.asked == []
     assert not board.root.exists()
-
-
-def test_the_boards_refusal_is_the_exit_status(far, board, push, workshop):
-    """The board trusts somebody else's key already."""
-    board.root.mkdir()
-    (board.root / "trusted.pub").write_bytes(write_key_pair(far.folder / "other")[1].read_bytes())
-    assert push("board", workshop.make().path, "--service", "none") == 2
-    assert [p.name for p in board.root.iterdir()] == ["trusted.pub"]
-    (board.root / "trusted.pub").unlink()
 
 
 @pytest.mark.parametrize(("host", "expected"), [("nowhere", PROGRAMS[:1]), ("full", None)])

@@ -14,6 +14,7 @@ from deploy.installer.systemd import (
     Systemd,
     UnhealthyError,
 )
+from edge_runtime.policy import MAX_POLICY_MIB
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "deploy/systemd"
@@ -61,6 +62,7 @@ def test_the_runtime_has_a_watchdog_limits_no_rights_and_nothing_to_write_to():
     assert promised.items() <= unit.items()
     assert not {"ReadWritePaths", "StateDirectory"} & set(unit)
     assert float(unit["WatchdogSec"]) <= 3
+    assert int(unit["MemoryMax"].removesuffix("M")) >= 5 * MAX_POLICY_MIB  # loaded with weights
     tries_s = float(unit["RestartSec"]) * float(unit["StartLimitBurst"])
     assert tries_s < float(unit["StartLimitIntervalSec"])  # or the limit would never be reached
     assert not {"Requires", "BindsTo", "Requisite"} & set(unit)  # the bus is no condition
