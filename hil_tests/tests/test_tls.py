@@ -3,12 +3,9 @@
 import contextlib
 import datetime
 import ipaddress
-import itertools
 import json
 import re
 import shutil
-import signal
-import threading
 import time
 from typing import Any
 
@@ -17,18 +14,17 @@ import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from bridge.__main__ import main as bridge
 from bridge.ports import SimulatorPort, open_listener
 from bridge.recording import Recording
 from deploy.__main__ import main as deploy
 from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.commands import ask
-from edge_runtime.reach import free_endpoint, look
+from edge_runtime.reach import free_endpoint
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from hil_tests.processes import Process, wait_until
+from hil_tests.processes import Process
 from hil_tests.testing.commands import run_command
 from hil_tests.testing.drives import SLOW_TOY, make_policy, read
 from hil_tests.testing.edge import run_edge, wait_until_driving
@@ -130,35 +126,14 @@ def test_zenoh_lets_in_only_who_shows_a_certificate_of_the_authority(parties, en
             bare(place, **tls)
 
 
-@pytest.mark.parametrize("mode", ["client", "peer"])
-def test_our_own_line_says_why(parties, endpoint, mode):
-    mixed = load_tls(parties / "foreign/edge-hunter01")
-    believing = type("Mixed", (type(mixed),), {"ca": str(parties / "ca/ca.pem")})(*mixed)
-    for tls, says in (
-        (mixed, "not believed here"), (None, "needs certificates"),
-        (believing, "refuses the certificate of edge-hunter01"),
+def test_our_own_line_says_why(parties, endpoint):
+    foreign, plain = load_tls(parties / "foreign/edge-hunter01"), endpoint.replace("tls/", "tcp/")
+    for place, tls, says in (
+        (endpoint, foreign, "not believed here"), (endpoint, None, "needs certificates"),
+        (plain, None, "wants --tls"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=says):
-            open_session(connect=endpoint, mode=mode, tls=tls)
-    if mode == "client":
-        with pytest.raises(UserError, match="wants --tls"):
-            open_session(connect=endpoint.replace("tls/", "tcp/"), mode=mode)
-
-
-def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, tmp_path):
-    plain = endpoint.replace("tls/", "tcp/")
-    with run_edge(*edge_flags(plain, tmp_path)) as edge:
-        edge.wait_for_line(" waiting ")
-        line = next(line for line in edge.errors.splitlines() if " waiting " in line)
-        assert f"{plain} listens with TLS and wants --tls" in line
-        assert edge.end() == 0
-    place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
-    simulator = open_session(listen=place.replace("tls/", "tcp/"), mode="router")
-    _, said = look(place, files)
-    simulator.close()
-    assert re.match(f"{place} gives no TLS link", said)
-    assert "connection refused" in look(place, files)[1]
-    assert look(endpoint, files) == (True, "")
+            open_session(connect=place, mode="client", tls=tls)
 
 
 @pytest.mark.parametrize(
@@ -193,76 +168,23 @@ def expired_in(line, folder):
     return line.startswith(f"error: {folder}/cert.pem expired at ")
 
 
-def test_a_link_ends_when_its_certificate_does(parties, endpoint, tmp_path):
-    folder = short_lived(parties, tmp_path / "edge-hunter01", 4.0)
-    with session(endpoint, folder, "peer", rules_for_edge("hunter01")) as edge:
-        assert edge.info.routers_zid()
-        wait_until(lambda: not edge.info.routers_zid(), "the end of the link", 9.0)
-    with pytest.raises(UserError, match="expired at"):
-        load_tls(folder)
-
-
-@contextlib.contextmanager
-def simulating(place, files):
-    """A simulator's end that sends a state each 50 ms, and the commands that come."""
-    commands: list[Any] = []
-    over = threading.Event()
-    with (
-        listener(place, files, rules_for_listener(["hunter01"])) as ours,
-        contextlib.closing(SimulatorPort(ours, "hunter01")) as port,
-    ):
-
-        def send():
-            for step in itertools.takewhile(lambda _: not over.wait(0.05), itertools.count()):
-                port.publish_state(wire.encode(make_state(step, session=port.session)))
-
-        port.hear("command", lambda payload: commands.append(wire.decode_command(payload)))
-        thread = threading.Thread(target=send)
-        thread.start()
-        try:
-            yield commands
-        finally:
-            over.set()
-            thread.join()
-
-
-def test_states_behind_an_expired_certificate_are_not_taken(parties, tmp_path):
-    """Also where the link stays: the clock of the edge's Python steps, that of Zenoh does not."""
-    place = free_endpoint("tls")
-    flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
-    files = short_lived(parties, tmp_path / "simulator-hunter01", 1800.0)
-    operator = load_tls(parties / "operator-hunter01")
-    inside = ("hil_tests.faults.inside", "edge_runtime", "run", *flags, "--vehicle", "mock")
-    edge = Process(*inside, ready="ready")
-    with contextlib.ExitStack() as ends, simulating(place, files) as commands:
-        ends.callback(edge.end)
-        wait_until(lambda: commands and commands[-1].mode == wire.DRIVE, "a drive")
-        edge.send(signal.SIGUSR1)
-        time.sleep(1.0)
-        stopped = len(commands)
-        for number in (signal.SIGUSR1, signal.SIGUSR2):  # It stays as it is, or holds again
-            edge.send(number)
-            time.sleep(0.5)
-            status = ask(place, "hunter01", "status", operator)
-            assert (status["mode"], status["needs_rearm"]) == ("safe_stop", True)
-            assert status["rejected"]["certificate"] >= 20
-            holds = number is signal.SIGUSR2
-            assert ask(place, "hunter01", "rearm", operator)["accepted"] is holds
-        assert {each.mode for each in commands[stopped : stopped + 5]} == {wire.SAFE_STOP}
-        wait_until(lambda: commands[-1].mode == wire.DRIVE, "the drive after the re-arm")
-        assert edge.end() == 0
-    assert any(f"that of {place} expired at" in line for _, line in edge.lines)
-
-
 def test_a_certificate_that_really_expires_stops_the_vehicle(parties, tmp_path):
     """This listener does not end by itself. Zenoh closes the link, and mostly has it again."""
-    place = free_endpoint("tls")
+    place, commands = free_endpoint("tls"), []
     flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
     with run_edge(*flags, "--vehicle", "mock") as edge:
-        files = short_lived(parties, tmp_path / "simulator-hunter01", 6.0)
+        files = short_lived(parties, tmp_path / "simulator-hunter01", 4.0)
         ends_s = load_tls(files).expires.timestamp()
-        with simulating(place, files) as commands:
-            wait_until(lambda: time.time() > ends_s + 3.0, "the end of the certificate")
+        with (
+            listener(place, files, rules_for_listener(["hunter01"])) as ours,
+            contextlib.closing(SimulatorPort(ours, "hunter01")) as port,
+        ):
+            port.hear("command", lambda payload: commands.append(wire.decode_command(payload)))
+            for step in range(10_000):
+                port.publish_state(wire.encode(make_state(step, session=port.session)))
+                time.sleep(0.05)
+                if time.time() > ends_s + 2.0:
+                    break
         assert edge.end() == 0
     drives = [each.sent_ns / 1e9 for each in commands if each.mode == wire.DRIVE]
     assert len(drives) > 5
@@ -278,7 +200,7 @@ def test_every_process_ends_with_its_certificate(parties, tmp_path):
     edge_files, simulator, viewer, router = files = [
         short_lived(parties, tmp_path / name, life_s)
         for name, life_s in
-        (("edge-hunter01", 8.0), ("simulator-hunter01", 9.0), ("viewer", 9.0), ("router", 12.0))
+        (("edge-hunter01", 7.0), ("simulator-hunter01", 8.0), ("viewer", 8.0), ("router", 10.0))
     ]  # fmt: skip
     flags = edge_flags(place, tmp_path, edge_files)
     where = ("--connect", place, "--tls")
@@ -340,11 +262,11 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
     assert router.end() == 0
 
 
-@pytest.mark.parametrize("name", ["operator-hunter01", "simulator-hunter01"])
-def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties, name):
+def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties):
+    operator = load_tls(parties / "operator-hunter01")
     with (
-        pytest.raises(UserError, match=f"of {name}; name the directory of viewer"),
-        open_listener(free_endpoint("tls"), "hunter01", 0.0, load_tls(parties / name)),
+        pytest.raises(UserError, match=r"operator-hunter01.* viewer"),
+        open_listener(free_endpoint("tls"), "hunter01", 0.0, operator),
     ):
         pass
     with pytest.raises(ValueError, match="access control"):
@@ -354,7 +276,7 @@ def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties, nam
 def drive_among(intruders, endpoint, flags, folder):
     """The report, the edge's log, and by name what each intruder heard and was answered."""
     out = folder / "r.json"
-    simulate = ["simulate", "--env", SLOW_TOY, "--episodes", "3", "--listen", endpoint]
+    simulate = ["simulate", "--env", SLOW_TOY, "--episodes", "2", "--listen", endpoint]
     with (
         Process("bridge", *simulate, "--out", str(out), *flags("simulator-hunter01")) as run,
         run_edge(*edge_flags(endpoint, folder), *flags("edge-hunter01")) as edge,
@@ -380,10 +302,10 @@ def test_episodes_over_mutual_tls_among_intruders(parties, tmp_path):
     report, log, loot = drive_among(
         strangers, endpoint, lambda name: ["--tls", str(parties / name)], tmp_path
     )
-    assert [row["outcome"] for row in report["per_episode"]] == ["timeout"] * 3
+    assert [row["outcome"] for row in report["per_episode"]] == ["timeout"] * 2
     # A pause of a busy machine may make a message stale; these are an intruder's only.
     assert not FOREIGN & set(report["rejected"])
-    assert int(re.findall(r"accepted=(\d+)", log)[-1]) >= 100
+    assert int(re.findall(r"accepted=(\d+)", log)[-1]) >= 60
     for name in STRANGERS[:-1]:
         assert loot[name] == (set(), set()), name
     heard, answered = loot["viewer"]
@@ -459,17 +381,6 @@ def test_a_forged_token_of_another_vehicle_ends_no_edge(parties, tmp_path, is_th
     assert "another" not in edge.errors
 
 
-def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path):
-    endpoint = free_endpoint("tls")
-    flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
-    rules = rules_for_listener(["hunter01"])
-    with listener(endpoint, parties / "router", rules), run_edge(*flags) as edge:
-        second = run_command("run", *flags)
-        assert second.returncode == 2
-        assert "another edge runtime is connected" in second.stderr
-        assert edge.end() == 0
-
-
 @pytest.mark.parametrize(
     ("rights", "heard"),
     # Without rights, too: what makes the first row mean something.
@@ -501,45 +412,26 @@ def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path, rights, hea
     assert set(found) == heard
 
 
-def test_a_routers_file_names_the_vehicles_of_both_options(parties, tmp_path, capsys):
+def test_a_routers_file_names_the_vehicles_of_both_options(parties, tmp_path):
     listed, out = tmp_path / "fleet.txt", tmp_path / "router.json5"
     listed.write_text("# the yard\nhunter02\n\nhunter03  # at the gate\n")
     words = ["router", "--listen", "tls/127.0.0.1:7447", "--tls", str(parties / "router")]
     words += ["--vehicle-id", "hunter01", "--vehicles", str(listed), "--out", str(out)]
     assert deploy(words) == 0
-    assert "3 vehicles" in capsys.readouterr().out
     settings = json.loads(out.read_text())
-    rules, link = settings["access_control"], settings["transport"]["link"]
-    names = {subject["id"] for subject in rules["subjects"]}
-    assert names >= {f"edge-hunter0{i}" for i in (1, 2, 3)}
+    rules, tls = settings["access_control"], settings["transport"]["link"]["tls"]
+    assert {each["id"] for each in rules["subjects"]} >= {f"edge-hunter0{i}" for i in (1, 2, 3)}
     assert (rules["enabled"], rules["default_permission"]) == (True, "deny")
     assert (settings["mode"], settings["listen"]["endpoints"]) == ("router", [words[2]])
-    assert link["tls"]["enable_mtls"] is True
-    assert link["tls"]["listen_certificate"] == str(parties / "router" / "cert.pem")
-    assert link["protocols"] == ["tls"]
-    assert settings["scouting"]["multicast"]["enabled"] is False
+    assert (tls["enable_mtls"], tls["listen_certificate"]) == (True, f"{parties}/router/cert.pem")
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ("--listen tcp/127.0.0.1:7447", "plain text"),
-        ("--tls {parties}/viewer", "certificate of viewer"),
-        ("--vehicle-id a/b", "not valid"),
-        ("--vehicles nowhere.txt", "does not exist"),
-        ("--out /dev/null/r.json5", "Not a directory"),
-    ],
+    "change", ["--listen tcp/127.0.0.1:7447", "--tls {parties}/viewer", "--vehicles nowhere.txt"]
 )
-def test_a_routers_file_is_refused_where_it_would_not_hold(parties, tmp_path, change, says):
+def test_a_routers_file_is_refused_where_it_would_not_hold(parties, tmp_path, change):
     words = "--listen tls/127.0.0.1:7447 --tls {parties}/router --vehicle-id hunter01 --out {out} "
     options = (words + change).format(parties=parties, out=tmp_path / "r.json5")
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError):
         deploy(["router", *options.split()])
     assert not list(tmp_path.iterdir())
-
-
-def test_a_router_says_what_is_wrong_with_its_file(tmp_path):
-    path = tmp_path / "r.json5"
-    path.write_text('{"mode": "router", "nonsense": 3}')
-    with pytest.raises(UserError, match="nonsense"):
-        bridge(["router", "--config", str(path)])
