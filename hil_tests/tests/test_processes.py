@@ -1,15 +1,12 @@
-"""Processes beside us: how they end, time out, crash and are interrupted."""
-
 import os
 import signal
 import subprocess
 import sys
-import threading
 
 import pytest
 
 from edge_runtime.util import UserError
-from hil_tests.processes import CommandTimeoutError, Process, in_parallel, wait_until
+from hil_tests.processes import CommandTimeoutError, Process, wait_until
 
 SERVER = ("http.server", "0", "--bind", "127.0.0.1")
 
@@ -30,19 +27,6 @@ def test_a_process_has_crashed_where_nobody_ended_it():
 def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path):
     with pytest.raises(UserError, match="does not exist"):
         Process("edge_runtime", "run", "--policy", str(tmp_path / "none.onnx"), ready="ready")
-
-
-def test_after_a_failure_nothing_more_is_begun():
-    begun, ended = [], threading.Event()
-
-    def fail(item):
-        begun.append(item)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        in_parallel(fail, [1, 2, 3], 1, lambda *_: None, ended)
-    assert ended.is_set()
-    assert len(begun) < 3
 
 
 CHILD = """
