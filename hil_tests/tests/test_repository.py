@@ -16,7 +16,6 @@ from pathlib import Path
 
 import pytest
 
-from deploy.installer import __main__ as installer
 from edge_runtime import __version__
 from edge_runtime.cli import ArgumentParser
 from trainer.util import kept
@@ -145,14 +144,6 @@ def test_what_drives_any_policy_knows_none_of_ours(folder):
         assert OURS.search(path.read_text()) is None, path
 
 
-def test_what_the_mutations_settings_name_is_there():
-    for path in (ROOT / "hil_tests/mutation").glob("*.toml"):
-        settings = tomllib.loads(path.read_text())["cosmic-ray"]
-        tests = [word for word in settings["test-command"].split() if ".py" in word]
-        named = [*settings["module-path"], *tests]
-        assert [each for each in named if not (ROOT / each).is_file()] == []
-
-
 class ParsedError(Exception):
     """The arguments are good; what they ask for is not done."""
 
@@ -198,20 +189,14 @@ def examples_in(text):
 @pytest.mark.parametrize("folder", ARROWS)
 def test_every_command_shows_examples_that_it_takes(folder, only_parse):
     commands = [[name] for name in subcommands_in(help_of(folder, [], only_parse))]
-    assert commands
     for words in [[], *commands]:
         found = examples_in(help_of(folder, words, only_parse))
         assert found, f"python -m {folder} {' '.join(words)} --help has no example"
         for example in found:
             assert example[: 1 + len(words)] == [folder, *words]
             # `train --set` alone lists the settings and ends; it drives nothing.
-            lists = example[-1] == "--set"
-            with pytest.raises(SystemExit if lists else ParsedError) as ended:
+            with pytest.raises(SystemExit if example[-1] == "--set" else ParsedError):
                 main_of(folder)(example[1:])
-            assert not lists or ended.value.args == (0,)
-        with pytest.raises(SystemExit) as ended:
-            main_of(folder)([*words, "--hepl"])
-        assert ended.value.code == 2
 
 
 HEAVY = ("torch", "highway_env", "matplotlib", "rerun", "scipy", "tensorboard", "pandas", "pygame")
@@ -253,15 +238,6 @@ def test_phil_runs_every_folder(tmp_path):
         ended = subprocess.run([phil, *words], capture_output=True, text=True, cwd=tmp_path)
         assert ended.returncode == status
         assert said in ended.stdout + ended.stderr
-
-
-def test_the_installer_shows_examples_that_it_takes():
-    parser = installer._parser()
-    (commands,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))
-    for one in [parser, *commands.choices.values()]:
-        text = " ".join(one.format_help().split())
-        _, _, example = text.partition("example: sudo python3 install.pyz ")
-        parser.parse_args(shlex.split(example))
 
 
 KINDS = ("*.md", "*/README.md", "docs/*.md")
