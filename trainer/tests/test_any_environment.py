@@ -23,7 +23,7 @@ from bridge.messages import Origin
 from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.testing.environments import CAMERA, ROVER, Rover, odd
+from hil_tests.testing.environments import odd
 from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
@@ -51,6 +51,7 @@ from trainer.person.recording import Recorder, demonstrate, read_steps
 from trainer.person.session import Sitting
 from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
+from trainer.tests.rover import CAMERA, ROVER, Rover
 from trainer.training.delayed import DelayedVehicle
 from trainer.view import ShownStep, sitting_entries
 
@@ -377,7 +378,7 @@ def test_a_stop_of_no_environments_own_begins_each_episode_with_hands_off():
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     env = make_environment(ROVER)
     env.reset(seed=0)
-    for expert in (expert_of(env), expert_of(env, "hil_tests.testing.environments:Careful")):
+    for expert in (expert_of(env), expert_of(env, "trainer.tests.rover:Careful")):
         assert expert.act().tolist() == [1.0, 0.0]
         assert expert.wants_control(np.array([-1.0, 0.0], np.float32)) == "slow"
         assert expert.may_return()
