@@ -54,9 +54,13 @@ def test_install_faulty_upgrades_good_upgrade_back_and_away(board, tmp_path, fau
             for step in itertools.takewhile(lambda _: not ending.wait(0.05), itertools.count()):
                 simulator.send(make_state(step))
 
+        def hears() -> bool:
+            heard.extend(simulator.drain())
+            return bool(heard)
+
         def drives(made) -> None:
             simulator.drain()  # Of what ran before.
-            wait_until(lambda: heard.extend(simulator.drain()) or heard, "commands")
+            wait_until(hears, "commands")
             assert {command.policy_id for command in heard} == {made.manifest.policy_id}
             heard.clear()
 
@@ -75,7 +79,7 @@ def test_install_faulty_upgrades_good_upgrade_back_and_away(board, tmp_path, fau
             shown = board.status()
             assert (shown["current"], shown["previous"]) == (good.manifest.version, "none")
             assert [p.name for p in (board.root / "releases").iterdir()] == [shown["current"]]
-            heard.extend(simulator.drain())
+            hears()
             assert bad.manifest.policy_id not in {command.policy_id for command in heard}
             drives(good)
         # The mock's feedback names the command it took last: never one, for it never ran.

@@ -171,7 +171,8 @@ def expired_in(line, folder):
 
 def test_a_certificate_that_really_expires_stops_the_vehicle(parties, tmp_path):
     """This listener does not end by itself. Zenoh closes the link, and mostly has it again."""
-    place, commands = free_endpoint("tls"), []
+    place = free_endpoint("tls")
+    commands: list[Any] = []
     flags = edge_flags(place, tmp_path, parties / "edge-hunter01")
     with run_edge(*flags, "--vehicle", "mock") as edge:
         files = short_lived(parties, tmp_path / "simulator-hunter01", 4.0)
@@ -223,7 +224,8 @@ def test_every_process_ends_with_its_certificate(parties, tmp_path):
 
 
 def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, tmp_path):
-    place, answered = free_endpoint("tls"), []
+    place = free_endpoint("tls")
+    answered: list[bytes] = []
     words = ("bridge", "router", "--listen", place, "--tls", str(parties / "router"))
 
     def drive() -> None:
