@@ -13,7 +13,7 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing.connection import wait
@@ -24,115 +24,89 @@ from bridge.progress import ProgressBar
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
 from trainer import util
-from trainer.drivers import CHECKPOINT_FILE
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments import plan, report
-from trainer.experiments.compute import BUSY, FAILED, FILES, FINISHED, STOPPED, Job, compute
+from trainer.experiments.compute import BUSY, FAILED, FINISHED, STOPPED, Job, compute
 from trainer.experiments.plan import FOREIGN, REPORT, STATUS, STUDIES, TYPICAL
-from trainer.experiments.records import Store
+from trainer.experiments.records import RECORD_FILE, Store
 from trainer.human.config import MODEL_FILE
 from trainer.options import check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
+from trainer.training.config import CONFIG_FILE
+from trainer.training.metrics import METRICS_FILE
 
 PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
-EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
-"""Exit status of a unit's process -> how the unit ended."""
+EXITS = (FINISHED, FAILED, STOPPED, BUSY)
+"""How a unit ended, in the order of its process's exit statuses."""
+FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE, CONFIG_FILE, RECORD_FILE)
+"""What a unit goes on from, and what it leaves."""
 Files = dict[str, bytes]
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute, say how much is done, or report; return the exit status."""
-    names = list(dict.fromkeys(arguments.names))
-    studies = [name for name in names if name in STUDIES]
-    alone = {STATUS, REPORT, TYPICAL, *STUDIES} & set(names)
-    is_status_of_study = len(names) == 2 and STATUS in names and bool(studies)
-    if len(names) > 1 and alone and not is_status_of_study:
-        known = ", ".join(STUDIES)
-        raise UserError(
-            f"{STATUS}, {REPORT}, {TYPICAL}, {known} stand alone, or {STATUS} with a table"
-        )
-    if names == [TYPICAL]:
-        return _write_typical(arguments)
-    store = _store(arguments, plan.study_of(names))
-    seeds = arguments.seeds
+    names, seeds = {*arguments.names}, arguments.seeds
+    chosen = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
+    alone = names & {STATUS, REPORT, TYPICAL, *STUDIES}
+    if len(names) > 1 and alone and names != {STATUS, chosen.name}:
+        raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
+    if TYPICAL in names:
+        results, nowhere = Path(arguments.results or util.kept("results")), Path(os.devnull)
+        stores = [Store(each, results / name, nowhere, nowhere) for name, each in STUDIES.items()]
+        found = [store.load(store.study.units(seeds), seeds) for store in stores]
+        report.write_typical(found, TYPICAL_FILE)
+        print(f"wrote {TYPICAL_FILE}")
+        return 0
+    results = Path(arguments.results or util.kept(f"results/{chosen.name}"))
+    runs = Path(arguments.runs or util.kept(f"runs/{chosen.name}"))
+    if arguments.quick:
+        chosen, results, runs = chosen.quick(), runs / "quick/results", runs / "quick"
+    store = Store(chosen, results, runs, Path(arguments.humans))
+    units = chosen.units(seeds, arguments.scenario, names)
     if STATUS in names:
-        print("\n".join(_status(store, seeds, arguments.scenario)))
+        records = store.load(units, seeds)
+        done = Counter(unit[:3] for unit in records.found)
+        for line, count in Counter(unit[:3] for unit in units).items():
+            print("{2:10} {1:24} {0:11}".format(*line), f"{done[line]} of {count} done")
+        stale = f"{len(records.stale)} records of other settings"
+        print(f"{len(records.found)} of {len(units)} units done; {stale}")
         return 0
-    everything = store.study.units(seeds)
-    if names == [REPORT]:
-        print(f"wrote {report.write_page(store, store.load(everything, seeds))}")
-        return 0
-    units = store.study.units(seeds, arguments.scenario, names)
-    ends, left = _compute_missing(arguments, store, units)
-    if ends[FINISHED] < left:
-        print("the same command goes on")
-    records = store.load(everything, seeds)
-    if set(units) & set(records.found):
+    ends = Counter[str]() if REPORT in names else _compute_missing(arguments, store, units)
+    records = store.load(chosen.units(seeds), seeds)
+    if REPORT in names or {*units} & {*records.found}:
         print(f"wrote {report.write_page(store, records)}")
     return 1 if ends[FAILED] else 0
 
 
-def _store(arguments: argparse.Namespace, study: plan.Study) -> Store:
-    results = Path(arguments.results or util.kept(f"results/{study.name}"))
-    runs = Path(arguments.runs or util.kept(f"runs/{study.name}"))
-    if arguments.quick:
-        study, results, runs = study.quick(), runs / "quick" / "results", runs / "quick"
-    return Store(study, results, runs, Path(arguments.humans))
-
-
-def _write_typical(arguments: argparse.Namespace) -> int:
-    """Write the curves that a person's coach shows, of all studies."""
-    results, seeds = Path(arguments.results or util.kept("results")), arguments.seeds
-    found = []
-    for study in STUDIES.values():
-        store = Store(study, results / study.name, Path(os.devnull), Path(arguments.humans))
-        found.append(store.load(study.units(seeds), seeds))
-    report.write_typical(found, TYPICAL_FILE)
-    print(f"wrote {TYPICAL_FILE}")
-    return 0
-
-
-def _status(store: Store, seeds: int, scenario: str | None) -> Iterator[str]:
-    """Yield a line for each algorithm and setting of a study: how many units are done."""
-    units = store.study.units(seeds, scenario)
-    records = store.load(units, seeds)
-    done = Counter(unit[:3] for unit in records.found)
-    for line, count in Counter(unit[:3] for unit in units).items():
-        task, algorithm, setting = line
-        yield f"{setting:10} {algorithm:24} {task:11} {done[line]} of {count} done"
-    stale = f"{len(records.stale)} records of other settings"
-    yield f"{len(records.found)} of {len(units)} units done; {stale}"
-
-
 def _compute_missing(
     arguments: argparse.Namespace, store: Store, wanted: Sequence[plan.Unit]
-) -> tuple[Counter[str], int]:
-    """Compute the units that have no current record.
-
-    Returns how many ended in which way, and how many there were to compute.
-    """
-    names, scenario = ", ".join(arguments.names), arguments.scenario
+) -> Counter[str]:
+    """Compute the units that have no current record; return how many ended in which way."""
     if arguments.ray and arguments.device != "cpu":
         raise UserError("--ray computes on processors: leave out --device")
     check_device(arguments.device)
     if not wanted:
-        raise UserError(f"{names}: nothing to compute in {scenario}")
+        raise UserError(f"{', '.join(arguments.names)}: nothing to compute in {arguments.scenario}")
     if arguments.ray and any(unit.scenario in FOREIGN for unit in wanted):
         ours = " or ".join(plan.SCENARIOS)
         raise UserError(f"--ray lacks {', '.join(FOREIGN)}: compute one with --scenario {ours}")
-    possible = [unit for unit in wanted if unit.is_possible(store.humans)]
-    if left_out := len(wanted) - len(possible):
-        say(f"{left_out} units left out: {store.humans} holds no human model of their scenario")
-    done = set(store.load(possible, arguments.seeds).found)
     # The clock that the processes have, too.
     stop_at_s = deadline_s(arguments.max_minutes, time.time)
-    jobs = [Job(each, store, stop_at_s, arguments.device) for each in possible if each not in done]
+    jobs = [Job(unit, store, stop_at_s, arguments.device) for unit in wanted]
+    possible = [job for job in jobs if not job.unit.needs_human or job.human_model.is_file()]
+    if left_out := len(wanted) - len(possible):
+        say(f"{left_out} units left out: {store.humans} holds no human model of their scenario")
+    done = store.load([job.unit for job in possible], arguments.seeds).found
+    jobs = [job for job in possible if job.unit not in {*done}]
     if jobs and arguments.ray:
         ends = run_on_ray(jobs, arguments.ray)
     else:
         ends = run_here(jobs, arguments.jobs or util.cores())
     said = "".join(f", {count} {end}" for end, count in ends.items())
     print(f"{len(done)} of {len(wanted)} units were there already{said}")
-    return ends, len(jobs)
+    if ends[FINISHED] < len(jobs):
+        print("the same command goes on")
+    return ends
 
 
 def run_here(jobs: Sequence[Job], processes: int) -> Counter[str]:
@@ -159,10 +133,10 @@ def run_here(jobs: Sequence[Job], processes: int) -> Counter[str]:
                 for sentinel in wait([*working]) if working else ():
                     process, job = working.pop(sentinel)
                     process.join()
-                    end = EXITS.get(process.exitcode, FAILED)
-                    if process.exitcode not in EXITS:
+                    died = process.exitcode not in range(len(EXITS))
+                    if died:
                         say(f"failed: {job.unit}: its process died ({process.exitcode})")
-                    ends[end] += 1
+                    ends[FAILED if died else EXITS[process.exitcode]] += 1
                     bar.advance({"last": str(job.unit)})
         finally:
             for process, _ in working.values():
@@ -179,18 +153,16 @@ def _work(job: Job) -> None:
     """Live as a process that computes a unit; the exit status tells how the unit ended."""
     os.nice(5)  # a machine on which somebody works stays usable
     threading.Thread(target=util.die_with_parent, daemon=True).start()
-    end, why = FAILED, ""
+    end = FAILED
     try:
         end = compute_alone(job)
     except UserError as error:
-        why = str(error)
+        say(f"failed: {job.unit}: {error}")
     except BaseException as error:
         path = job.run_dir / "error.txt"
         write_atomic(path, traceback.format_exc().encode())
-        why = f"{type(error).__name__}: {error} ({path})"
-    if end == FAILED:
-        say(f"failed: {job.unit}: {why}")
-    sys.exit(list(EXITS.values()).index(end))
+        say(f"failed: {job.unit}: {type(error).__name__}: {error} ({path})")
+    sys.exit(EXITS.index(end))
 
 
 def compute_alone(job: Job) -> str:
@@ -209,28 +181,38 @@ def run_on_ray(jobs: Sequence[Job], address: str) -> Counter[str]:
 
     Raises UserError: Ray is not installed, or nothing answers at the address.
     """
-    ray = _connected(address)
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
+    if not ray.is_initialized():
+        import bridge
+        import edge_runtime
+        import trainer
+
+        # Nodes need the libraries; our own code is sent to them.
+        modules = {"py_modules": [edge_runtime, bridge, trainer]}
+        try:
+            ray.init(address=address, runtime_env=modules, log_to_driver=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise UserError(f"--ray {address}: no cluster answers: {error}") from error
     remote = ray.remote(num_cpus=1, max_retries=3)(compute_parcel)  # for nodes that die
     ends: Counter[str] = Counter()
     with ExitStack() as locks:
         waiting = {}
         for job in jobs:
-            if not locks.enter_context(util.held(job.run_dir, PATIENCE_S)):
-                ends[BUSY] += 1
-            elif job.store.record_left(job.unit):  # made elsewhere in the meantime
-                ends[FINISHED] += 1
-            else:
+            if locks.enter_context(util.held(job.run_dir, PATIENCE_S)):
                 waiting[remote.remote(*pack(job))] = job
+            else:
+                ends[BUSY] += 1
         while waiting:
             (ready, *_), _ = ray.wait(list(waiting))
-            job = waiting.pop(ready)
+            job, end = waiting.pop(ready), FAILED
             try:
                 end = unpack(job, *ray.get(ready))
             except ray.exceptions.RayError as error:
                 cause = getattr(error, "cause", None) or error
-                last = str(cause).strip().splitlines()[-1:]  # a MemoryError says nothing
-                end = FAILED
-                say(": ".join((end, str(job.unit), type(cause).__name__, *last)))
+                say(f"failed: {job.unit}: {type(cause).__name__}: {cause}")
             ends[end] += 1
             say(f"{job.unit}: {end}, {ends.total()} of {len(jobs)}")
     return ends
@@ -259,34 +241,13 @@ def unpack(job: Job, end: str, working: Files) -> str:
     return end
 
 
-def _read(directory: Path, names: Sequence[str]) -> Files:
+def _read(directory: Path, names: Iterable[str]) -> Files:
     """Return those of the files that are there."""
     paths = [directory / name for name in names]
     return {path.name: path.read_bytes() for path in paths if path.is_file()}
 
 
 def _write(directory: Path, files: Files) -> None:
-    """Write the files, each whole or not at all."""
     make_directory(directory)
     for name, data in files.items():
         write_atomic(directory / name, data)
-
-
-def _connected(address: str) -> Any:
-    """Return the library, with a cluster behind it."""
-    try:
-        import ray
-    except ImportError:
-        raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
-    if not ray.is_initialized():
-        import bridge
-        import edge_runtime
-        import trainer
-
-        # Nodes need the libraries; our own code is sent to them.
-        modules = {"py_modules": [edge_runtime, bridge, trainer]}
-        try:
-            ray.init(address=address, runtime_env=modules, log_to_driver=False)
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            raise UserError(f"--ray {address}: no cluster answers: {error}") from error
-    return ray

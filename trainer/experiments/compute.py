@@ -6,13 +6,14 @@ What is killed goes on from its last checkpoint, to the same bits.
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from bridge.outcomes import GOAL
@@ -22,9 +23,18 @@ from trainer import drivers, util
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, drive_together
-from trainer.experiments import plan, records
-from trainer.experiments.plan import Line, Study, Unit
-from trainer.experiments.records import ARRIVED_ONLY, RECORD_FILE, Columns, Record, Store, rounded
+from trainer.experiments import plan
+from trainer.experiments.plan import TASKS, Line, Study, Unit
+from trainer.experiments.records import (
+    ARRIVED_ONLY,
+    DISTANCE,
+    RECORD_FILE,
+    REWARD,
+    Record,
+    Store,
+    columns_of,
+    summarise_tests,
+)
 from trainer.human.config import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
@@ -35,22 +45,19 @@ from trainer.training.run import TrainingRun
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; with a checkpoint, for lack of time; at once, since
 another process has it; with an error."""
-FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE, CONFIG_FILE, RECORD_FILE)
-"""What a unit goes on from, and what it leaves."""
 EPISODES = {
-    "end_step": "total_steps",
-    "return": "episode_return",
+    "total_steps": "end_step",
+    "episode_return": "return",
     "distance_m": "distance_m",
     "outcome": "outcome",
     "human_steps": "human_steps",
-    "takeovers": "interventions",
+    "interventions": "takeovers",
     "validation_success": "validation_success",
     "validation_distance_m": "validation_distance_m",
     "validation_reward": "validation_reward",
 }
-"""Column of the table of episodes -> column of a run's metrics."""
-DRIVES = ("outcome", "distance_m", "reward", *ARRIVED_ONLY)  # What is measured in a test drive
-TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
+"""Column of a run's metrics -> column of the table of episodes."""
+TIMES = ["environment_s", "acting_s", "storing_s", "waiting_s"]
 """Columns of the metrics that add up to the time that a training took."""
 UNLIMITED_EPISODES = 10**6  # So many that steps decide
 
@@ -77,65 +84,17 @@ class Job:
 
 
 def compute(job: Job) -> str:
-    """Compute a unit from where it stands and write its record; return how that ended."""
-    record = make_record(job)
-    if record is None:
-        return STOPPED
-    write_json(job.run_dir / RECORD_FILE, record)
-    # The actor stays, for export and for tests to come; what learning needs is large.
-    (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return FINISHED
-
-
-def make_record(job: Job) -> Record | None:
-    """Train and test a unit; return its rows of each table, or None where time ran out.
+    """Compute a unit from where it stands and write its record; return how that ended.
 
     torch works on one thread: the last bits must not depend on the machine's cores.
     """
-    unit, study = job.unit, job.store.study
-    if time.time() > job.stop_at_s:
-        return None
     torch.set_num_threads(1)
-    record: dict[str, Columns] = {}
-    own: dict[str, Any] = {}
-    device, policy = "cpu", unit.scripted_human
-    if unit.trained:
-        if not _train(job):
-            return None
-        rows = read_metrics(job.run_dir)
-        record["episodes"] = {ours: [_value(row[theirs]) for row in rows]
-                              for ours, theirs in EPISODES.items()}  # fmt: skip
-        env = make_environment(unit.environment)
-        tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
-        own = {
-            "period_s": env.control_period_s,
-            "updates": int(rows[-1]["updates"]),
-            "tested_actor_at_step": int(rows[tested - 1]["total_steps"]),
-            "training_s": round(sum(float(row[key] or 0.0) for row in rows for key in TIMES)),
-        }
-        # Not the job's: the unit may have been trained before.
-        device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
-        policy = str(job.run_dir)
-    elif unit.algorithm == plan.CONSTANT:
-        own = best_constant(unit.scenario, study)
-        policy = f"{drivers.CONSTANT}{own['action']}"
-    elif unit.algorithm == plan.HUMAN_MODEL:
-        policy = str(job.human_model.parent)
-    began_s = time.monotonic()
-    drives = drive_tests(unit, policy, study.of(unit.scenario))
-    own["tests_s"] = round(time.monotonic() - began_s)
-    tests = [records.summarise_tests(unit.scenario, *each) for each in drives.items()]
-    record["tests"] = {name: [row[name] for row in tests] for name in tests[0]}
-    if Line(unit.algorithm, unit.setting) in plan.BOXED:
-        record["drives"] = arrivals(drives, plan.BOXES[unit.scenario])
-    record["units"] = {name: [value] for name, value in {
-        "digest": study.digest(unit),
-        "config": json.dumps(study.config(unit), separators=(",", ":")),
-        "human_model": _human_model_id(job),
-        **own,
-        **_computed_on(device),
-    }.items()}  # fmt: skip
-    return record
+    if time.time() > job.stop_at_s or (job.unit.trained and not _train(job)):
+        return STOPPED
+    write_json(job.run_dir / RECORD_FILE, make_record(job))
+    # The actor stays, for export and for tests to come; what learning needs is large.
+    (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
+    return FINISHED
 
 
 def run_config(job: Job) -> RunConfig:
@@ -176,47 +135,79 @@ def _train(job: Job) -> bool:
     return run.over
 
 
-def _value(text: str) -> Any:
-    """Return a number of a row of metrics with five digits, None for nan, or an outcome."""
-    if text in ("", "nan"):
-        return None
-    try:
-        return int(text) if text.lstrip("-").isdigit() else rounded(float(text))
-    except ValueError:
-        return text
+def make_record(job: Job) -> Record:
+    """Test a unit, trained or not; return its rows of each table."""
+    unit, study = job.unit, job.store.study
+    tables: dict[str, pd.DataFrame] = {}
+    own: dict[str, Any] = {}
+    device, policy = "cpu", unit.scripted_human
+    if unit.trained:
+        rows = pd.read_csv(job.run_dir / METRICS_FILE)
+        episodes = rows[[*EPISODES]].rename(columns=EPISODES)
+        tables["episodes"] = episodes.map(_rounded)
+        env = make_environment(TASKS[unit.scenario][0])
+        tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
+        own = {
+            "period_s": env.control_period_s,
+            "updates": int(rows.updates.iloc[-1]),
+            "tested_actor_at_step": int(rows.total_steps[tested - 1]),
+            "training_s": round(rows[TIMES].sum(axis=None)),
+        }
+        # Not the job's: the unit may have been trained before.
+        device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
+        policy = str(job.run_dir)
+    elif unit.algorithm == plan.CONSTANT:
+        own = best_constant(unit.scenario, study)
+        policy = f"{drivers.CONSTANT}{own['action']}"
+    elif unit.algorithm == plan.HUMAN_MODEL:
+        policy = str(job.human_model.parent)
+    began_s = time.monotonic()
+    drives = drive_tests(unit, policy, study.of(unit.scenario))
+    own["tests_s"] = round(time.monotonic() - began_s)
+    tables["tests"] = summarise_tests(unit.scenario, drives)
+    if Line(unit.algorithm, unit.setting) in plan.BOXED:
+        tables["drives"] = arrivals(drives, plan.BOXES[unit.scenario])
+    row = {
+        "digest": study.digest(unit),
+        "config": json.dumps(study.config(unit), separators=(",", ":")),
+        "human_model": None,
+        **own,
+        **_computed_on(device),
+    }
+    if unit.needs_human:
+        model = sha256(read_bytes(job.human_model, "human model"))
+        row["human_model"] = model.hexdigest()[: plan.ID_LENGTH]
+    record = {name: columns_of(table) for name, table in tables.items()}
+    return {**record, "units": {name: [value] for name, value in row.items()}}
 
 
-def drive_tests(unit: Unit, policy: str, study: Study) -> dict[str, Columns]:
-    """Return the test drives of a policy: condition -> column -> a value a drive."""
-    tests, seeds = dict[str, Columns](), range(study.test_runs)
+def _rounded(value: Any) -> Any:
+    """Return a number with five digits; anything else as it is."""
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def drive_tests(unit: Unit, policy: str, study: Study) -> pd.DataFrame:
+    """Return the test drives of a policy, a row each, condition by condition."""
+    environment, seeds = TASKS[unit.scenario][0], range(study.test_runs)
+    columns = ["outcome", DISTANCE, REWARD, *ARRIVED_ONLY]
+    tests = []
     for condition in unit.conditions:
-        env = make_environment(unit.environment, condition)
+        env = make_environment(environment, condition)
         driver: Any = load_driver(policy, env)[0]
         if drivers.is_expert(policy):  # it has a memory, and drives its own environment only
             drives = drive_episodes(env, driver, seeds, condition)
         else:
             more = range(min(study.together, study.test_runs) - 1)
-            envs = [env, *(make_environment(unit.environment, condition) for _ in more)]
+            envs = [env, *(make_environment(environment, condition) for _ in more)]
             drives = drive_together(envs, driver.act_together, seeds, condition)
-        tests[condition] = {name: [rounded(getattr(drive, name)) for drive in drives]
-                            for name in DRIVES}  # fmt: skip
-    return tests
+        tests += [(condition, drive.seed, *(_rounded(getattr(drive, name)) for name in columns))
+                  for drive in drives]  # fmt: skip
+    return pd.DataFrame(tests, columns=["condition", "drive", *columns])
 
 
-def arrivals(tests: Mapping[str, Columns], quantities: Iterable[str]) -> Columns:
-    """Return the columns of the table of drives: those that reach the goal."""
-    reached = [
-        (condition, drive)
-        for condition, drives in tests.items()
-        for drive, outcome in enumerate(drives["outcome"])
-        if outcome == GOAL
-    ]
-    return {
-        "condition": [condition for condition, _ in reached],
-        "drive": [drive for _, drive in reached],
-        **{name: [tests[condition][name][drive] for condition, drive in reached]
-           for name in quantities},
-    }  # fmt: skip
+def arrivals(drives: pd.DataFrame, quantities: Iterable[str]) -> pd.DataFrame:
+    """Return the rows of the table of drives: those that reach the goal."""
+    return drives.loc[drives.outcome == GOAL, ["condition", "drive", *quantities]]
 
 
 def best_constant(scenario: str, study: Study) -> dict[str, Any]:
@@ -239,14 +230,6 @@ def best_constant(scenario: str, study: Study) -> dict[str, Any]:
     coarse, reach = search(-1.0, 1.0), 2.0 / (study.search_points - 1)
     best = search(max(coarse - reach, -1.0), min(coarse + reach, 1.0))
     return {"action": best, "searched": len(worth), "search_success": worth[best][0]}
-
-
-def _human_model_id(job: Job) -> str | None:
-    """Return the first letters of the hash of the human model that guided; None: none did."""
-    if not job.unit.needs_human:
-        return None
-    model = read_bytes(job.human_model, "human model")
-    return sha256(model).hexdigest()[: plan.ID_LENGTH]
 
 
 def _computed_on(device: str) -> dict[str, Any]:

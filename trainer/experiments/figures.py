@@ -3,13 +3,11 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from io import BytesIO
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
-from statistics import mean, median_high
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
@@ -40,7 +38,6 @@ from trainer.experiments.records import (
     SUCCESS,
     TIME_S,
     TRAINING,
-    Numbers,
     Records,
 )
 from trainer.pictures import DOTS_PER_INCH
@@ -51,15 +48,6 @@ Scene = tuple[str, str]  # A scenario under a test condition
 SCENES = [*product(SCENARIOS, CONDITIONS)]
 PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
 SCENE_KEY = "L: left turn, C: congestion, -N: command noise, -V: variant, -D: dense"
-
-
-def label(scene: Scene) -> str:
-    """Return the scene as in the paper's figure 9: L, L-N, L-V, C, ..."""
-    scenario, condition = scene
-    letter = scenario[0].upper()
-    return letter if condition == "nominal" else f"{letter}-{condition[0].upper()}"
-
-
 COLOURS = {
     "phil_td3": "C3",
     "ia_td3": "C0",
@@ -69,7 +57,7 @@ COLOURS = {
 }
 OTHERS = ("C4", "C5", "C6", "C8", "C9", "black", "C1")
 """For algorithms without a colour of their own, by their place in the figure."""
-CURVES = ((TRAINING, REWARD), (TRAINING, DISTANCE), (ALONE, SUCCESS), (ALONE, DISTANCE))
+CURVES = ((REWARD, TRAINING), (DISTANCE, TRAINING), (SUCCESS, ALONE), (DISTANCE, ALONE))
 TITLES = {
     REWARD: "reward",
     DISTANCE: "surviving distance, m",
@@ -81,37 +69,38 @@ TITLES = {
 MARKERS = {NORMAL: "o", plan.ONE_FRAME: "D", plan.RANDOM: "^", plan.BIASED: "v"}
 
 
+def label(scene: Scene) -> str:
+    """Return the scene as in the paper's figure 9: L, L-N, L-V, C, ..."""
+    letter, condition = scene[0][0].upper(), scene[1]
+    return letter if condition == "nominal" else f"{letter}-{condition[0].upper()}"
+
+
 def _colour(line: Line, place: int) -> str:
-    """An algorithm's colour, the same in every figure."""
     return COLOURS.get(line.algorithm, OTHERS[place % len(OTHERS)])
 
 
 def draw_curves(name: str, records: Records) -> Figure:
     """A row a scenario: training episodes with the human's help, then the policy alone."""
     figure = Figure(figsize=(16.0, 6.8), layout="constrained")
-    panels = figure.subplots(2, len(CURVES), sharex="row")
-    for panel, (scenario, (kind, metric)) in zip(
-        panels.flat, product(SCENARIOS, CURVES), strict=True
-    ):
+    panels = figure.subplots(2, len(CURVES), sharex="row").flat
+    for panel, (scenario, curve) in zip(panels, product(SCENARIOS, CURVES), strict=True):
+        metric, kind = curve
         panel.set_title(f"{words(scenario)}: {TITLES[metric]}, {kind}", fontsize=10)
         for place, line in enumerate(EXPERIMENTS[name].lines):
-            units = records.units_of(scenario, line)
-            if not units or (metric == REWARD and line.setting == plan.PRINTED):
+            curves = records.curves(scenario, line, f"{metric} {kind}")
+            if not len(curves) or (metric == REWARD and line.setting == plan.PRINTED):
                 continue  # the printed reward is on another scale
-            grid = records.grid(scenario)
-            curves = np.stack([records.curve(unit, kind, metric, grid) for unit in units])
+            grid, colour = records.grid(scenario), _colour(line, place)
             middle, std = curves.mean(axis=0), curves.std(axis=0, ddof=min(len(curves) - 1, 1))
-            look = {"ls": "-" if line.setting == NORMAL else "--", "color": _colour(line, place)}
-            panel.plot(grid, middle, **look, lw=1.8, label=f"{line.name}, seeds: {len(units)}")
-            panel.fill_between(
-                grid, middle - std, middle + std, color=look["color"], alpha=0.15, lw=0
-            )
+            style, title = "-" if line.setting == NORMAL else "--", f"{line.name}, seeds: "
+            panel.plot(grid, middle, style, color=colour, lw=1.8, label=f"{title}{len(curves)}")
+            panel.fill_between(grid, middle - std, middle + std, color=colour, alpha=0.15, lw=0)
         if metric != REWARD:
             best = 1.0 if metric == SUCCESS else FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")
             panel.set_ylim(top=1.05 * best)
         panel.grid(alpha=0.3)
-        if (kind, metric) == CURVES[-1] and panel.get_legend_handles_labels()[1]:
+        if curve == CURVES[-1] and panel.get_legend_handles_labels()[1]:
             panel.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     figure.supxlabel(
         "environment steps; in training: episodes in which the human may take over; "
@@ -121,15 +110,14 @@ def draw_curves(name: str, records: Records) -> Figure:
     return figure
 
 
-Panel = tuple[str, Sequence[tuple[str, Callable[[Records, Line], Numbers]]], bool]
-"""Title, and side by side a place's label with the values of a line there; whether boxes show them
-or a point their mean."""
+Panel = tuple[str, str, Sequence[tuple[str, str]]]
+"""Quantity and scenario, and side by side a place's label and what follows the quantity's name."""
 
 
 def draw_groups(
-    name: str, rows: int, panels: Sequence[Panel], key: str, records: Records
+    name: str, panels: Sequence[Panel], rows: int, key: str, records: Records
 ) -> Figure:
-    """The lines side by side in each place of each panel."""
+    """The lines side by side in each place of each panel, boxes of what arrives or a mean."""
     lines = EXPERIMENTS[name].lines
     figure = Figure(figsize=(15.0, 1.8 + 2.8 * rows), layout="constrained")
     axes, width = figure.subplots(rows, len(panels) // rows), 0.8 / len(lines)
@@ -139,11 +127,15 @@ def draw_groups(
         filled = own if line.setting == NORMAL else "white"
         return {"marker": MARKERS[line.setting], "color": own, "mfc": filled, "ms": 5, "ls": "none"}
 
-    for axis, (title, places, boxes) in zip(axes.flat, panels, strict=True):
-        axis.set_title(title, fontsize=10)
-        for (group, (_, values_of)), (side, line) in product(enumerate(places), enumerate(lines)):
+    for axis, (quantity, scenario, places) in zip(axes.flat, panels, strict=True):
+        kind = places[0][1].partition(",")[0]
+        about = kind if kind in (TRAINING, ALONE) else words(scenario)
+        axis.set_title(f"{TITLES[quantity]}, {about}", fontsize=10)
+        for (group, (_, where)), (side, line) in product(enumerate(places), enumerate(lines)):
             x = group + (side - 0.5 * (len(lines) - 1)) * width
-            its, values = look(side, line), values_of(records, line)
+            its, boxes = look(side, line), quantity in ARRIVED_ONLY
+            values = (records.arrivals(scenario, line, where)[quantity] if boxes
+                      else records.of(scenario, line)[f"{quantity} {where}"])  # fmt: skip
             if len(values) and boxes:
                 axis.boxplot(
                     [values], positions=[x], widths=0.85 * width, patch_artist=True,
@@ -151,7 +143,7 @@ def draw_groups(
                     medianprops={"color": "black"},
                 )  # fmt: skip
             elif len(values):
-                std = values.std(ddof=1) if len(values) > 1 else None
+                std = values.std() if len(values) > 1 else None
                 axis.errorbar(x, values.mean(), std, capsize=2, **its)
         axis.set_xticks(range(len(places)), [place for place, _ in places], fontsize=8)
         axis.set_xlim(-0.6, len(places) - 0.4)
@@ -163,47 +155,30 @@ def draw_groups(
     return figure
 
 
-def _scenes(quantities: Sequence[str], of: Iterable[Scene] = SCENES) -> list[Panel]:
+def _scenes(*quantities: str, of: Iterable[Scene] = SCENES) -> list[Panel]:
     """A panel for each scenario's scenes, with a quantity for each scenario."""
-
-    def values(scene: Scene, quantity: str) -> Callable[[Records, Line], Numbers]:
-        scenario, condition = scene
-        if quantity in ARRIVED_ONLY:
-            return lambda records, line: records.arrivals(scenario, line, condition)[quantity]
-        return lambda records, line: records.of(scenario, line)[f"{quantity} {condition}"]
-
     return [
-        (f"{TITLES[quantity]}, {words(scenario)}",
-         [(label(scene), values(scene, quantity)) for scene in of if scene[0] == scenario],
-         quantity in ARRIVED_ONLY)
+        (quantity, scenario, [(label(scene), scene[1]) for scene in of if scene[0] == scenario])
         for scenario, quantity in zip(SCENARIOS, quantities, strict=True)
-    ]  # fmt: skip
-
-
-def _ends() -> list[Panel]:
-    """A panel for each curve: where it ends."""
-
-    def values(scenario: str, kind: str, metric: str) -> Callable[[Records, Line], Numbers]:
-        return lambda records, line: np.array(
-            [records.end(unit, kind, metric) for unit in records.units_of(scenario, line)]
-        )
-
-    return [
-        (f"{TITLES[metric]}, {kind}", [(words(scenario), values(scenario, kind, metric))], False)
-        for scenario, (kind, metric) in product(SCENARIOS, CURVES)
     ]
 
 
+ENDS: list[Panel] = [
+    (metric, scenario, [(words(scenario), f"{kind}, end")])
+    for scenario, (metric, kind) in product(SCENARIOS, CURVES)
+]
+"""Where each curve ends."""
 POINTS, ARRIVALS = "points: mean and standard deviation of the seeds", "drives that arrive"
 PAPER_FIGURES: Mapping[str, Draw] = {
     **{name: partial(draw_curves, name)
        for name in ("fig7", "fig11", "fig12", "fig13", "ablation", "printed")},
-    **{name: partial(draw_groups, name, rows, panels, key) for name, rows, panels, key in (
-        ("fig8", 2, _ends(), POINTS),
-        ("fig9", 2, _scenes([SUCCESS] * 2) + _scenes([DISTANCE] * 2), f"{SCENE_KEY}; {POINTS}"),
-        ("fig10", 1, _scenes([TIME_S, LATERAL]), f"{SCENE_KEY}; {ARRIVALS}"),
-        ("fig14", 1, _scenes([DISTANCE] * 2, PAPER_SCENES), f"{SCENE_KEY}; {POINTS}"),
-        ("fig15", 1, _scenes([LONGITUDINAL, LATERAL], PAPER_SCENES), f"{SCENE_KEY}; {ARRIVALS}"),
+    **{name: partial(draw_groups, name, panels, rows, key) for name, panels, rows, key in (
+        ("fig8", ENDS, 2, POINTS),
+        ("fig9", [*_scenes(SUCCESS, SUCCESS), *_scenes(DISTANCE, DISTANCE)], 2,
+         f"{SCENE_KEY}; {POINTS}"),
+        ("fig10", _scenes(TIME_S, LATERAL), 1, f"{SCENE_KEY}; {ARRIVALS}"),
+        ("fig14", _scenes(DISTANCE, DISTANCE, of=PAPER_SCENES), 1, f"{SCENE_KEY}; {POINTS}"),
+        ("fig15", _scenes(LONGITUDINAL, LATERAL, of=PAPER_SCENES), 1, f"{SCENE_KEY}; {ARRIVALS}"),
     )},
 }  # fmt: skip
 """Name of the experiment, and of the PNG -> how it is drawn."""
@@ -214,45 +189,40 @@ def draw_guidance(records: Records) -> Figure:
     figure = Figure(figsize=(3.3 * len(TASKS) + 1.5, 7.0), layout="constrained")
     panels = figure.subplots(2, len(TASKS), sharey=True)
     heights = -np.arange(len(ROWS))
+    for panel in panels.flat:
+        panel.grid(axis="x", alpha=0.3)
     for (above, below), task in zip(panels.T, TASKS, strict=True):
         found = [records.of(task, Line(row, GOOD)) for row in ROWS]
-        costs = [list(rows[f"human_s_to_{LEARNED:.0%}"]) if row in HELPED else []
-                 for row, rows in zip(ROWS, found, strict=True)]  # fmt: skip
-        most = max((s for s in chain(*costs) if np.isfinite(s)), default=1.0)
+        learned = [rows[f"human_s_to_{LEARNED:.0%}"] for rows in found]
+        costs = [s[s < np.inf] for row, s in zip(ROWS, learned, strict=True) if row in HELPED]
+        most = max((s.max() for s in costs if len(s)), default=1.0)
         never = 1.15 * most
-        _dots(above, heights, [[min(s, never) for s in each] for each in costs], median_high)
-        for row, height in zip(ROWS, heights, strict=True):
-            if row not in HELPED:
+        for row, height, rows, human_s in zip(ROWS, heights, found, learned, strict=True):
+            colour = "C3" if row == "phil_td3" else "C0"
+            success, cut = 100.0 * rows["success nominal"], human_s.clip(upper=never)
+            numbers = [(below, success, success.mean())]
+            if row in HELPED:
+                numbers.append((above, cut, cut.quantile(interpolation="higher")))
+            else:
                 above.text(0.02 * most, height, "no human", va="center", fontsize=8)
+            for panel in (above, below):
+                panel.axhline(height, color="0.93", lw=0.8, zorder=0)
+            for panel, dots, middle in numbers:
+                places = height + np.linspace(0.2, -0.2, len(dots))
+                panel.plot(dots, places, "o", ms=4, alpha=0.55, mew=0, color=colour)
+                ends = [height - 0.35, height + 0.35]
+                panel.plot([middle] * 2, ends, lw=2, color=colour)
         above.axvline(1.08 * most, color="0.6", lw=0.8, ls=":")
         above.text(never, 0.8, "never", ha="center", fontsize=8)
         above.set(title=words(task), xlim=(0.0, 1.25 * most))
         above.set_xticks([tick for tick in above.get_xticks() if tick <= most])
         above.set_xlabel(f"seconds of the human until {LEARNED:.0%} alone", fontsize=9)
-        _dots(below, heights, [list(100.0 * rows["success nominal"]) for rows in found], mean)
         below.set(xlim=(-4.0, 104.0))
         below.set_xlabel("success, nominal tests, %", fontsize=9)
     for panel in panels[:, 0]:
         panel.set_yticks(heights, [Line(row).name for row in ROWS], fontsize=8)
         panel.set_ylim(heights[-1] - 0.6, 1.6)
     return figure
-
-
-def _dots(
-    panel: Axes,
-    heights: Iterable[int],
-    rows: Iterable[Sequence[float]],
-    middle: Callable[[Sequence[float]], float],
-) -> None:
-    """A dot for each number of a row, beside one another, and a bar for their middle."""
-    panel.grid(axis="x", alpha=0.3)
-    for row, height, numbers in zip(ROWS, heights, rows, strict=True):
-        colour = "C3" if row == "phil_td3" else "C0"
-        panel.axhline(height, color="0.93", lw=0.8, zorder=0)
-        if numbers:  # None where a row has no human
-            places = height + np.linspace(0.2, -0.2, len(numbers))
-            panel.plot(numbers, places, "o", ms=4, alpha=0.55, mew=0, color=colour)
-            panel.plot([middle(numbers)] * 2, [height - 0.35, height + 0.35], lw=2, color=colour)
 
 
 FIGURES: Mapping[str, Mapping[str, Draw]] = {

@@ -1,21 +1,18 @@
 """Studies: which runs a table compares, with which settings and budgets, and the digest of each.
 
-A study is data. Its runs are the product of algorithms, tasks and seeds in each setting; a new
-table is a new row of ``STUDIES`` and, if it needs them, of ``SETTINGS`` and ``TASKS``.
+A new table is a new row of ``STUDIES`` and, if it needs them, of ``SETTINGS`` and ``TASKS``.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from trainer.environments import CONDITIONS
-from trainer.human.config import MODEL_FILE
 from trainer.learner.config import ALGORITHMS, FASTER
 
 RESULTS_VERSION = 1
@@ -66,20 +63,17 @@ HUMANS: Mapping[str, Setting] = {
     **IMPERFECT,
 }
 """Who guides in the table of human guidance, the same for all rows."""
-TUNED: Mapping[str, Mapping[str, Any]] = dict.fromkeys(("phil_td3", "ia_td3", "hi_td3"), FASTER)
-"""Row of the table of human guidance -> the hyper-parameters that its tuning chose there, where the
-paper's experiments have others. What it chose for the other rows stands in ``ALGORITHMS``."""
 SETTINGS: Mapping[str, Setting] = {
     **HUMANS,
     NORMAL: Setting("two frames, good guidance"),
     ONE_FRAME: Setting("one frame, the paper's tough setting", learner={"frames": 1}),
     RANDOM: Setting(
         "one third of the human's actions replaced by random ones, the paper's poor guidance",
-        run={"poor_guidance_share": POOR_SHARE},
+        {"poor_guidance_share": POOR_SHARE},
     ),
     BIASED: Setting(
         "one third of the human's actions replaced by one wrong action, always the same",
-        run={"poor_guidance_share": POOR_SHARE, "poor_guidance": "biased"},
+        {"poor_guidance_share": POOR_SHARE, "poor_guidance": "biased"},
     ),
     PRINTED: Setting("numbers and equations as the paper prints them", preset="printed"),
 }
@@ -110,6 +104,9 @@ LABELS = {
 }
 FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")  # What the paper compares throughout
 GUIDED = FOUR[:3]
+TUNED: Mapping[str, Mapping[str, Any]] = dict.fromkeys(GUIDED, FASTER)
+"""Row of the table of human guidance -> the hyper-parameters that its tuning chose there, where the
+paper's experiments have others. What it chose for the other rows stands in ``ALGORITHMS``."""
 NO_CLONING = ("phil_without_cloning",)
 PARTS = (*NO_CLONING, "phil_without_shaping")
 PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
@@ -152,8 +149,7 @@ class Experiment(NamedTuple):
     scenarios: tuple[str, ...] = SCENARIOS
 
     @property
-    def lines(self) -> list[Line]:
-        """An algorithm's settings side by side."""
+    def lines(self) -> list[Line]:  # an algorithm's settings side by side
         return [Line(*each) for each in product(self.algorithms, self.settings)]
 
 
@@ -194,7 +190,7 @@ BOXES = {
 """Scenario -> the quantities of these drives."""
 ALL, STATUS, REPORT, TYPICAL = WORDS = ("all", "status", "report", "typical")
 """What may stand in the place of an experiment or a study."""
-DEFAULT_SEEDS, MANY = 5, 1000
+DEFAULT_SEEDS = 5
 PAIRS = len(SCENARIOS) * DEFAULT_SEEDS
 ENOUGH = 9  # Of these pairs: an equal row has so many by chance in one of 93 cases
 MOST_EPISODES = 100  # In which a row of the table of human guidance is to learn
@@ -214,34 +210,21 @@ class Unit(NamedTuple):
 
     @property
     def trained(self) -> bool:
-        """Whether anything is trained for it."""
         return self.algorithm in ALGORITHMS
 
     @property
-    def needs_human(self) -> bool:
-        """Whether a human model decides its result."""
+    def needs_human(self) -> bool:  # whether a human model decides its result
         guided = self.trained and ALGORITHMS[self.algorithm].guided
         return self.algorithm == HUMAN_MODEL or (guided and not SETTINGS[self.setting].human)
 
     @property
-    def environment(self) -> str:
-        """What the environment is made by."""
-        return TASKS[self.scenario][0]
-
-    @property
-    def scripted_human(self) -> str:
-        """Names the script that guides, or the one that the human model imitates."""
+    def scripted_human(self) -> str:  # who guides, or whom the human model imitates
         human = SETTINGS[self.setting].human
         return human if ":" in human else TASKS[self.scenario][1]
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Those under which it is tested."""
+    def conditions(self) -> tuple[str, ...]:  # under which it is tested
         return tuple(CONDITIONS) if self.scenario in SCENARIOS else ("nominal", "noise")
-
-    def is_possible(self, humans: Path) -> bool:
-        """Whether the human model that it needs, if it does, is there."""
-        return not self.needs_human or (humans / self.scenario / MODEL_FILE).is_file()
 
 
 class StudyRow(NamedTuple):
@@ -249,16 +232,19 @@ class StudyRow(NamedTuple):
 
     setting: str
     algorithms: tuple[str, ...]
-    tasks: tuple[str, ...]
-    seeds: int = MANY  # At most; 0: tested only
+    tasks: tuple[str, ...] = SCENARIOS
+    seeds: int = 1000  # At most; 0: tested only
+
+    @property
+    def lines(self) -> list[Line]:
+        return [Line(algorithm, self.setting) for algorithm in self.algorithms]
 
 
 @dataclass(frozen=True)
 class Study:
     """A table of runs: its rows, and what all of its units have in common."""
 
-    name: str
-    """Of its page's template, and of its folders in ``results`` and ``runs``."""
+    name: str  # Of its page's template, and of its folders in ``results`` and ``runs``
     rows: tuple[StudyRow, ...]  # In the order of work
     steps: Mapping[str, int]
     """Task -> environment steps of a training, the same for every algorithm."""
@@ -314,17 +300,13 @@ class Study:
         """What decides a unit's training, in plain words and values."""
         here, setting = self.of(unit.scenario), SETTINGS[unit.setting]
         human = HUMAN_MODEL if unit.needs_human else unit.scripted_human
-        values = {"scenario": unit.environment, "algorithm": unit.algorithm, "human": human}
+        values = {"scenario": TASKS[unit.scenario][0], "algorithm": unit.algorithm, "human": human}
         if unit.algorithm == CONSTANT:
             return {**values, "search": [here.search_runs, here.search_points]}
         if not unit.trained:
             return values
-        learner = {
-            **ALGORITHMS[unit.algorithm].settings,
-            **(TUNED.get(unit.algorithm, {}) if unit.setting in HUMANS else {}),
-            **here.learner,
-            **setting.learner,
-        }
+        tuned = TUNED.get(unit.algorithm, {}) if unit.setting in HUMANS else {}
+        own = ALGORITHMS[unit.algorithm].settings
         return {
             **values,
             "seed": unit.seed,
@@ -333,7 +315,7 @@ class Study:
             "evaluate_every_steps": here.evaluate_every_steps,
             "evaluation_runs": here.evaluation_runs,
             **setting.run,
-            "learner": learner,
+            "learner": {**own, **tuned, **here.learner, **setting.learner},
         }
 
     def run_name(self, unit: Unit) -> str:
@@ -356,15 +338,15 @@ PAPER = Study(
     "paper",
     (
         StudyRow(NORMAL, TESTED_ONLY, SCENARIOS, 0),
-        StudyRow(NORMAL, FOUR, SCENARIOS),
-        StudyRow(BIASED, GUIDED, SCENARIOS),
-        StudyRow(PRINTED, FOUR, SCENARIOS),
-        StudyRow(ONE_FRAME, FOUR, SCENARIOS),
-        StudyRow(RANDOM, GUIDED, SCENARIOS),
-        StudyRow(NORMAL, PARTS, SCENARIOS),
-        StudyRow(BIASED, NO_CLONING, SCENARIOS),
-        StudyRow(NORMAL, (*PRIORITIES, *BUFFERS), SCENARIOS),
-        StudyRow(NORMAL, WEIGHTS, SCENARIOS),
+        StudyRow(NORMAL, FOUR),
+        StudyRow(BIASED, GUIDED),
+        StudyRow(PRINTED, FOUR),
+        StudyRow(ONE_FRAME, FOUR),
+        StudyRow(RANDOM, GUIDED),
+        StudyRow(NORMAL, PARTS),
+        StudyRow(BIASED, NO_CLONING),
+        StudyRow(NORMAL, (*PRIORITIES, *BUFFERS)),
+        StudyRow(NORMAL, WEIGHTS),
     ),
     steps={"left_turn": 6_000, "congestion": 6_000},
 )
@@ -374,7 +356,7 @@ GUIDANCE = Study(
         StudyRow(GOOD, (EXPERT,), tuple(TASKS), 0),
         StudyRow(MODEL, (HUMAN_MODEL,), ("left_turn",), 0),
         StudyRow(SLOWER, (EXPERT,), ("left_turn",), 0),
-        StudyRow(GOOD, ROWS, SCENARIOS),
+        StudyRow(GOOD, ROWS),
         StudyRow(MODEL, HELPED, ("left_turn",)),
         StudyRow(GOOD, ROWS, FOREIGN, 3),
         *(StudyRow(human, HELPED, ("left_turn",)) for human in IMPERFECT),
@@ -388,14 +370,3 @@ GUIDANCE = Study(
 STUDIES = {study.name: study for study in (PAPER, GUIDANCE)}
 PAPER_TESTS = 50
 """Of the test drives in a scene, the first so many have the paper's seeds (section VII-D)."""
-
-
-def study_of(names: Collection[str]) -> Study:
-    """The study that names on the command line mean: one that is named, else the paper's."""
-    return next((STUDIES[name] for name in names if name in STUDIES), PAPER)
-
-
-def lines_of(study: Study) -> Iterator[Line]:
-    """Every line that is computed, in the order of work."""
-    for row in study.rows:
-        yield from (Line(algorithm, row.setting) for algorithm in row.algorithms)

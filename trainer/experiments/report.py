@@ -5,12 +5,10 @@ a table is made of the numbers of a line's units in one task, one row a unit.
 """
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
-from statistics import median_high
 from typing import Any
 
 import jinja2
@@ -26,16 +24,7 @@ from trainer.environments import CONDITIONS
 from trainer.experiments import figures, plan
 from trainer.experiments import records as data
 from trainer.experiments.figures import PAPER_SCENES, SCENES, label
-from trainer.experiments.plan import (
-    EXPERIMENTS,
-    GOOD,
-    HELPED,
-    HUMANS,
-    SCENARIOS,
-    TASKS,
-    Line,
-    words,
-)
+from trainer.experiments.plan import EXPERIMENTS, GOOD, HELPED, HUMANS, SCENARIOS, TASKS, Line
 from trainer.experiments.records import LEARNED, WELL, Records, Store
 from trainer.learner.config import ALGORITHMS
 from trainer.training.config import PRESETS
@@ -68,10 +57,10 @@ def write_page(store: Store, records: Records) -> Path:
         loader=jinja2.FileSystemLoader(Path(__file__).parent), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    templates.filters |= {"words": words, "percent": "{:.0%}".format, "number": "{:,}".format}
+    templates.filters |= {"words": plan.words, "percent": "{:.0%}".format, "number": "{:,}".format}
     claims = store.results / CLAIMS_FILE  # Of the kept records alone
     text = templates.get_template(f"{name}.md.jinja").render(
-        {function.__name__: function for function in (markdown, *PAGES[name])},
+        {function.__name__: function for function in PAGES[name]},
         claims=pd.read_csv(claims, keep_default_na=False) if claims.is_file() else None,
         command="python -m trainer experiment",
         data=data,
@@ -86,24 +75,16 @@ def write_page(store: Store, records: Records) -> Path:
     return path
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def markdown(head: Iterable[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return a table in Markdown."""
-    return "\n".join(markdown_table(head, rows)).rstrip("\n")
+    return "\n".join(markdown_table([*head], rows)).rstrip("\n")
 
 
-def table(
-    records: Records,
-    places: Iterable[tuple[str, Line]],
-    columns: Mapping[str, Cell],
-    with_tested_only: bool = False,
-) -> str:
+def table(records: Records, places: Iterable[tuple[str, Line]], columns: Mapping[str, Cell]) -> str:
     """Return a row for each task and line of which there is something."""
-    found = ((*place, records.of(*place)) for place in places)
-    rows = [
-        (line.name, words(task), *(cell(its) for cell in columns.values()))
-        for task, line, its in found
-        if len(its) and (with_tested_only or line.algorithm in ALGORITHMS)
-    ]
+    found = ((task, line, records.of(task, line)) for task, line in places)
+    rows = [(line.name, plan.words(task), *(cell(its) for cell in columns.values()))
+            for task, line, its in found if len(its)]  # fmt: skip
     return markdown(("", "scenario", *columns), rows)
 
 
@@ -112,13 +93,13 @@ def shown(cell: Cell, rows: pd.DataFrame) -> str:
     return cell(rows) if len(rows) else "–"
 
 
-def spread(numbers: Iterable[float]) -> str:
+def spread(numbers: pd.Series) -> str:
     """Return median (of an even number the upper middle), least and most, as in "12 [8, ∞]".
 
     Of five, 15 of 16 times the true median lies between the least and the most.
     """
-    numbers = list(numbers)
-    ends = (f"{number:,.0f}" for number in (median_high(numbers), min(numbers), max(numbers)))
+    ordered = numbers.sort_values()
+    ends = (f"{ordered.iloc[place]:,.0f}" for place in (len(ordered) // 2, 0, -1))
     middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
     return f"{middle} [{least}, {most}]"
 
@@ -131,7 +112,7 @@ def until(level: float, what: str) -> Cell:
 
     def cell(rows: pd.DataFrame) -> str:
         costs = rows[f"{what}_to_{level:.0%}"]
-        there = int(np.isfinite(costs).sum())
+        there = np.isfinite(costs).sum()
         if what in ("human_s", "takeovers") and not ALGORITHMS[rows.algorithm.iloc[0]].guided:
             return "–"
         if not there:
@@ -189,14 +170,13 @@ COSTS: Mapping[str, Cell] = {
 """Columns of the table of human guidance."""
 
 
-def computed_in(records: Records, lines: Iterable[Line]) -> str:
+def computed_in(records: Records, algorithms: Iterable[str], settings: Iterable[str]) -> str:
     """Return how many of the trainings multiplied in what, and where."""
-    units = pd.concat([records.of(task, line) for task, line in product(TASKS, lines)])
-    counts = Counter(
-        ("bfloat16" if fast else "float32") + ("" if pd.isna(gpu) else " on a GPU")
-        for fast, gpu in zip(units.bfloat16, units.gpu, strict=True)
-    )
-    return ", ".join(f"{count} {what}" for what, count in counts.most_common())
+    units = records.numbers
+    units = units[units.algorithm.isin([*algorithms]) & units.setting.isin([*settings])]
+    kinds = units.bfloat16.map(lambda fast: "bfloat16" if fast else "float32")
+    kinds += units.gpu.map(lambda gpu: "" if pd.isna(gpu) else " on a GPU")
+    return ", ".join(f"{count} {kind}" for kind, count in kinds.value_counts().items())
 
 
 # The paper's experiments
@@ -211,17 +191,6 @@ def presets() -> str:
     return markdown(("setting", "ours", "printed"), [row for row in rows if row[1] != row[2]])
 
 
-def settings(records: Records) -> str:
-    """Return the table of what is trained, and in what it was computed."""
-    rows = []
-    for row in (row for row in records.study.rows if row.seeds):
-        lines = [Line(name, row.setting) for name in row.algorithms]
-        names = ", ".join(Line(name).name for name in row.algorithms)
-        meaning = plan.SETTINGS[row.setting].meaning
-        rows.append((words(row.setting), meaning, names, computed_in(records, lines)))
-    return markdown(("setting", "meaning", "algorithms", "computed in"), rows)
-
-
 def anchor(name: str) -> str:
     """Return the link to the part of an experiment, as GitHub makes it."""
     return f"{name} {EXPERIMENTS[name].title}".lower().replace(",", "").replace(" ", "-")
@@ -231,15 +200,15 @@ def summary(claims: pd.DataFrame) -> str:
     """Return the table of how many claims hold, by experiment."""
     answers = {"yes": "holds", "no": "does not", "undecided": "undecided"}
 
-    def row(title: str, about: str, of: pd.DataFrame) -> tuple[Any, ...]:
-        found, alone = ([(column == answer).sum() for answer in answers]
+    def row(title: str, about: str, of: pd.DataFrame) -> list[Any]:
+        found, alone = (column.value_counts().reindex(list(answers), fill_value=0)
                         for column in (of.holds, of.holds_alone))  # fmt: skip
-        return (title, about, *found, *(alone if any(alone) else [""] * len(alone)))
+        return [title, about, *found, *(alone if alone.any() else [""] * len(alone))]
 
+    parts = {name: claims[claims.experiment == name] for name in EXPERIMENTS}
     rows = [row("all", "the paper's claims", claims[claims.by == "paper"])]
-    for name, one in EXPERIMENTS.items():
-        if len(of := claims[claims.experiment == name]):
-            rows.append(row(f"[{name}](#{anchor(name)})", one.title, of))
+    rows += [row(f"[{name}](#{anchor(name)})", EXPERIMENTS[name].title, of)
+             for name, of in parts.items() if len(of)]  # fmt: skip
     alone = [f"policy alone: {answer}" for answer in answers.values()]
     return markdown(("", "about", *answers.values(), *alone), rows)
 
@@ -247,10 +216,10 @@ def summary(claims: pd.DataFrame) -> str:
 def verdicts(claims: pd.DataFrame, name: str) -> str:
     """Return the table of an experiment's claims; nothing where it has none."""
     of, paper = claims[claims.experiment == name], "wanted" if name == "goals" else "the paper"
-    columns = ["claim", "said", "weakest", "holds", "weakest_alone", "holds_alone"]
-    head = ("claim", paper, "weakest comparison", "holds", "weakest, policy alone", "holds")
-    count = 6 if of.holds_alone.any() else 4
-    return markdown(head[:count], of[columns[:count]].to_numpy()) if len(of) else ""
+    head = {"claim": "claim", "said": paper, "weakest": "weakest comparison", "holds": "holds"}
+    if of.holds_alone.any():
+        head |= {"weakest_alone": "weakest, policy alone", "holds_alone": "holds"}
+    return markdown(head.values(), of[[*head]].to_numpy()) if len(of) else ""
 
 
 def tests(records: Records) -> str:
@@ -263,7 +232,7 @@ def tests(records: Records) -> str:
     rows = [
         (line.name, *(shown(cell(condition), records.of(scenario, line))
                       for scenario, condition in SCENES))
-        for line in plan.lines_of(records.study)
+        for row in records.study.rows for line in row.lines
     ]  # fmt: skip
     return markdown(("", *map(label, SCENES)), [row for row in rows if {*row[1:]} != {"–"}])
 
@@ -272,16 +241,16 @@ def distances(records: Records, name: str, paper: Mapping[str, Sequence[str]]) -
     """Return a table of the paper: our distances, of all drives on its seeds, beside its own."""
     scenes = [scene for scene in PAPER_SCENES if scene[0] in EXPERIMENTS[name].scenarios]
 
-    def cell(condition: str) -> Cell:
-        def pooled(rows: pd.DataFrame) -> str:
+    def pooled(condition: str) -> Cell:
+        def cell(rows: pd.DataFrame) -> str:
             each, sd = (rows[f"paper_distance_{m} {condition}"] for m in ("m", "sd_m"))
             return f"{each.mean():.2f}±{np.sqrt((sd**2).mean() + each.var(ddof=0)):.2f}"
 
-        return pooled
+        return cell
 
     rows = [
         (Line(algorithm).name,
-         *(f"{shown(cell(condition), records.of(scenario, Line(algorithm)))} ({number})"
+         *(f"{shown(pooled(condition), records.of(scenario, Line(algorithm)))} ({number})"
            for (scenario, condition), number in zip(scenes, numbers, strict=True)))
         for algorithm, numbers in paper.items()
     ]  # fmt: skip
@@ -298,7 +267,8 @@ def times(records: Records, paper: Mapping[str, float]) -> str:
 
 def cost(records: Records) -> str:
     """Return the table of what each line's trainings cost."""
-    lines = product(plan.lines_of(records.study), SCENARIOS)
+    trained = [row for row in records.study.rows if row.seeds]
+    lines = product((line for row in trained for line in row.lines), SCENARIOS)
     return table(records, ((task, line) for line, task in lines), COST)
 
 
@@ -307,23 +277,22 @@ def cost(records: Records) -> str:
 
 def short(records: Records) -> str:
     """Return the table of seconds, success and pairs, one row an algorithm."""
-    columns = {
-        **{f"s, {words(task)}": (task, until(LEARNED, "human_s")) for task in TASKS},
-        **{f"%, {words(task)}": (task, mean("success nominal", 0, 100.0)) for task in TASKS},
-    }
+    seconds, success = until(LEARNED, "human_s"), mean("success nominal", 0, 100.0)
+    columns = [*product((("s", seconds), ("%", success)), TASKS)]
     rows = [
         (Line(row).name,
-         *(shown(cell, records.of(task, Line(row, GOOD))) for task, cell in columns.values()),
-         less_in(pairs(records, row)) if row in HELPED and row != PHIL else "–")
+         *(shown(cell, records.of(task, Line(row, GOOD))) for (_, cell), task in columns),
+         less_in(pairs(records, row)) if row in plan.RIVALS else "–")
         for row in plan.ROWS
     ]  # fmt: skip
-    return markdown(("", *columns, "pairs with less than PHIL-TD3"), rows)
+    titles = (f"{unit}, {plan.words(task)}" for (unit, _), task in columns)
+    return markdown(("", *titles, "pairs with less than PHIL-TD3"), rows)
 
 
 def pairs(records: Records, row: str, tasks: Iterable[str] = SCENARIOS) -> pd.DataFrame:
     """Return the human's seconds until a row and PHIL-TD3 had learned, pair by pair of seeds."""
-    lines = product(tasks, [Line(row, GOOD), Line(PHIL, GOOD)])
-    found = pd.concat([records.of(*each) for each in lines])
+    found = records.numbers
+    found = found[found.scenario.isin([*tasks]) & (found.setting == GOOD)]
     learned = f"human_s_to_{LEARNED:.0%}"
     found = found.pivot(index=["scenario", "seed"], columns="algorithm", values=learned)
     return found.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
@@ -359,14 +328,15 @@ def place(records: Records) -> str:
     return table(records, product(TASKS, [Line(row, GOOD) for row in plan.RIVALS]), columns)
 
 
-def verdict(records: Records) -> str:
-    """Return which row is to be the default by the rule on the page, in a sentence."""
+def default(records: Records) -> str | int:
+    """Return which row is to be the default by the rule on the page.
+
+    Where pairs are missing, instead how many there are of one row.
+    """
     first = records.only(plan.DEFAULT_SEEDS)
     found = {row: pairs(first, row) for row in plan.RIVALS}
-    fewest = min(map(len, found.values()))
-    if fewest < plan.PAIRS:
-        there = f"{fewest} of {plan.PAIRS} pairs are there"
-        return f"The default cannot be judged yet: of one row {there}."
+    if (fewest := min(map(len, found.values()))) < plan.PAIRS:
+        return fewest
 
     def takes_its_place(row: str) -> bool:
         behind = (over(first, first.of(scenario, Line(row, GOOD)), Line(PHIL, GOOD),
@@ -374,60 +344,54 @@ def verdict(records: Records) -> str:
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
         return (found[row].own < found[row].phil).sum() >= plan.ENOUGH and not any(behind)
 
-    better = filter(takes_its_place, plan.RIVALS)
-    best = min(better, key=lambda row: median_high(found[row].own), default=PHIL)
-    return f"By the rule the default is {Line(best).name}."
+    better = {row: found[row].own.quantile(interpolation="higher")
+              for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
+    return Line(min(better, key=better.__getitem__, default=PHIL)).name
 
 
-def learns(records: Records) -> str:
-    """Return which rows get there in good time in every seed of one of our scenes."""
-
-    def is_soon(rows: pd.DataFrame) -> bool:
-        return len(rows) > 0 and (rows[f"episodes_to_{LEARNED:.0%}"] <= plan.MOST_EPISODES).all()
-
-    late = [
-        Line(row).name
-        for row in plan.ROWS
-        if not any(is_soon(records.of(task, Line(row, GOOD))) for task in SCENARIOS)
-    ]
-    return (
-        f"all rows but {', '.join(late)} ([why](../README.md#the-fair-table))"
-        if late
-        else "all rows"
-    )
+def late(records: Records) -> list[str]:
+    """Return which rows get there in good time in every seed of none of our scenes."""
+    found = records.numbers[records.numbers.scenario.isin(SCENARIOS)]
+    found = found[(found.setting == GOOD) & found.algorithm.isin(plan.ROWS)]
+    most = found.groupby(["algorithm", "scenario"])[f"episodes_to_{LEARNED:.0%}"].max()
+    soon = most.groupby("algorithm").min() <= plan.MOST_EPISODES
+    return [Line(row).name for row in plan.ROWS if not soon.get(row, False)]
 
 
-def forgives(records: Records) -> str:
+def beside(records: Records) -> pd.DataFrame:
+    """Return the numbers of the units that a human helps in the left turn."""
+    found = records.numbers
+    return found[(found.scenario == "left_turn") & found.algorithm.isin(HELPED)
+                 & found.setting.isin([*HUMANS])]  # fmt: skip
+
+
+def forgives(records: Records) -> tuple[list[str], list[str]]:
     """Return which rows succeed beside each human in the left turn, and which beside some not."""
-    good, less = [], []
-    for row in HELPED:
-        units = {human: records.of("left_turn", Line(row, human)) for human in HUMANS}
-        shares = {human: 100.0 * its["success nominal"].mean() for human, its in units.items()}
-        low = [f"{words(human)} {success:.1f}" for human, success in shares.items()
-               if success < 100.0 * LEARNED]  # fmt: skip
-        if low:
-            less.append(f"{Line(row).name} ({', '.join(low)})")
-        elif any(map(len, units.values())):
-            good.append(Line(row).name)
-    beside_some = f" Less beside some: {'; '.join(less)}." if less else ""
-    return f"{', '.join(good) or 'no row'}.{beside_some}"
+    good, less = list[str](), list[str]()
+    success = beside(records).groupby(["algorithm", "setting"])["success nominal"].mean().unstack()
+    for row in (row for row in HELPED if row in success.index):
+        shares = 100.0 * success.loc[row].reindex(list(HUMANS))
+        low = [f"{plan.words(human)} {share:.1f}" for human, share in shares.items()
+               if share < 100.0 * LEARNED]  # fmt: skip
+        name = Line(row).name
+        (less if low else good).append(f"{name} ({', '.join(low)})" if low else name)
+    return good, less
 
 
 def seeds_beside(records: Records, human: str) -> str:
     """Return how many seeds the rows have beside a human."""
-    counts = [len(records.of("left_turn", Line(row, human))) for row in HELPED]
-    return " to ".join(map(str, sorted({min(counts), max(counts)})))
+    found = beside(records)
+    counts = found[found.setting == human].algorithm.value_counts().reindex(HELPED, fill_value=0)
+    return " to ".join(map(str, sorted({counts.min(), counts.max()})))
 
 
 def beside_each(records: Records, title: str) -> str:
     """Return the table with a row for each algorithm, a column for each human in the left turn."""
     cell = {**COSTS, **outcomes(records), "success, nominal, %": share("nominal")}[title]
-    found = {human: [records.of("left_turn", Line(row, human)) for row in HELPED]
-             for human in HUMANS}  # fmt: skip
-    found = {human: each for human, each in found.items() if any(map(len, each))}
-    cells = [[shown(cell, rows) for rows in each] for each in found.values()]
-    names = (Line(row).name for row in HELPED)
-    return markdown((title, *map(words, found)), list(zip(names, *cells, strict=True)))
+    lines = {key: cell(rows) for key, rows in beside(records).groupby(["algorithm", "setting"])}
+    humans = [human for human in HUMANS if any(human == setting for _, setting in lines)]
+    rows = [(Line(row).name, *(lines.get((row, human), "–") for human in humans)) for row in HELPED]
+    return markdown((title, *map(plan.words, humans)), rows)
 
 
 def outcomes(records: Records) -> Mapping[str, Cell]:
@@ -454,31 +418,26 @@ def costs(records: Records) -> str:
 def came_of_it(records: Records) -> str:
     """Return the table of how the policies drive alone, and the humans."""
     lines = [*(Line(row, GOOD) for row in (*plan.ROWS, plan.EXPERT)), *OWN.values()]
-    return table(records, product(TASKS, lines), outcomes(records), with_tested_only=True)
+    return table(records, product(TASKS, lines), outcomes(records))
+
+
+def listed(values: Mapping[str, Any]) -> str:
+    """Return settings as a cell shows them."""
+    return ", ".join(f"`{name}={value}`" for name, value in values.items())
 
 
 def own_settings() -> str:
     """Return the table of the hyper-parameters that each row has of its own."""
-    rows = [
-        (Line(row).name, f"`{row}`", *(
-            ", ".join(f"`{name}={value}`" for name, value in values.items())
-            for values in (ALGORITHMS[row].settings, plan.TUNED.get(row, {}))
-        ))
-        for row in plan.ROWS
-    ]  # fmt: skip
+    rows = [(Line(row).name, f"`{row}`", listed(ALGORITHMS[row].settings),
+             listed(plan.TUNED.get(row, {}))) for row in plan.ROWS]  # fmt: skip
     return markdown(("", "`NAME`", "settings of its own", "in this table alone"), rows)
 
 
-def guided_in(records: Records) -> str:
-    """Return how many of the table's trainings multiplied in what."""
-    return computed_in(records, [Line(*each) for each in product(plan.ROWS, HUMANS)])
-
-
 PAGES: Mapping[str, Sequence[Callable[..., Any]]] = {
-    "paper": (presets, settings, anchor, summary, verdicts, tests, distances, times, cost),
+    "paper": (presets, computed_in, anchor, summary, verdicts, tests, distances, times, cost),
     "guidance": (
-        short, place, verdict, learns, forgives, seeds_beside, beside_each, costs, came_of_it,
-        own_settings, guided_in,
+        short, place, default, late, forgives, seeds_beside, beside_each, costs, came_of_it,
+        own_settings, computed_in,
     ),
 }  # fmt: skip
 """Study -> what its template calls."""
@@ -494,19 +453,17 @@ def write_typical(found: Iterable[Records], path: Path) -> None:
     """
     curves: dict[str, dict[str, Any]] = {}
     for records in found:
-        human = GOOD if records.study.name == plan.GUIDANCE.name else plan.NORMAL
-        for scenario, row in sorted({(unit.scenario, unit.algorithm) for unit in records.found}):
-            units = records.units_of(scenario, Line(row, human))
-            if row in ALGORITHMS and ALGORITHMS[row].guided and units:
-                grid = records.grid(scenario)
-                given = np.median([records.human_s(unit, grid) for unit in units], axis=0)
-                alone = np.median(
-                    [records.curve(unit, data.ALONE, data.SUCCESS, grid) for unit in units], axis=0
+        human = GOOD if records.study is plan.GUIDANCE else plan.NORMAL
+        units = records.numbers[records.numbers.setting == human]
+        for (task, row), its in units.groupby(["scenario", "algorithm"]):
+            if row in ALGORITHMS and ALGORITHMS[row].guided:
+                given, alone = (
+                    np.median(records.curves(task, Line(row, human), name), axis=0)
+                    for name in ("human_s", f"{data.SUCCESS} {data.ALONE}")
                 )
                 points = np.stack([given.round(1), alone.round(3)], axis=1).tolist()
-                curves.setdefault(units[0].environment, {})[row] = {
-                    "human": human, "seeds": len(units), "points": points
-                }  # fmt: skip
+                curve = {"human": human, "seeds": len(its), "points": points}
+                curves.setdefault(TASKS[task][0], {})[row] = curve
     if not curves:
         raise UserError("there are no records of a guided training")
     write_atomic(path, (json.dumps(curves) + "\n").encode())

@@ -21,7 +21,7 @@ from trainer.environments import CONDITIONS
 from trainer.experiments import command, compute, figures, plan, records, report
 from trainer.experiments.compute import FAILED, FINISHED, STOPPED, Job
 from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit
-from trainer.experiments.records import ALONE, RECORD_FILE, SUCCESS, Store
+from trainer.experiments.records import RECORD_FILE, Store, columns_of
 from trainer.human.config import MODEL_FILE, HumanModelConfig
 from trainer.human.model import HumanModel
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
@@ -93,20 +93,21 @@ def made_up(unit, digest):
     skill = SKILLS.get(unit.algorithm, 0.9)
     random = np.random.default_rng([unit.seed, *"".join(unit[:3]).encode()])
     full_m = plan.FULL_PATH_M.get(unit.scenario, 50.0)
-    drives = {}
-    for place, condition in enumerate(unit.conditions):
-        reached = random.random(60) < skill - 0.03 * place
-        drives[condition] = {
-            "outcome": [GOAL if arrived else COLLISION for arrived in reached],
-            "distance_m": np.where(reached, full_m + 0.2, full_m * random.random(60)).tolist(),
-            "reward": np.where(reached, 10.0, -10.0).tolist(),
-            **{name: random.gamma(2.0, 0.1, 60).tolist() for name in records.ARRIVED_ONLY},
-        }
-    tests = [records.summarise_tests(unit.scenario, *each) for each in drives.items()]
+    reached = np.concatenate([random.random(60) < skill - 0.03 * place
+                              for place in range(len(unit.conditions))])  # fmt: skip
+    drives = pd.DataFrame({
+        "condition": np.repeat(unit.conditions, 60),
+        "drive": [*range(60)] * len(unit.conditions),
+        "outcome": np.where(reached, GOAL, COLLISION),
+        "distance_m": np.where(reached, full_m + 0.2, 0.5 * full_m),
+        "reward": np.where(reached, 10.0, -10.0),
+        **{name: random.gamma(2.0, 0.1, len(reached)) for name in records.ARRIVED_ONLY},
+    })  # fmt: skip
     own = {"digest": digest, "bfloat16": unit.seed > 1, "gpu": "H100" if unit.seed > 2 else None}
-    record: dict[str, Any] = {"tests": {name: [row[name] for row in tests] for name in tests[0]}}
+    tests = records.summarise_tests(unit.scenario, drives)
+    record: dict[str, Any] = {"tests": columns_of(tests)}
     if Line(*unit[1:3]) in plan.BOXED:
-        record["drives"] = compute.arrivals(drives, plan.BOXES[unit.scenario])
+        record["drives"] = columns_of(compute.arrivals(drives, plan.BOXES[unit.scenario]))
     if unit.algorithm == plan.CONSTANT:
         own |= {"action": 0.1, "searched": 39, "search_success": 0.3}
     if unit.trained:
@@ -375,7 +376,7 @@ class TestNumbers:
         assert row["human_s_to_98%"] == pytest.approx(8.1)
         assert (row["steps"], row["human_steps"], row["failures"]) == (6000, 300, 5)
         assert row["unlearned"] == pytest.approx(0.1)  # the mean of 1.0, 0.9 and 0.8
-        given = found.human_s(GUIDED, found.grid("left_turn"))
+        (given,) = found.curves("left_turn", Line("phil_td3"), "human_s")
         assert given[:2] == pytest.approx([2.4, 4.8])
 
     def test_a_seed_that_never_learned_costs_more_than_any_other(self, store):
@@ -387,22 +388,23 @@ class TestNumbers:
         assert cell(found) == "1,620 [1,080, ∞] (2 of 3)"
         assert cell(found[1:]) == "∞ [1,620, ∞] (1 of 2)"
         assert cell(found[2:]) == "never"
-        assert report.spread([-0.3, -3.0, np.inf]) == "0 [-3, ∞]"
+        assert report.spread(pd.Series([-0.3, -3.0, np.inf])) == "0 [-3, ∞]"
 
     def test_tests_are_summed_up_by_what_arrives_and_distances_end_at_the_goal(self):
-        drives: dict[str, Any] = {
-            "outcome": [GOAL] * 50 + [COLLISION] * 50, "distance_m": [21.4] * 50 + [1.0] * 50,
-            "reward": [1.0] * 100, "time_s": [4.0] * 50 + [1.0] * 50,
-            records.LATERAL: [None] * 100, records.LONGITUDINAL: [0.5] * 100,
-        }  # fmt: skip
-        row = records.summarise_tests("left_turn", "noise", drives)
+        drives = pd.DataFrame({
+            "condition": "noise", "outcome": [GOAL] * 50 + [COLLISION] * 50,
+            "distance_m": [21.4] * 50 + [1.0] * 50, "reward": 1.0,
+            "time_s": [4.0] * 50 + [1.0] * 50, records.LATERAL: None, records.LONGITUDINAL: 0.5,
+        })  # fmt: skip
+        (row,) = records.summarise_tests("left_turn", drives).to_dict("records")
         assert (row["success"], row["paper_success"], row["distance_m"]) == (0.5, 1.0, 11.0)
         assert (row["paper_distance_m"], row["paper_distance_sd_m"]) == (21.0, 0.0)
-        assert (row["time_s"], row[records.LATERAL]) == (4.0, None)
+        assert row["time_s"] == 4.0
+        assert np.isnan(row[records.LATERAL])
 
     @pytest.mark.parametrize(
         ("cheaper", "behind", "default"),
-        [(10, 0, "HI"), (9, 0, "HI"), (8, 0, "PHIL"), (10, 1, "PHIL")],
+        [(9, 0, "HI-TD3"), (8, 0, "PHIL-TD3"), (10, 1, "PHIL-TD3")],
     )
     def test_a_row_becomes_the_default_that_costs_less_and_is_nowhere_behind(
         self, store, monkeypatch, cheaper, behind, default
@@ -419,7 +421,7 @@ class TestNumbers:
 
         monkeypatch.setattr(plan, "RIVALS", ("hi_td3",))
         found = leave(store, GOOD_UNITS, episodes=steps, tests=tests)
-        assert report.verdict(found) == f"By the rule the default is {default}-TD3."
+        assert report.default(found) == default
         assert report.less_in(report.pairs(found, "hi_td3")) == f"{cheaper} of 10"
 
     def test_pairs_of_which_none_learns_are_not_compared(self, store):
@@ -439,8 +441,8 @@ class TestNumbers:
         found = leave(store, units, episodes=validated(1.0), tests=lambda unit: {
             "success": [0.6 if unit[1:3] == ("hi_td3", "slower") else 0.9] * 4
         })  # fmt: skip
-        assert report.forgives(found) == "PHIL-TD3. Less beside some: HI-TD3 (slower 60.0)."
-        assert report.learns(found).startswith("all rows but IA-TD3, vanilla TD3, ")
+        assert report.forgives(found) == (["PHIL-TD3"], ["HI-TD3 (slower 60.0)"])
+        assert report.late(found)[:2] == ["IA-TD3", "vanilla TD3"]
 
     def test_a_row_is_held_against_the_human_that_guided_it(self, store):
         rewards = {("phil_td3", "slower", 1): 5.0, ("phil_td3", "late", 1): 5.0,
@@ -460,7 +462,7 @@ class TestNumbers:
         (curve,) = json.loads(path.read_text())["left_turn"].values()
         given, alone = zip(*curve["points"], strict=True)
         assert (curve["human"], curve["seeds"], given[-1]) == ("normal", 3, 30.0)
-        ends = [found.curve(u, ALONE, SUCCESS, found.grid("left_turn"))[-1] for u in units[3:]]
+        ends = found.curves("left_turn", Line("phil_td3"), "success alone")[:, -1]
         assert alone[-1] == pytest.approx(np.median(ends), abs=1e-3)
 
 
