@@ -24,7 +24,7 @@ from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit
 from trainer.experiments.records import RECORD_FILE, Store, columns_of
 from trainer.human.config import MODEL_FILE, HumanModelConfig
 from trainer.human.model import HumanModel
-from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
+from trainer.learner.config import ALGORITHMS
 from trainer.training.run import TrainingRun
 
 ROOT = Path(__file__).parents[2]
@@ -154,9 +154,8 @@ class TestUnit:
 
     def test_a_killed_one_is_a_failure_and_goes_on_to_the_same_record(self, store, straight):
         ends = []
-        working = threading.Thread(
-            target=lambda: ends.append(command.run_here([Job(UNIT, store)], 1))
-        )
+        jobs = [Job(UNIT, store)]
+        working = threading.Thread(target=lambda: ends.append(command.run_here(jobs, 1)))
         working.start()
         while not (store.run_dir(UNIT) / CHECKPOINT_FILE).exists():
             assert working.is_alive()
@@ -183,12 +182,9 @@ class TestUnit:
     def test_tests_that_change_are_driven_with_the_actor_that_is_there(self, straight, monkeypatch):
         monkeypatch.setattr(TrainingRun, "train", lambda *_: pytest.fail("trained again"))
         more = replace(straight, study=replace(TINY, test_runs=5))
-        before = record_of(straight)
         assert more.record_left(UNIT) is None
         assert compute.compute(Job(UNIT, more)) == FINISHED
-        after = record_of(straight)
-        assert after["tests"]["drives"] == [5] * len(CONDITIONS)
-        assert after["episodes"] == before["episodes"]
+        assert record_of(straight)["tests"]["drives"] == [5] * len(CONDITIONS)
         assert compute.compute(Job(UNIT, straight)) == FINISHED
 
     def test_one_that_another_process_has_is_left_to_it(self, store, monkeypatch):
@@ -268,9 +264,8 @@ class TestTables:
                 leave(store, self.UNITS)
         found = store.load(self.UNITS, 2)
         assert tuple(found.found) == self.UNITS
-        assert (
-            not found.tables["episodes"].reset_index().duplicated([*records.KEY, "end_step"]).any()
-        )
+        rows = found.tables["episodes"].reset_index()
+        assert not rows.duplicated([*records.KEY, "end_step"]).any()
 
     @pytest.mark.parametrize("damage", [b"", b"no table", b"\xfd7zXZ\x00"])
     def test_damage_is_refused_in_one_line(self, store, damage):
@@ -313,9 +308,6 @@ class TestPlan:
         assert len({*digests, digest()}) == len(digests) + 1
         # Tests do not name the training.
         assert replace(TINY, test_runs=9).run_name(UNIT) == TINY.run_name(UNIT)
-        assert plan.digest({"a": 1, "b": {"x": 1, "y": 2}}) == plan.digest(
-            {"b": {"y": 2, "x": 1}, "a": 1}
-        )
 
     def test_every_experiment_is_computed_by_all_line_by_line_and_seed_by_seed(self):
         units = PAPER.units(5)
@@ -325,19 +317,6 @@ class TestPlan:
         assert {unit.algorithm for unit in units[:4]} == set(plan.TESTED_ONLY)
         assert [unit.seed for unit in units[4:44]] == sorted(unit.seed for unit in units[4:44])
         assert units[44].setting == "biased"
-
-    def test_the_settings_are_what_they_say(self, store):
-        of = {
-            name: compute.run_config(
-                Job(GUIDED._replace(setting=name), replace(store, study=PAPER))
-            )
-            for name in plan.SETTINGS
-        }
-        assert of["one_frame"].learner.frames == 1
-        assert of["printed"].learner == PRINTED_LEARNER
-        assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
-        assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
-        assert {each.steps for each in of.values()} == {PAPER.steps["left_turn"]}
 
     def test_the_table_of_guidance_has_every_row_with_every_human(self, store):
         units = GUIDANCE.units(5)
@@ -386,9 +365,7 @@ class TestNumbers:
         )).of("left_turn", Line("phil_td3"))  # fmt: skip
         cell = report.until(0.9, "steps")
         assert cell(found) == "1,620 [1,080, ∞] (2 of 3)"
-        assert cell(found[1:]) == "∞ [1,620, ∞] (1 of 2)"
         assert cell(found[2:]) == "never"
-        assert report.spread(pd.Series([-0.3, -3.0, np.inf])) == "0 [-3, ∞]"
 
     def test_tests_are_summed_up_by_what_arrives_and_distances_end_at_the_goal(self):
         drives = pd.DataFrame({
@@ -424,16 +401,6 @@ class TestNumbers:
         assert report.default(found) == default
         assert report.less_in(report.pairs(found, "hi_td3")) == f"{cheaper} of 10"
 
-    def test_pairs_of_which_none_learns_are_not_compared(self, store):
-        found = leave(store, GOOD_UNITS[:10], episodes=lambda unit: validated(
-            float(unit.algorithm == "phil_td3")
-        ))  # fmt: skip
-        (row,) = [line for line in report.place(found).splitlines() if line.startswith("| HI-TD3")]
-        assert row.endswith("| ∞ [∞, ∞] | 0 of 5 |")
-        other = replace(store, results=store.results / "other")
-        found = leave(other, GOOD_UNITS[:10], episodes=validated(0.0))
-        assert report.place(found).splitlines()[-1].endswith("| – | 0 of 5 |")
-
     def test_a_row_forgives_a_human_beside_whom_it_still_succeeds(self, store):
         units = [Unit("left_turn", *each, 1) for each in product(
             ("phil_td3", "hi_td3"), ("good", "slower")
@@ -443,15 +410,6 @@ class TestNumbers:
         })  # fmt: skip
         assert report.forgives(found) == (["PHIL-TD3"], ["HI-TD3 (slower 60.0)"])
         assert report.late(found)[:2] == ["IA-TD3", "vanilla TD3"]
-
-    def test_a_row_is_held_against_the_human_that_guided_it(self, store):
-        rewards = {("phil_td3", "slower", 1): 5.0, ("phil_td3", "late", 1): 5.0,
-                   ("expert", "slower", 0): 3.0, ("expert", "good", 0): 9.0}  # fmt: skip
-        units = [Unit("left_turn", *each) for each in rewards]
-        found = leave(store, units, tests=lambda unit: {"reward": [rewards[unit[1:]]] * 4})
-        cell = report.outcomes(found)["return over the human's, nominal"]
-        cells = [cell(found.of("left_turn", Line(*unit[1:3]))) for unit in units]
-        assert cells == ["2.00", "-4.00", "-6.00", "0.00"]
 
     def test_a_coachs_curves_are_the_medians_of_the_seeds_that_a_human_guided(
         self, store, tmp_path
@@ -483,10 +441,7 @@ class TestCommand:
         anchors = {f"#{re.sub('[^a-z0-9 -]', '', line[3:].lower()).replace(' ', '-')}"
                    for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
         assert set(re.findall(r"\((#[^)]*)\)", page)) <= anchors
-        assert "4 float32, 4 bfloat16" in page
         assert str(tmp_path) not in page
-        last = call(capsys, "experiment", "status", "--seeds", 2, *places)[1].splitlines()[-1]
-        assert last == "10 of 112 units done; 0 records of other settings"
 
     def test_what_is_missing_is_computed_and_reported(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setitem(figures.FIGURES, "paper", {})
@@ -496,15 +451,6 @@ class TestCommand:
         assert (status, out.splitlines()[-1]) == (0, f"wrote {results / 'README.md'}")
         assert "constant actions in the left turn is" in (results / "README.md").read_text()
         assert "1 of 1 units were there already" in call(capsys, "experiment", "floor", *more)[1]
-
-    def test_stopping_soon_leaves_it_to_the_same_command(self, tmp_path, capsys):
-        more = ("--quick", "--max-minutes", 1e-4, "--humans", tmp_path, "--runs", tmp_path)
-        status, out, err = call(
-            capsys, "experiment", "fig7", "--scenario", "left_turn", "--seeds", 1, *more
-        )
-        assert (status, "the same command goes on" in out) == (0, True)
-        assert "3 units left out" in err  # without their human
-        assert not (tmp_path / "quick/results").exists()
 
     @pytest.mark.parametrize("names", ["status report", "guidance fig7", "typical all"])
     def test_names_that_do_not_go_together_are_refused(self, capsys, names):
