@@ -15,6 +15,7 @@ from PIL import Image
 from edge_runtime.files import write_atomic
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
+from trainer.experiments import records as data
 from trainer.experiments.plan import (
     EXPERIMENTS,
     FULL_PATH_M,
@@ -27,19 +28,7 @@ from trainer.experiments.plan import (
     Line,
     words,
 )
-from trainer.experiments.records import (
-    ALONE,
-    ARRIVED_ONLY,
-    DISTANCE,
-    LATERAL,
-    LEARNED,
-    LONGITUDINAL,
-    REWARD,
-    SUCCESS,
-    TIME_S,
-    TRAINING,
-    Records,
-)
+from trainer.experiments.records import ALONE, DISTANCE, REWARD, SUCCESS, TRAINING, Records
 from trainer.pictures import DOTS_PER_INCH
 
 KEPT_COLOURS = 64  # Of a figure's pixels
@@ -62,9 +51,9 @@ TITLES = {
     REWARD: "reward",
     DISTANCE: "surviving distance, m",
     SUCCESS: "success",
-    TIME_S: "time to the goal, s",
-    LATERAL: "mean |lateral acceleration|, m/s²",
-    LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
+    data.TIME_S: "time to the goal, s",
+    data.LATERAL: "mean |lateral acceleration|, m/s²",
+    data.LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
 }
 MARKERS = {NORMAL: "o", plan.ONE_FRAME: "D", plan.RANDOM: "^", plan.BIASED: "v"}
 
@@ -133,7 +122,7 @@ def draw_groups(
         axis.set_title(f"{TITLES[quantity]}, {about}", fontsize=10)
         for (group, (_, where)), (side, line) in product(enumerate(places), enumerate(lines)):
             x = group + (side - 0.5 * (len(lines) - 1)) * width
-            its, boxes = look(side, line), quantity in ARRIVED_ONLY
+            its, boxes = look(side, line), quantity in data.ARRIVED_ONLY
             values = (records.arrivals(scenario, line, where)[quantity] if boxes
                       else records.of(scenario, line)[f"{quantity} {where}"])  # fmt: skip
             if len(values) and boxes:
@@ -176,9 +165,10 @@ PAPER_FIGURES: Mapping[str, Draw] = {
         ("fig8", ENDS, 2, POINTS),
         ("fig9", [*_scenes(SUCCESS, SUCCESS), *_scenes(DISTANCE, DISTANCE)], 2,
          f"{SCENE_KEY}; {POINTS}"),
-        ("fig10", _scenes(TIME_S, LATERAL), 1, f"{SCENE_KEY}; {ARRIVALS}"),
+        ("fig10", _scenes(data.TIME_S, data.LATERAL), 1, f"{SCENE_KEY}; {ARRIVALS}"),
         ("fig14", _scenes(DISTANCE, DISTANCE, of=PAPER_SCENES), 1, f"{SCENE_KEY}; {POINTS}"),
-        ("fig15", _scenes(LONGITUDINAL, LATERAL, of=PAPER_SCENES), 1, f"{SCENE_KEY}; {ARRIVALS}"),
+        ("fig15", _scenes(data.LONGITUDINAL, data.LATERAL, of=PAPER_SCENES), 1,
+         f"{SCENE_KEY}; {ARRIVALS}"),
     )},
 }  # fmt: skip
 """Name of the experiment, and of the PNG -> how it is drawn."""
@@ -193,7 +183,7 @@ def draw_guidance(records: Records) -> Figure:
         panel.grid(axis="x", alpha=0.3)
     for (above, below), task in zip(panels.T, TASKS, strict=True):
         found = [records.of(task, Line(row, GOOD)) for row in ROWS]
-        learned = [rows[f"human_s_to_{LEARNED:.0%}"] for rows in found]
+        learned = [rows[f"human_s_to_{data.LEARNED:.0%}"] for rows in found]
         costs = [s[s < np.inf] for row, s in zip(ROWS, learned, strict=True) if row in HELPED]
         most = max((s.max() for s in costs if len(s)), default=1.0)
         never = 1.15 * most
@@ -216,7 +206,7 @@ def draw_guidance(records: Records) -> Figure:
         above.text(never, 0.8, "never", ha="center", fontsize=8)
         above.set(title=words(task), xlim=(0.0, 1.25 * most))
         above.set_xticks([tick for tick in above.get_xticks() if tick <= most])
-        above.set_xlabel(f"seconds of the human until {LEARNED:.0%} alone", fontsize=9)
+        above.set_xlabel(f"seconds of the human until {data.LEARNED:.0%} alone", fontsize=9)
         below.set(xlim=(-4.0, 104.0))
         below.set_xlabel("success, nominal tests, %", fontsize=9)
     for panel in panels[:, 0]:

@@ -57,10 +57,12 @@ def write_page(store: Store, records: Records) -> Path:
         loader=jinja2.FileSystemLoader(Path(__file__).parent), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
+    templates.filters["listed"] = lambda values: ", ".join(f"`{k}={v}`" for k, v in values.items())
     templates.filters |= {"words": plan.words, "percent": "{:.0%}".format, "number": "{:,}".format}
     claims = store.results / CLAIMS_FILE  # Of the kept records alone
     text = templates.get_template(f"{name}.md.jinja").render(
         {function.__name__: function for function in PAGES[name]},
+        algorithms=ALGORITHMS,
         claims=pd.read_csv(claims, keep_default_na=False) if claims.is_file() else None,
         command="python -m trainer experiment",
         data=data,
@@ -421,23 +423,11 @@ def came_of_it(records: Records) -> str:
     return table(records, product(TASKS, lines), outcomes(records))
 
 
-def listed(values: Mapping[str, Any]) -> str:
-    """Return settings as a cell shows them."""
-    return ", ".join(f"`{name}={value}`" for name, value in values.items())
-
-
-def own_settings() -> str:
-    """Return the table of the hyper-parameters that each row has of its own."""
-    rows = [(Line(row).name, f"`{row}`", listed(ALGORITHMS[row].settings),
-             listed(plan.TUNED.get(row, {}))) for row in plan.ROWS]  # fmt: skip
-    return markdown(("", "`NAME`", "settings of its own", "in this table alone"), rows)
-
-
 PAGES: Mapping[str, Sequence[Callable[..., Any]]] = {
     "paper": (presets, computed_in, anchor, summary, verdicts, tests, distances, times, cost),
     "guidance": (
         short, place, default, late, forgives, seeds_beside, beside_each, costs, came_of_it,
-        own_settings, computed_in,
+        computed_in,
     ),
 }  # fmt: skip
 """Study -> what its template calls."""
