@@ -3,7 +3,11 @@
 import contextlib
 import itertools
 import os
+import random
+import signal
+import subprocess
 import threading
+import time
 
 import pytest
 
@@ -12,6 +16,7 @@ from deploy.bundle import make_bundle
 from deploy.certs import write_key_pair
 from deploy.installer import systemd
 from deploy.installer.__main__ import share_key
+from deploy.installer.layout import CURRENT, PREVIOUS, Releases
 from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
@@ -192,3 +197,34 @@ def test_who_runs_it_stays_as_it_was_installed(
             (tmp_path / name).touch()
     with pytest.raises(UserError) if expected is UserError else contextlib.nullcontext():
         assert isinstance(systemd.choose(service, tmp_path), expected or type(None))
+
+
+@pytest.mark.board
+@pytest.mark.timeout(1800)
+def test_killed_at_40_random_moments_the_board_has_a_whole_release_and_completes(board):
+    """With all that it has started, as a power cut would."""
+    shop, choice = board.workshop, random.Random(7)
+    # Of three in turn the next one is neither current nor previous, so it is unpacked anew.
+    made = itertools.cycle([shop.make(value) for value in (0.1, 0.2, 0.3)])
+    old, releases, cut_off = next(made), Releases(str(board.root)), 0
+    begin_s = time.monotonic()
+    assert board.install(old.path).returncode == 0
+    limit_s = time.monotonic() - begin_s
+    for _ in range(40):
+        new = next(made)
+        with subprocess.Popen(
+            board.command("install", new.path), stdout=subprocess.DEVNULL, start_new_session=True
+        ) as run:
+            time.sleep(choice.uniform(0.0, limit_s))
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+        cut_off += run.returncode != 0
+        current = releases.linked(CURRENT) or ""
+        assert current in (old.manifest.version, new.manifest.version)
+        assert releases.damage(current) == []
+        assert board.install(new.path).returncode == 0
+        assert releases.linked(CURRENT) == new.manifest.version
+        assert releases.linked(PREVIOUS) == old.manifest.version
+        assert len(list((board.root / "releases").iterdir())) == 2
+        old = new
+    assert cut_off > 20
