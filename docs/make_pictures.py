@@ -31,8 +31,7 @@ from trainer.person.tests.browser import (
     quit_sitting,
     until,
 )
-from trainer.pictures import write_figure
-from trainer.training.metrics import read_metrics
+from trainer.training.metrics import read_metrics, write_figure
 from trainer.util import kept
 
 MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s

@@ -21,7 +21,7 @@ from edge_runtime.util import UserError
 from hil_tests.faults.run import run_faults
 from hil_tests.faults.table import ROWS, Row
 from hil_tests.sweep import NETWORK_AXES, Axis, draw_axes, render_latency, run_latency
-from trainer.pictures import write_figure
+from trainer.training.metrics import write_figure
 from trainer.util import cores, kept
 
 SHOWN_WRONG = 5

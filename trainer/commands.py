@@ -15,7 +15,7 @@ from edge_runtime.cli import add_public_key, command
 from trainer import options
 from trainer.environments import CONDITIONS
 from trainer.experiments import plan
-from trainer.human.config import FIELDS, HumanModelConfig
+from trainer.human import FIELDS, HumanModelConfig
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.person.interface import HUMANS, add_person
 from trainer.training.config import (
@@ -111,7 +111,7 @@ def setting_lines() -> Iterator[str]:
 
 
 @command(
-    "trainer.person.drive:run",
+    "trainer.person.session:run",
     "python -m trainer drive --out runs/drives",
     "python -m trainer drive --policy runs/phil_1 --out runs/drives",
     "python -m trainer drive --from drive.mcap --at 3s --out runs/drives",
@@ -141,7 +141,7 @@ def drive(parser: argparse.ArgumentParser) -> None:
 
 
 @command(
-    "trainer.human.dagger:run",
+    "trainer.human.model:run",
     "python -m trainer human --scenario left_turn --out runs/human",
     "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
     "python -m trainer human --from runs/drives --out runs/me",
@@ -263,7 +263,7 @@ def experiment(parser: argparse.ArgumentParser) -> None:
 
 
 @command(
-    "trainer.pictures:run",
+    "trainer.training.metrics:run",
     "python -m trainer plot runs/phil_1",
     "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
 )

@@ -21,7 +21,7 @@ from trainer.environments import (
     make_environment,
     task_of,
 )
-from trainer.human.config import MODEL_FILE
+from trainer.human import MODEL_FILE
 from trainer.human.guide import Action, Driver, Observation
 from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor

@@ -29,7 +29,7 @@ from trainer.experiments import plan, report
 from trainer.experiments.compute import BUSY, FAILED, FINISHED, STOPPED, Job, compute
 from trainer.experiments.plan import FOREIGN, REPORT, STATUS, STUDIES, TYPICAL
 from trainer.experiments.records import RECORD_FILE, Store
-from trainer.human.config import MODEL_FILE
+from trainer.human import MODEL_FILE
 from trainer.options import check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
 from trainer.training.config import CONFIG_FILE

@@ -35,7 +35,7 @@ from trainer.experiments.records import (
     columns_of,
     summarise_tests,
 )
-from trainer.human.config import MODEL_FILE
+from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig

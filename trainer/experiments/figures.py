@@ -29,7 +29,7 @@ from trainer.experiments.plan import (
     words,
 )
 from trainer.experiments.records import ALONE, DISTANCE, REWARD, SUCCESS, TRAINING, Records
-from trainer.pictures import DOTS_PER_INCH
+from trainer.training.metrics import DOTS_PER_INCH
 
 KEPT_COLOURS = 64  # Of a figure's pixels
 Draw = Callable[[Records], Figure]

@@ -1,20 +1,29 @@
 """The DAgger human model of section V, which imitates the human's actions so far."""
 
-from collections.abc import Iterator
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
-from trainer import util
-from trainer.environments import check_trained_in
-from trainer.human.config import MODEL_FILE, HumanModelConfig
-from trainer.human.guide import Driver
+from bridge.progress import ProgressBar
+from edge_runtime.files import write_json
+from edge_runtime.util import UserError
+from trainer import options, util
+from trainer.environments import check_trained_in, expert_of, make_environment
+from trainer.human import FIELDS, MODEL_FILE, HumanModelConfig
+from trainer.human.guide import Driver, HumanGuide, steps_held
 from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
-from trainer.util import Purpose, load_torch, random_stream, save_torch
+from trainer.person.interface import vector
+from trainer.person.recording import find_recordings, read_episodes, read_steps
+from trainer.util import Purpose, claimed, episode_seed, load_torch, random_stream, save_torch
 
 REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is refined
 
@@ -109,3 +118,116 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
         check_trained_in(env, directory, state["scenario"])
         actor.load_state_dict(state.pop("actor"))
     return actor, state
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train the model, showing progress; return the exit status."""
+    options.set_threads(arguments.threads)
+    if arguments.recordings is not None and arguments.label_every_step:
+        raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
+    config = HumanModelConfig(**{name: getattr(arguments, name) for name in FIELDS})
+    directory = Path(arguments.out)
+    with claimed(directory):
+        if (directory / MODEL_FILE).exists():
+            raise UserError(f"{directory} holds a human model; choose another --out")
+        _train(arguments, config, directory)
+    return 0
+
+
+def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
+    end_s = options.deadline_s(arguments.max_minutes)
+    env = make_environment(arguments.scenario)
+    about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
+    size, space = env.action_space.shape[0], env.observation_space
+    model = HumanModel(config, arguments.seed, size, space)
+    if arguments.recordings is None:
+        episodes = imitate(model, env, arguments.seed)
+    else:
+        recordings = find_recordings([Path(place) for place in arguments.recordings])
+        taken_over = demonstrate(model, recordings, env.scenario)
+        about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
+        # As many gradient steps as with the expert, without the episodes between them.
+        episodes = (
+            HumanEpisode(model.learn(config.updates_per_episode), model.demonstrations)
+            for _ in range(config.episodes)
+        )
+    with ProgressBar("human model", config.episodes) as bar:
+        for episode in episodes:
+            shown = {"demonstrations": str(episode.demonstrations), "loss": f"{episode.loss:.3f}"}
+            if episode.outcome:
+                shown |= {"interventions": str(episode.interventions), "outcome": episode.outcome}
+            bar.advance(shown)
+            if time.monotonic() > end_s:
+                break
+    if bar.done < config.episodes:
+        print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
+    # In proportion: part of the episodes have shown part of the examples, in part of the time.
+    updates = config.refining_updates * bar.done // config.episodes
+    if updates:
+        with ProgressBar("refining", min(updates, REFINING_PARTS)) as refining:
+            for loss in model.refine(updates):
+                refining.advance({"loss": f"{loss:.3f}"})
+    about["config"] = asdict(config)
+    model.save(directory, about)
+    amount = {"episodes": bar.done, "demonstrations": model.demonstrations}
+    write_json(directory / "human.json", about | amount)
+    print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
+
+
+class HumanEpisode(NamedTuple):
+    """One episode of the human model's training."""
+
+    loss: float
+    demonstrations: int  # The human's steps so far
+    interventions: int = 0
+    outcome: str = ""  # Empty where nobody drove: the model learned from recordings
+
+
+def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
+    """Imitate the scripted expert, which takes over while the model drives; yield each episode."""
+    config = model.config
+    # Three, as each has a memory: a person who takes over looks at the scene afresh.
+    expert, adviser = expert_of(env), expert_of(env)
+    guide = HumanGuide(expert, expert_of(env), steps_held(env.control_period_s))
+    for episode in range(config.episodes):
+        every = config.demonstrate_every
+        demonstrated = every and episode % every == every - 1
+        observation, info = env.reset(seed=episode_seed(seed, Purpose.HUMAN_EPISODES, episode))
+        guide.reset()
+        adviser.reset()
+        interventions, ended = 0, False
+        while not ended:
+            action = model.act(observation)
+            intervention = None if demonstrated else guide.watch(observation, action)
+            if demonstrated or intervention is not None:
+                action = expert.act(observation) if intervention is None else intervention.action
+                model.add(observation, action)
+            elif config.label_every_step:
+                model.add(observation, adviser.act(observation))
+            interventions += intervention is not None and intervention.first
+            observation, _, terminated, truncated, info = env.step(action)
+            ended = terminated or truncated
+        loss = model.learn(config.updates_per_episode)
+        yield HumanEpisode(loss, model.demonstrations, interventions, info["outcome"])
+
+
+def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
+    """Give the model every recorded step in which the person was in control.
+
+    During a hand-over the model gets the hands' action, not the blend that was applied; on the way
+    back to the policy the hands have let go. Returns the number of take-overs; a whole episode
+    driven alone counts as one. UserError: another scenario, or nobody drove.
+    """
+    interventions = 0
+    for path in recordings:
+        for episode in read_episodes(read_steps(path)):
+            first = episode[0]
+            if first.scenario != scenario:
+                raise UserError(f"{path} was driven in {first.scenario}, not in {scenario}")
+            interventions += sum(step.first for step in episode)
+            for step in episode:
+                if step.control == "human":
+                    model.add(step.observation, vector(step.human_action))
+    if not model.demonstrations:
+        raise UserError("nobody took over in these recordings: there is nothing to imitate")
+    return interventions

@@ -24,8 +24,7 @@ from bridge.outcomes import DISCARDED
 from bridge.record import close_torn, new_recording_at
 from bridge.recording import Recording
 from edge_runtime.util import UserError
-from trainer.human.model import HumanModel
-from trainer.person.interface import Amount, Control, vector
+from trainer.person.interface import Amount, Control
 
 TOPIC = "person/step"
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
@@ -216,25 +215,3 @@ def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Recorded
     """Yield the steps from ``position``, a sitting and an index, on, over all sittings."""
     for path in _begun(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
-
-
-def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
-    """Give the model every recorded step in which the person was in control.
-
-    During a hand-over the model gets the hands' action, not the blend that was applied; on the way
-    back to the policy the hands have let go. Returns the number of take-overs; a whole episode
-    driven alone counts as one. UserError: another scenario, or nobody drove.
-    """
-    interventions = 0
-    for path in recordings:
-        for episode in read_episodes(read_steps(path)):
-            first = episode[0]
-            if first.scenario != scenario:
-                raise UserError(f"{path} was driven in {first.scenario}, not in {scenario}")
-            interventions += sum(step.first for step in episode)
-            for step in episode:
-                if step.control == "human":
-                    model.add(step.observation, vector(step.human_action))
-    if not model.demonstrations:
-        raise UserError("nobody took over in these recordings: there is nothing to imitate")
-    return interventions

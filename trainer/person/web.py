@@ -34,8 +34,7 @@ from PIL import Image
 from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
-from trainer.person.controls import controls_of
-from trainer.person.interface import WISH_HELP, Reading, View
+from trainer.person.interface import WISH_HELP, Reading, View, controls_of
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 

@@ -17,8 +17,7 @@ from trainer.training.config import RunConfig
 from trainer.training.delayed import DelayedVehicle
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import read_metrics
-from trainer.training.run import Parts, TrainingRun
-from trainer.training.validation import Validation
+from trainer.training.run import Parts, TrainingRun, Validation
 
 POLICY, HUMAN = 0.25, -0.5
 BATCH = 4

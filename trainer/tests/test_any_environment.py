@@ -37,18 +37,16 @@ from trainer.environments import (
     outer,
     task_of,
 )
-from trainer.human.config import HumanModelConfig
-from trainer.human.model import HumanModel
+from trainer.human import HumanModelConfig
+from trainer.human.model import HumanModel, demonstrate
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import ReplayBuffer, ReplayLayout, Transition
 from trainer.learner.td3 import TD3Learner
-from trainer.person import drive as driving
-from trainer.person.controls import controls_of
-from trainer.person.drive import drive
-from trainer.person.interface import Reading
-from trainer.person.recording import Recorder, demonstrate, read_steps
-from trainer.person.session import Sitting
+from trainer.person import session as driving
+from trainer.person.interface import Reading, controls_of
+from trainer.person.recording import Recorder, read_steps
+from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
 from trainer.tests.rover import CAMERA, ROVER, Rover

@@ -22,7 +22,7 @@ from trainer.experiments import command, compute, figures, plan, records, report
 from trainer.experiments.compute import FAILED, FINISHED, STOPPED, Job
 from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit
 from trainer.experiments.records import RECORD_FILE, Store, columns_of
-from trainer.human.config import MODEL_FILE, HumanModelConfig
+from trainer.human import MODEL_FILE, HumanModelConfig
 from trainer.human.model import HumanModel
 from trainer.learner.config import ALGORITHMS
 from trainer.training.run import TrainingRun

@@ -7,10 +7,9 @@ import torch
 
 from trainer.drivers import constant_driver
 from trainer.environments import expert_of, make_environment
-from trainer.human.config import HumanModelConfig
-from trainer.human.dagger import imitate
+from trainer.human import HumanModelConfig
 from trainer.human.guide import ASKED, Asking, HumanGuide, PoorHands, steps_held
-from trainer.human.model import HumanModel, load_human_model
+from trainer.human.model import HumanModel, imitate, load_human_model
 from trainer.person.tests.people import BRAKE, FULL, drive
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv

@@ -31,7 +31,6 @@ from trainer.person.interface import (
     SLOWEST,
     check_person_options,
 )
-from trainer.pictures import write_learning_curve
 from trainer.training.config import (
     CONFIG_FILE,
     DEFAULTS,
@@ -47,7 +46,7 @@ from trainer.training.config import (
     parse_setting,
     settings_in,
 )
-from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
+from trainer.training.metrics import EpisodeMetrics, read_metrics, totals, write_learning_curve
 from trainer.training.run import TrainingRun
 from trainer.util import claimed
 

@@ -21,7 +21,7 @@ from trainer.person.tests.people import (
     recorded_step,
 )
 from trainer.training.metrics import read_metrics
-from trainer.training.validation import Validation
+from trainer.training.run import Validation
 from trainer.util import load_torch
 
 DRIVE = ("drive", "--out", "{tmp}/rec")

@@ -12,13 +12,12 @@ from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
 from trainer.person.recording import DIRECTORY
+from trainer.person.run import BehindTheScenes, Candidate
 from trainer.person.tests.people import record, recorded_step
-from trainer.person.validation import BehindTheScenes, Candidate
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
-from trainer.training.run import Parts, TrainingRun
-from trainer.training.validation import Validation
+from trainer.training.run import Parts, TrainingRun, Validation
 
 
 def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):

@@ -6,8 +6,8 @@ import pytest
 
 from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
 from trainer.drivers import constant_driver
-from trainer.person.drive import drive
 from trainer.person.recording import read_episodes, read_steps
+from trainer.person.session import drive
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.people import LET_GO, QUIT, Discarding, Puppet, hold, make_sitting, wish
 
