@@ -57,21 +57,16 @@ class Effort:
     steps_per_round: int = 200  # About three episodes
     training_episodes: int = 10  # Besides those before the first update
 
-    @property
-    def ticks(self) -> int:
-        """Rounds and episodes in all, for the progress bar."""
-        return self.rounds * (1 + len(SCENARIOS)) + self.training_episodes
-
 
 FULL, QUICK = Effort(), Effort(rounds=4, updates_per_round=3, training_episodes=3)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print; return the exit status."""
     check_writable(arguments.out)
     set_threads(arguments.threads)
     effort = QUICK if arguments.quick else FULL
-    with ProgressBar("bench", effort.ticks) as bar:
+    ticks = effort.rounds * (1 + len(SCENARIOS)) + effort.training_episodes
+    with ProgressBar("bench", ticks) as bar:
         report = measure(effort, lambda done: bar.advance({"last": done}))
     write_json_out(arguments.out, report)
     show(report)
@@ -175,10 +170,9 @@ def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, 
 def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
     """Train PHIL-TD3 in the left turn with an update a step, without validation or checkpoint."""
     learner = LearnerConfig(batch_size=effort.batch_size, warmup_steps=effort.batch_size)
-    config = RunConfig(evaluate_every_steps=0, learner=learner)
     episodes: list[EpisodeMetrics] = []
     with tempfile.TemporaryDirectory() as directory:
-        run = TrainingRun(config, Path(directory))
+        run = TrainingRun(RunConfig(evaluate_every_steps=0, learner=learner), Path(directory))
         with contextlib.closing(run.learning):
             while run.learning.added < learner.warmup_steps:
                 run.advance()
@@ -186,8 +180,7 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
             for _ in range(effort.training_episodes):
                 episodes.append(run.advance())
                 tick("training")
-            whole_s = time.perf_counter() - began_s
-    return training_figures(episodes, whole_s)
+            return training_figures(episodes, time.perf_counter() - began_s)
 
 
 def training_figures(episodes: Sequence[EpisodeMetrics], whole_s: float) -> dict[str, Any]:
@@ -236,7 +229,6 @@ def gather(size: int, seed: int = 0) -> Experience:
 
 
 def filled(experience: Experience) -> ReplayBuffer:
-    """Fill a replay buffer of ours."""
     replay = ReplayBuffer(len(experience))
     for before, action, reward, after, human in experience:
         replay.add(Transition(before, action, float(reward), after, False, human=bool(human)))

@@ -33,7 +33,6 @@ from trainer.util import PERIOD_S, kept
 @command(
     "trainer.training.command:run",
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
-    "python -m trainer train --resume --out runs/phil_1",
     "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
     "python -m trainer train --human web --rerun mine.rrd --out runs/mine",
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
@@ -86,10 +85,7 @@ def train(parser: argparse.ArgumentParser) -> None:
 
 
 class _Set(argparse.Action):
-    """``--set NAME=VALUE``, collected; ``--set`` alone lists the settings, as --help does options.
-
-    Other options need not be there for that.
-    """
+    """Collects ``--set NAME=VALUE``; ``--set`` alone lists the settings."""
 
     def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
         if value is None:
@@ -99,7 +95,6 @@ class _Set(argparse.Action):
 
 
 def setting_lines() -> Iterator[str]:
-    """Describe every setting: as it is typed by default, and what it means."""
     said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
     for name, default in SETTINGS.items():
         typed = str(default).lower() if isinstance(default, bool) else str(default)
@@ -129,12 +124,8 @@ def drive(parser: argparse.ArgumentParser) -> None:
     add_place(parser)
     out = "directory of the recordings; each sitting adds one"
     add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
-    add(
-        "--episodes",
-        type=cli.positive,
-        metavar="N",
-        help="number of episodes (default: no end)",
-    )
+    number = "number of episodes (default: no end)"
+    add("--episodes", type=cli.positive, metavar="N", help=number)
     options.add_seed(parser, " of the episodes, which are others in every sitting")
     add_person(parser)
     options.add_threads(parser)
@@ -252,14 +243,13 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     last = "stop every run after its next episode once this time is over; the same command resumes"
     options.add_time_limit(how, last)
     where = parser.add_argument_group("where it is kept")
-    for option, default, text in (
-        ("--results", None, "tables, figures and page (default: results/paper, or "
-         "results/guidance; typical: the directory of both, results)"),
-        ("--runs", None, "checkpoints and actors (default: runs/paper, or runs/guidance)"),
-        ("--humans", kept("results/humans/paper"),
-         "holds the human model of each scenario: DIR/left_turn, DIR/congestion"),
-    ):  # fmt: skip
-        where.add_argument(option, default=default, metavar="DIR", help=text)
+    results = "tables, figures and page (default: results/paper, or results/guidance; typical: the "
+    results += "directory of both, results)"
+    where.add_argument("--results", metavar="DIR", help=results)
+    runs = "checkpoints and actors (default: runs/paper, or runs/guidance)"
+    where.add_argument("--runs", metavar="DIR", help=runs)
+    models, place = "holds a human model: DIR/left_turn, DIR/congestion", "results/humans/paper"
+    where.add_argument("--humans", default=kept(place), metavar="DIR", help=models)
 
 
 @command(

@@ -34,26 +34,16 @@ NO_NETWORK = LatencySpec()
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; return the exit status."""
     check_writable(arguments.out)
-    found = evaluate(
-        arguments.policy,
-        arguments.scenario,
-        runs=arguments.runs,
-        seed=arguments.seed,
-        condition=arguments.condition,
-        latency=arguments.latency,
-        public_key=arguments.public_key,
-    )
+    names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key")
+    found = evaluate(**{name: getattr(arguments, name) for name in names})
     if not arguments.out:
         print(json.dumps(found.report, indent=2))
         return 0
     detail = [asdict(result) for result in found.episodes]
     write_json_out(arguments.out, {**found.report, "per_episode": detail})
-    distance_m, reward = found.report["surviving_distance_m"], found.report["episode_reward"]
     success = "" if found.success_rate is None else f"success {found.success_rate:.1%}, "
-    print(
-        f"{counted(arguments.runs, 'episode')}: {success}return {reward['mean']:.2f}, "
-        f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
-    )
+    said = f"{success}return {found.mean_return:.2f}"
+    print(f"{counted(arguments.runs, 'episode')}: {said}: {arguments.out}")
     return 0
 
 
@@ -66,7 +56,7 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float | None:
-        """Share of episodes that reached the goal; None if the environment knows no goal."""
+        """Share of episodes that reached the goal; None: the environment knows no goal."""
         return self.report["success_rate"]
 
     @property
@@ -95,10 +85,8 @@ def evaluate(
     """
     if condition not in CONDITIONS:
         raise UserError(f"condition must be one of {', '.join(CONDITIONS)}: {condition}")
-    if runs < 1:
-        raise UserError(f"runs must be at least 1: {runs}")
-    if seed < 0:
-        raise UserError(f"seed must be at least 0: {seed}")
+    if runs < 1 or seed < 0:
+        raise UserError(f"runs must be at least 1, and seed at least 0: {runs}, {seed}")
     scenario = scenario or getattr(policy, "scenario", None)
     policy, spec = located(fspath(policy)), parse_spec(latency)
     named, period_s = trained_in(policy, public_key)
@@ -181,8 +169,7 @@ def drive_together(
 ) -> list[EpisodeResult]:
     """Drive an episode for each seed, as many at once as there are environments.
 
-    A batch of pictures is much faster than one after another; last bits may differ. ``act`` has no
-    memory: it returns actions [n, action size] for observations [n, ...].
+    ``act`` has no memory: it returns actions [n, action size] for observations [n, ...].
     """
     noise_std = CONDITIONS[condition].noise_std
     results: dict[int, EpisodeResult] = {}

@@ -31,34 +31,22 @@ def add_scenario(parser: Group, known: str = "") -> None:
 
 
 def add_seed(parser: Group, what: str = "") -> None:
-    """Add ``--seed``; ``what`` says of what."""
     said = f"random seed{what}"
     parser.add_argument("--seed", type=not_negative, default=0, metavar="N", help=said)
 
 
 def add_threads(parser: Group) -> None:
-    parser.add_argument(
-        "--threads",
-        # torch asks the system for as many at once, and dies where it has none.
-        type=whole_number(0, MOST_THREADS),
-        default=0,
-        metavar="N",
-        help="processor threads for PyTorch; 0: its own default",
-    )
+    said = "processor threads for PyTorch; 0: its own default"
+    kind = whole_number(0, MOST_THREADS)
+    parser.add_argument("--threads", type=kind, default=0, metavar="N", help=said)
 
 
 def add_latency(parser: Group, what: str) -> None:
-    """Add ``--latency``, as text."""
-    parser.add_argument(
-        "--latency",
-        metavar="SPEC",
-        default="none",
-        help=f"{what}: {GRAMMAR}".replace("%", "%%"),
-    )
+    said = f"{what}: {GRAMMAR}".replace("%", "%%")
+    parser.add_argument("--latency", metavar="SPEC", default="none", help=said)
 
 
 def add_time_limit(parser: Group, what: str) -> None:
-    """Add ``--max-minutes``; ``what`` says what happens then."""
     text = f"{what} (default: no limit)"
     parser.add_argument("--max-minutes", type=positive_number, metavar="MIN", help=text)
 
@@ -73,13 +61,10 @@ def add_fields(parser: Group, config: Any, *names: str) -> None:
     said = meanings(type(config))
     for name in names:
         option, default = f"--{name.replace('_', '-')}", getattr(config, name)
+        how: dict[str, Any] = {"type": not_negative, "default": default, "metavar": "N"}
         if isinstance(default, bool):
-            said_of_flag = said[name].removeprefix("whether ")
-            parser.add_argument(option, action="store_true", help=said_of_flag)
-        else:
-            parser.add_argument(
-                option, type=not_negative, default=default, metavar="N", help=said[name]
-            )
+            how = {"action": "store_true"}
+        parser.add_argument(option, help=said[name].removeprefix("whether "), **how)
 
 
 def meanings(config: type) -> dict[str, str]:
@@ -98,12 +83,8 @@ def meanings(config: type) -> dict[str, str]:
 
 
 def add_device(parser: Group) -> None:
-    parser.add_argument(
-        "--device",
-        choices=DEVICES,
-        default=DEVICES[0],
-        help="device of the neural networks",
-    )
+    said = "device of the neural networks"
+    parser.add_argument("--device", choices=DEVICES, default=DEVICES[0], help=said)
 
 
 def check_device(device: str) -> None:

@@ -36,8 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     names = ("out", "scenario", "key")
     made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
     signed = "signed" if arguments.key else "not signed"
-    size = f"{len(made.model) / 1e6:.1f} MB"
-    print(f"{arguments.out}: {size}, {signed}, policy_id {made.policy_id}")
+    print(f"{arguments.out}: {signed}, policy_id {made.policy_id}")
     print(f"torch and onnxruntime differ by at most {made.max_difference:.1e}")
     return 0
 
@@ -99,21 +98,15 @@ def export_policy(
     observations = real_observations(env, PARITY_OBSERVATIONS)
     task = task_of(env)
     entries = entries_of(observations, next(iter(task.observation)))
-    about = {
-        "seed": label["seed"],
-        "episodes": label["episode"],
-        "config": training,
-        "source_revision": training.get("source_revision", "unknown"),
-    }
-    graph = _to_onnx(network, entries)
-    model = make_policy(graph, task, label["algorithm"], about)
+    revision = training.get("source_revision", "unknown")
+    about = {"seed": label["seed"], "episodes": label["episode"], "config": training}
+    about |= {"source_revision": revision}
+    model = make_policy(_to_onnx(network, entries), task, label["algorithm"], about)
     difference = parity(network, model, entries)
     allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
     if not difference < allowed:
-        raise UserError(
-            f"onnxruntime and torch differ by {difference:.1e} (allowed: {allowed:.1e}); "
-            "nothing was written"
-        )
+        differ = f"{difference:.1e} (allowed: {allowed:.1e})"
+        raise UserError(f"onnxruntime and torch differ by {differ}")
     return Export(model, policy_id_of(model), difference)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from enum import IntEnum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -75,19 +75,10 @@ def check_ranges(config: Any, ranges: Mapping[Range, Sequence[str]]) -> None:
         name, value = field.name, getattr(config, field.name)
         low, high = named.get(name, FROM_ZERO)
         if value != field.default and not (math.isfinite(value) and low <= value <= high):
-            raise UserError(f"{name} = {value} is out of range: {_text(low, high)}")
-
-
-def _text(low: float, high: float) -> str:
-    if math.isinf(low):
-        return "it must be a finite number"
-    if (low, high) == ABOVE_ZERO:
-        return "it must be above 0"
-    return f"at least {low}" if math.isinf(high) else f"{low} to {high}"
+            raise UserError(f"{name} = {value} is out of range: {low} to {high}")
 
 
 def save_torch(path: Path, state: Any) -> None:
-    """Write a state, whole or not at all."""
     import torch
 
     buffer = io.BytesIO()
@@ -96,10 +87,7 @@ def save_torch(path: Path, state: Any) -> None:
 
 
 def load_torch(path: Path) -> dict[str, Any]:
-    """Read what ``save_torch`` wrote.
-
-    Raises UserError: not such a file. Only tensors and plain values are unpickled.
-    """
+    """Read what ``save_torch`` wrote, else UserError; only tensors and plain values are read."""
     import torch
 
     try:
@@ -112,11 +100,8 @@ def load_torch(path: Path) -> dict[str, Any]:
         if not isinstance(state, dict):
             raise TypeError(type(state))
         return state
-    except (OSError, RuntimeError, ValueError, EOFError) as error:
-        raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
-    except Exception as error:
-        # torch raises unpickling errors of its own for foreign files.
-        raise UserError(f"{path} is not a checkpoint of this project") from error
+    except Exception as error:  # torch raises errors of its own for foreign files.
+        raise UserError(f"{path} is not a checkpoint of this project: {error}") from error
 
 
 @contextmanager
@@ -132,11 +117,9 @@ def fitting(words: str) -> Iterator[None]:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Be the only process of this machine that trains in a directory.
+    """Be the only process of this machine that trains in a directory; UserError where it is not.
 
     A missing directory is made, and removed again if it stays empty.
-
-    Raises UserError: another process trains there, or the directory cannot be made or written.
     """
     made = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
     with held(directory) as mine:
@@ -154,10 +137,7 @@ def claimed(directory: Path) -> Iterator[None]:
 def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
     """Lock a directory against other processes; yield whether that succeeded in ``patience_s``.
 
-    A missing directory is made. The kernel keeps the lock: it ends with the process that holds it,
-    however that dies.
-
-    Raises UserError: the directory cannot be made or written.
+    A missing directory is made, else UserError. The kernel ends the lock with its process.
     """
     make_directory(directory)
     check_writable(directory / ".held")
@@ -208,26 +188,16 @@ def kept(path: str) -> str:
 def source_revision(directory: Path = Path(__file__).parent) -> str:
     """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
 
-    As of the first call: this process does not run what is committed later. The experiments' own
-    output does not count.
+    As of the first call. The experiments' own output does not count.
     """
-    commit = _git(directory, "rev-parse", "HEAD")
-    if commit is None:
+    git = partial(subprocess.run, cwd=directory, capture_output=True, text=True)
+    try:
+        commit = git(["git", "rev-parse", "HEAD"], check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
         return "unknown"
     source = (":/", *(f":(top,exclude){path}" for path in WRITTEN))
-    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", *source) is None
-    return f"{commit}-dirty" if dirty else commit
-
-
-def _git(directory: Path, *arguments: str) -> str | None:
-    """Return git's output; None where it fails."""
-    try:
-        done = subprocess.run(
-            ["git", *arguments], cwd=directory, capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
+    clean = git(["git", "diff", "--quiet", "HEAD", "--", *source]).returncode == 0
+    return commit if clean else f"{commit}-dirty"
 
 
 def cpu_info() -> list[str]:

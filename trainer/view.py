@@ -35,7 +35,7 @@ from bridge.rerun.draw import Canvas, Plot
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.util import UserError, counted
 from trainer.environments import make_environment
-from trainer.human.guide import REASONS, Intervention, Reason
+from trainer.human.guide import BY_PERSON, REASONS, Intervention, Reason
 from trainer.learner.networks import FRAMES_SPACE
 from trainer.learner.replay import Transition
 from trainer.person.interface import Amount, amount, vector
@@ -47,7 +47,6 @@ LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
 MOST_WAITING = 5000
 """Entries, of which ten a second have pictures. A view that is slower loses some; the loop none."""
-APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
 RECENT_STEPS = 200  # Shown of what changes within an episode
 WINDOW = 20  # Episodes of the moving means
@@ -92,6 +91,8 @@ LINES = {
     "speed/ego": draw.BLUE,
     **{path: colour for path, (colour, _) in MEASURED.items()},
 }
+NUMBERS = {"action/policy": "policy_action", "action/applied": "action", "speed/ego": "speed_mps"}
+"""Line -> the field of a step."""
 DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
 
@@ -114,27 +115,10 @@ class ShownEpisode(NamedTuple):
 
     last_step: int
     metrics: EpisodeMetrics
-    has_road: bool = True
 
 
 Entry = ShownStep | ShownEpisode
 Draw = Callable[[Entry], None]
-
-
-def of_training(
-    number: int, seen: Transition, intervention: Intervention | None, speed_mps: float
-) -> ShownStep:
-    """A step of a training, as it is drawn."""
-    reason = None if intervention is None else intervention.reason
-    actions = amount(seen.overruled), amount(seen.action)
-    return ShownStep(number, *actions, speed_mps, reason)
-
-
-def of_sitting(number: int, step: RecordedStep) -> ShownStep:
-    """A recorded step, as it is drawn; a person who drives alone has no policy beside."""
-    policy = math.nan if step.policy_action is None else step.policy_action
-    reason: Reason | None = "person" if step.human else None
-    return ShownStep(number, policy, step.action, step.speed_mps, reason)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -144,20 +128,14 @@ def run(arguments: argparse.Namespace) -> int:
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)
     blueprint = make_blueprint(None, SITTINGS)
-    with open_sink(sink, SITTING_APPLICATION, blueprint, arguments.port) as recording:
-        log, ends = TrainingLog(recording, SITTINGS), list[ShownEpisode]()
+    with open_sink(sink, "phil_hil_sittings", blueprint, arguments.port) as recording:
+        log, episodes, steps = TrainingLog(recording, SITTINGS), 0, 0
         for entry in sitting_entries(paths):
             log.draw(entry)
-            if isinstance(entry, ShownEpisode):
-                ends.append(entry)
+            episodes += isinstance(entry, ShownEpisode)
+            steps += isinstance(entry, ShownStep)
         flush(recording)
-        steps = sum(end.metrics.steps for end in ends)
-        human_steps = sum(end.metrics.human_steps for end in ends)
-        line = f"{counted(len(ends), 'episode')}, {counted(steps, 'step')}, "
-        line += f"{human_steps} of them the person's"
-        if roadless := sum(not end.has_road for end in ends):
-            line += f"; {roadless} without their road"
-        print(line, flush=True)
+        print(f"{counted(episodes, 'episode')}, {counted(steps, 'step')}", flush=True)
         with suppress(KeyboardInterrupt):
             while sink == SERVE:
                 time.sleep(LOOK_S)
@@ -172,7 +150,11 @@ def sitting_entries(paths: Iterable[Path]) -> Iterator[Entry]:
         episode = list(steps)
         road = _drive_again(episode, environment)
         for step, scene in zip(episode, road or [None] * len(episode), strict=True):
-            yield of_sitting(total_steps, step)._replace(frames=step.observation, scene=scene)
+            policy = math.nan if step.policy_action is None else step.policy_action
+            reason = BY_PERSON if step.human else None
+            yield ShownStep(
+                total_steps, policy, step.action, step.speed_mps, reason, step.observation, scene
+            )
             total_steps += 1
         known: dict[str, Any] = {
             "episode": number,
@@ -185,7 +167,7 @@ def sitting_entries(paths: Iterable[Path]) -> Iterator[Entry]:
         }
         # What only a learner knows is nan.
         metrics = EpisodeMetrics(**{**dict.fromkeys(NAMES, math.nan), **known})
-        yield ShownEpisode(total_steps - 1, metrics, bool(road))
+        yield ShownEpisode(total_steps - 1, metrics)
 
 
 def _drive_again(episode: list[RecordedStep], environment: Callable[[str], Any]) -> list[Any]:
@@ -209,7 +191,6 @@ def _drive_again(episode: list[RecordedStep], environment: Callable[[str], Any])
 
 
 def _scene(env: Any) -> Any:
-    """The scene, or what the environment draws where it has none; None where it draws nothing."""
     with suppress(Exception):  # Of any kind: it is somebody else's code, and the training goes on.
         scene = env.scene()
         return env.render() if scene is None else read_scene(scene)
@@ -222,7 +203,7 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
 
     @contextmanager
     def opened() -> Iterator[Draw]:
-        with open_sink(sink, APPLICATION, make_blueprint(None, EPISODES)) as recording:
+        with open_sink(sink, "phil_hil_training", make_blueprint(None, EPISODES)) as recording:
             log = TrainingLog(recording, EPISODES)
             yield log.draw
             log.draw_steps()
@@ -230,18 +211,16 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
     with sigterm_as_interrupt():  # Here, as signals are the main thread's.
         background = Background(opened)
         watcher = Watcher(run, background.put)
-        run.recorders.append(watcher)
+        run.recorders.append(watcher.record)
         try:
             yield watcher.on_episode
         finally:
-            run.recorders.remove(watcher)
+            run.recorders.remove(watcher.record)
             background.close()
-            if background.dropped:
-                print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
 
 
 class Watcher:
-    """Watches one run; ``put`` takes what is to be drawn, and must not block."""
+    """Hands a run's steps over to ``put``, which must not block; with pictures where due."""
 
     def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put, self._steps = run, put, run.steps
@@ -250,15 +229,15 @@ class Watcher:
     def record(
         self, seen: Transition, intervention: Intervention | None, info: dict[str, Any]
     ) -> None:
-        """Hand a step over, with pictures where they are due."""
-        step = of_training(self._steps, seen, intervention, float(info["speed_mps"]))
+        reason = None if intervention is None else intervention.reason
+        actions = amount(seen.overruled), amount(seen.action)
+        step = ShownStep(self._steps, *actions, float(info["speed_mps"]), reason)
         self._steps += 1
         if self._pace.due(time.monotonic()):
             step = step._replace(frames=seen.observation, scene=_scene(self._run.env))
         self._put(step)
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
-        """Hand an episode's end over."""
         self._put(ShownEpisode(max(self._steps - 1, 0), metrics))
 
 
@@ -269,7 +248,6 @@ class Background:
     """
 
     def __init__(self, opened: Callable[[], AbstractContextManager[Draw]]) -> None:
-        self.dropped = 0
         self._opened = opened
         self._queue: queue.Queue[Entry | None] = queue.Queue(MOST_WAITING)
         self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
@@ -277,10 +255,8 @@ class Background:
 
     def put(self, entry: Entry) -> None:
         """Hand an entry over; never blocks."""
-        try:
+        with suppress(queue.Full):
             self._queue.put_nowait(entry)
-        except queue.Full:
-            self.dropped += 1
 
     def close(self) -> None:
         """Draw what still waits, and close the view."""
@@ -349,12 +325,8 @@ class TrainingLog:
         if not steps:
             return
         times = rr.TimeColumn(TIMELINE, sequence=[step.number for step in steps])
-        for path, numbers in (
-            ("action/policy", [step.policy_action for step in steps]),
-            ("action/applied", [step.action for step in steps]),
-            ("speed/ego", [step.speed_mps for step in steps]),
-        ):
-            values = np.array(numbers).reshape(len(steps), -1)
+        for path, name in NUMBERS.items():
+            values = np.array([getattr(step, name) for step in steps]).reshape(len(steps), -1)
             count = values.shape[1]
             self._canvas.name_actions(path, [str(number) for number in range(1, count + 1)])
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([count] * len(steps))
@@ -367,7 +339,6 @@ class TrainingLog:
                 self._canvas.log("driver", rr.StateChange(state=driver))
 
     def _draw_scene(self, scene: Any) -> None:
-        """Draw a road with its cars, a picture, or nothing, in the place of what was there."""
         road = scene if isinstance(scene, SeenScene) else None
         lines = (road.roads, road.path, road.goal) if road else None
         if self._canvas.is_new_ground(lines or (scene is not None) or None):
@@ -395,18 +366,12 @@ class TrainingLog:
         }.items():
             if not math.isnan(value):
                 self._canvas.scalar(path, value)
-        self._canvas.status(_status(metrics))
+        self._canvas.status(
+            [
+                f"# episode {metrics.episode + 1}: {metrics.outcome}",
+                f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
+                f"{counted(metrics.interventions, 'intervention')}, "
+                f"{counted(metrics.human_steps, 'step')} the human's",
+            ]
+        )
         flush(self._canvas.recording)  # Only a flush notices that a viewer has gone.
-
-
-def _status(metrics: EpisodeMetrics) -> list[str]:
-    distance = f"{metrics.distance_m:.1f} m, " * math.isfinite(metrics.distance_m)
-    alone = metrics.validation_success
-    return [
-        f"# episode {metrics.episode + 1}: {metrics.outcome}",
-        f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
-        f"{counted(metrics.interventions, 'intervention')}, "
-        f"{counted(metrics.human_steps, 'step')} the human's",
-        f"{distance}return {metrics.episode_return:.1f}",
-        "" if math.isnan(alone) else f"validation: success {alone:.0%}",
-    ]

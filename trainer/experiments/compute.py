@@ -129,7 +129,7 @@ def _train(job: Job) -> bool:
 
     def after(metrics: EpisodeMetrics) -> None:
         if time.time() > job.stop_at_s:
-            run.quit()
+            run.quitting = True
 
     run.train(after)
     return run.over

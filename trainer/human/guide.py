@@ -30,12 +30,15 @@ class Driver(Protocol):
         ...
 
 
-class Trigger(Protocol):
-    """The activation conditions of section V: when a person would take over."""
+class Expert(Driver, Protocol):
+    """The scripted human of an environment: drives from the true state, and says when to take over.
 
-    def reset(self) -> None:
-        """Forget the last episode, where there is something to forget."""
-        return
+    These are the activation conditions of section V.
+    """
+
+    def act(self, observation: Any = None) -> Action:
+        """Return the expert's action."""
+        ...
 
     def wants_control(self, action: Action) -> Reason | None:
         """Return why a person would take over from ``action`` now, or None. Once a step."""
@@ -44,14 +47,6 @@ class Trigger(Protocol):
     def may_return(self) -> bool:
         """Return whether a person would give the wheel back here: by default anywhere."""
         return True
-
-
-class Expert(Trigger, Protocol):
-    """The scripted human of an environment: drives from the true state, and says when."""
-
-    def act(self, observation: Any = None) -> Action:
-        """Return the expert's action."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -149,9 +144,9 @@ class Asking:
 class Attention:
     """The attention of a human who comes late, or overlooks a reason and then is blind for a while.
 
-    ``late_steps`` are the least and the longest delay in control periods; each take-over's is drawn
-    anew. ``missed_share`` is how often the human notices nothing. A late human takes over from what
-    the policy does by then, and that is what has the penalty.
+    ``late_steps``: least and longest delay in control periods, drawn anew for each take-over;
+    ``missed_share``: how often the human notices nothing. What a late human takes over from, and
+    what is penalised, is what the policy does by then.
     """
 
     BLIND_STEPS = 15
@@ -190,12 +185,9 @@ class PoorHands:
         """Return the action, or a wrong one in its place."""
         if self.random.random() >= self.share:
             return action
-        wrong = (
-            self.random.uniform(-1.0, 1.0, action.shape)
-            if self.biased is None
-            else np.full(action.shape, self.biased)
-        )
-        return wrong.astype(np.float32)
+        if self.biased is not None:
+            return np.full(action.shape, self.biased, np.float32)
+        return self.random.uniform(-1.0, 1.0, action.shape).astype(np.float32)
 
 
 def steps_held(period_s: float) -> int:
@@ -206,15 +198,15 @@ def steps_held(period_s: float) -> int:
 class HumanGuide(Guide):
     """Turns the trigger of a scripted human and a driver into interventions.
 
-    The human stays in control for ``hold_steps`` from the last reason for it. A second and a half:
-    a person first brings the car out of what made them take over. Where the robot asks, it is a
-    third of that: nothing is wrong yet. At the wheel every human is attentive.
+    The human stays in control for ``hold_steps`` from the last reason for it: a person first brings
+    the car out of what made them take over. Where the robot asks, it is a third of that: nothing is
+    wrong yet. At the wheel every human is attentive.
     """
 
     def __init__(
         self,
         driver: Driver,
-        trigger: Trigger,
+        trigger: Expert,
         hold_steps: int,
         attention: Attention | None = None,
         asking: Asking | None = None,

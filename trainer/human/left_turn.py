@@ -167,16 +167,14 @@ class LeftTurnHuman(Expert):
         else:
             margin_m = self.KEEP_MARGIN_M if self.going else self.START_MARGIN_M
             self.going = self.crossing.clear(self.HORIZON_S, margin_m, self.GO)
-        return np.array([self._go() if self.going else self._wait()], dtype=np.float32)
+        go = min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
+        return np.array([go if self.going else self._wait()], dtype=np.float32)
 
     def _beyond_return(self) -> bool:
         """Whether even full brake would leave the nose in the lane."""
         env = self.env
         stopping_m = env.ego.speed**2 / (2.0 * env.config.brake_mps2)
         return env.distance_m + stopping_m > self.POINT_OF_NO_RETURN_M
-
-    def _go(self) -> float:
-        return min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
 
     def _wait(self) -> float:
         """Slow down with the distance to the line, and stand there."""
@@ -219,15 +217,13 @@ class LeftTurnHuman(Expert):
         """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
         crossing = self.crossing
         stop = PedalPlan(pedal, self.HOLD_S, then_brake=self.RESCUE_BRAKE)
-        if crossing.state_after(self.HORIZON_S, stop)[0] <= self.STOP_BY_M or self._stays(pedal):
+        before_m = self.POINT_OF_NO_RETURN_M - self.env.distance_m
+        if pedal <= 0.0 and self.env.ego.speed == 0.0 and before_m >= 0.0:  # It goes on standing.
+            return True
+        if crossing.state_after(self.HORIZON_S, stop)[0] <= self.STOP_BY_M:
             return True
         go = PedalPlan(pedal, self.HOLD_S, then_mps=self.CRUISE_MPS)
         return crossing.clear(self.HORIZON_S, self.RESCUE_MARGIN_M, go)
-
-    def _stays(self, pedal: float) -> bool:
-        """Whether the car stands outside of the lane, and goes on standing."""
-        ego_at_m, last_m = self.env.distance_m, self.POINT_OF_NO_RETURN_M
-        return pedal <= 0.0 and self.env.ego.speed == 0.0 and ego_at_m <= last_m
 
 
 class SlowHuman(LeftTurnHuman):

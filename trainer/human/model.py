@@ -31,9 +31,8 @@ REFINING_PARTS = 20  # Steps in which the learning rate falls while a model is r
 class HumanModel(Driver):
     """A regression of the human's action on the picture (eq. 24 to 27).
 
-    Until the first intervention it is an untrained policy network (eq. 25, with table A4's one
-    frame), and ``learn`` does nothing. Then it learns a little after each episode (eq. 27) from all
-    of the human's steps so far: data aggregation.
+    Until the first intervention it is an untrained policy network (eq. 25). Then it learns a little
+    after each episode (eq. 27) from all of the human's steps so far: data aggregation.
     """
 
     def __init__(
@@ -107,10 +106,7 @@ class HumanModel(Driver):
 
 
 def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
-    """Load a HUMAN_DIR: its network and all else that it holds.
-
-    Raises UserError: it holds no human model of ``env``.
-    """
+    """Load a HUMAN_DIR: its network and all else; UserError: it holds no human model of ``env``."""
     path = directory / MODEL_FILE
     state = load_torch(path)
     with util.fitting(f"{path} is not a human model of this project"):
@@ -121,7 +117,6 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train the model, showing progress; return the exit status."""
     options.set_threads(arguments.threads)
     if arguments.recordings is not None and arguments.label_every_step:
         raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
@@ -138,8 +133,8 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
     end_s = options.deadline_s(arguments.max_minutes)
     env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
-    size, space = env.action_space.shape[0], env.observation_space
-    model = HumanModel(config, arguments.seed, size, space)
+    shape, space = env.action_space.shape, env.observation_space
+    model = HumanModel(config, arguments.seed, shape[0], space)
     if arguments.recordings is None:
         episodes = imitate(model, env, arguments.seed)
     else:
@@ -212,11 +207,10 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
 
 
 def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:
-    """Give the model every recorded step in which the person was in control.
+    """Give the model every recorded step in which the person was in control; count take-overs.
 
-    During a hand-over the model gets the hands' action, not the blend that was applied; on the way
-    back to the policy the hands have let go. Returns the number of take-overs; a whole episode
-    driven alone counts as one. UserError: another scenario, or nobody drove.
+    During a hand-over the model gets the hands' action, not the blend that was applied. An episode
+    driven alone counts as a take-over. UserError: another scenario, or nobody drove.
     """
     interventions = 0
     for path in recordings:

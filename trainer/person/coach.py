@@ -61,7 +61,7 @@ class Coaching:
 
 
 class Coach:
-    """Collects what happens. ``learning``: something does, so there is something to advise."""
+    """Collects what happens; it advises where something is ``learning``."""
 
     def __init__(self, typical: Curve | None = None, learning: bool = False) -> None:
         self.typical, self.learning = typical or [], learning
@@ -76,8 +76,10 @@ class Coach:
         for row in rows:
             human_s = int(row["human_steps"]) * period_s
             given_s += human_s
-            known = int(row["episode"]), row["outcome"], human_s, int(row["interventions"])
-            self.episodes.append(SittingEpisode(*known))
+            takeovers = int(row["interventions"])
+            self.episodes.append(
+                SittingEpisode(int(row["episode"]), row["outcome"], human_s, takeovers)
+            )
             if was_validated(row):
                 self.curve.append((given_s, float(row["validation_success"])))
 
@@ -117,8 +119,8 @@ def advise(
 ) -> str:
     """Return one line of advice, by the first rule that fits; an empty text where none does.
 
-    ``alone`` is the newest success of the policy alone, 0 to 1, where it is known; ``mastered``:
-    episode -> whether the policy alone reaches the goal in it today.
+    ``alone``: newest success of the policy alone, 0 to 1; ``mastered``: episode -> whether the
+    policy alone reaches the goal in it today.
     """
     if alone is not None and is_reached(LEARNED, alone):
         what = "you may stop here" if is_reached(WELL, alone) else "watch only"
@@ -139,9 +141,8 @@ def advise(
 
 
 def said(cost: Mapping[str, float], curve: Curve, typical: Curve) -> str:
-    """Say what the person has given so far, and after how much of it the policy alone had learned.
-
-    Beside it stands how much a scripted human had given by then.
+    """Say what the person has given, and after how much of it the policy alone had learned,
+    beside a scripted human.
     """
     given = (
         f"{cost['human_s']:.0f} s at the wheel, {counted(int(cost['takeovers']), 'take-over')}, "
@@ -160,5 +161,5 @@ def typical_curve(scenario: str, algorithm: str) -> Curve:
 
     ``python -m trainer experiment typical`` makes the file from the experiments' records.
     """
-    known = json.loads(TYPICAL_FILE.read_text()).get(scenario, {}).get(algorithm, {"points": []})
-    return [(human_s, success) for human_s, success in known["points"]]
+    known = json.loads(TYPICAL_FILE.read_text()).get(scenario, {}).get(algorithm, {})
+    return [(human_s, success) for human_s, success in known.get("points", [])]

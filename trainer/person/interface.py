@@ -28,10 +28,6 @@ WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
 """What decides the applied action; ``returning``: the person has let go, and the action is on its
 way back to the policy's, which still counts as the person's."""
-WISH_HELP = (
-    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
-    "    Q: quit, all is kept"
-)
 PERSON = "person"  # ``RunConfig.human`` of a run that a person guides
 
 
@@ -99,16 +95,13 @@ class View:
 class Person(Protocol):
     """Hands and eyes: a device to ask, a display to show.
 
-    The loop's thread calls all of it, about once a control period; nothing may block for longer
-    than a few milliseconds.
+    The loop's thread calls all of it, once a control period; nothing may block for longer than a
+    few milliseconds.
     """
 
     @property
     def present(self) -> bool:
-        """Whether a browser has the wheel.
-
-        Before an episode the loop waits for it; within one, an absent person has let go.
-        """
+        """Whether a browser has the wheel: an episode waits for it."""
 
     def poll(self, now_s: float) -> Reading:
         """Return the hands at ``now_s`` (``time.monotonic``); at rest without a device."""
@@ -133,8 +126,7 @@ def add_person(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
     here = "address on which the cockpit listens; by default only this machine reaches it"
     port = "port of the cockpit; 0: any free port"
-    said = f"a number from {SLOWEST} to {FASTEST}"
-    speed = number(said, lambda value: SLOWEST <= value <= FASTEST)
+    speed = number(f"a number from {SLOWEST} to {FASTEST}", lambda x: SLOWEST <= x <= FASTEST)
     slow = "simulated seconds in a real second; 0.5 is slow motion"
     group.add_argument("--host", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)
@@ -150,7 +142,7 @@ def check_person_options(arguments: argparse.Namespace) -> None:
 
 
 def open_person(arguments: argparse.Namespace) -> Person:
-    """Open the browser cockpit; raises UserError where it cannot be served."""
+    """Open the browser cockpit; UserError where it cannot be served."""
     from trainer.person.web import open_cockpit  # aiohttp takes a third of a second to load
 
     return open_cockpit(arguments)
@@ -178,15 +170,13 @@ class Controls:
     @property
     def help(self) -> str:
         """A line for the page: which key does what."""
-        held: dict[Amount, list[str]] = {}
+        held: dict[str, list[str]] = {}
         for key in self.keys:
-            held.setdefault(self.mix({key: 1.0}), []).append(key.capitalize())
-        what = (f"{' / '.join(keys)}: {_text(self.names, act)}" for act, keys in held.items())
+            action = zip(self.names, vector(self.mix({key: 1.0})), strict=True)
+            words = ", ".join(f"{name} {value:+g}" for name, value in action)
+            held.setdefault(words, []).append(key.capitalize())
+        what = (f"{' / '.join(keys)}: {words}" for words, keys in held.items())
         return "    ".join(["hold to take over", *what, "Space: hands off"])
-
-
-def _text(names: tuple[str, ...], action: Amount) -> str:
-    return ", ".join(f"{n} {v:+g}" for n, v in zip(names, vector(action), strict=True))
 
 
 @cache
@@ -194,11 +184,9 @@ def controls_of(scenario: str) -> Controls:
     """Return the controls of an environment; UserError where a person cannot drive it."""
     with closing(make_environment(scenario)) as env:
         if isinstance(env, Adapted) and not env.can_be_seen:
-            what = "it offers no render() and no scene()"
-            raise UserError(f"a person cannot see {scenario}: {what}")
+            raise UserError(f"a person cannot see {scenario}: it has no render() and no scene()")
         if not env.keys:
-            what = "it has several actions, and no keys"
-            raise UserError(f"a person cannot drive {scenario}: {what}")
+            raise UserError(f"a person cannot drive {scenario}: several actions, and no keys")
         rest = amount(env.rest_action)
         keys = {
             name.lower().removeprefix("arrow").removeprefix("key"): amount(np.subtract(held, rest))
@@ -206,6 +194,5 @@ def controls_of(scenario: str) -> Controls:
         }
         controls = Controls(keys, rest, env.key_rate_per_s, tuple(env.action_names))
     if taken := sorted(RESERVED & keys.keys()):
-        what = "pause, restart, discard, quit or hold without driving"
-        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which {what}: name others")
+        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which are the cockpit's")
     return controls

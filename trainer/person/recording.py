@@ -2,9 +2,8 @@
 
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on; its messages are whole transitions
 (``RecordedStep``) in MessagePack. Each step is a chunk of its own, handed to the operating system
-at once. So whatever ends the process, at most one step is lost: the one that was being taken, or an
-episode's last, which says whether the person discarded it. 30 minutes are about 14 MB. Nothing is
-ever overwritten: sittings add up.
+at once, so a kill loses at most one step: the one that was being taken, or an episode's last, which
+says whether the person discarded it. 30 minutes are about 14 MB. Nothing is ever overwritten.
 """
 
 import io
@@ -60,12 +59,11 @@ class RecordedStep(msgspec.Struct, frozen=True):
 
     @property
     def observation(self) -> NDArray[Any]:
-        """s; of our scenarios uint8 [2, 45, 80]."""
+        """State s; of our scenarios uint8 [2, 45, 80]."""
         return _unpacked(self.seen)
 
     @property
     def next_observation(self) -> NDArray[Any]:
-        """s', likewise."""
         return _unpacked(self.seen_next)
 
     @property
@@ -113,7 +111,7 @@ class Recorder:
             self.write(msgspec.structs.replace(step, outcome=outcome))
 
     def write(self, step: RecordedStep) -> None:
-        """Write a step; from here on no kill takes it away. UserError on a full disk."""
+        """Write a step, which no kill then takes away. UserError on a full disk."""
         data, index = msgspec.msgpack.encode(step), self.index
         self.index += 1
         with self._one_line():

@@ -22,7 +22,7 @@ from bridge.outcomes import GOAL
 from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory
-from edge_runtime.util import UserError, counted
+from edge_runtime.util import UserError
 from trainer.drivers import TogetherDriver
 from trainer.human.guide import BY_PERSON, Intervention, Stepped, make_transition
 from trainer.learner.config import find_algorithm
@@ -30,40 +30,31 @@ from trainer.learner.networks import Actor
 from trainer.person.coach import Coach, typical_curve
 from trainer.person.interface import open_person, vector
 from trainer.person.recording import DIRECTORY, RecordedStep, Recorder, read_episodes, steps_since
-from trainer.person.session import PacedEnvironment, Sitting, SittingRecorder
+from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
 from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_vehicle
 from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_blocked
 
-PRETENDED = ("poor_guidance_share", "late_to_s", "missed_share")
-"""What makes a scripted human imperfect."""
-
 
 @contextmanager
 def training_with_person(
     arguments: argparse.Namespace, config: RunConfig, run_dir: Path
 ) -> Iterator[tuple[TrainingRun, Sitting]]:
-    """A run with a person as its guide; everything is kept, whatever ends it.
-
-    The recordings go into ``sittings`` in the run's directory, and a resumed run stores what was
-    recorded after its checkpoint.
-    """
+    """Open a run with a person as its guide; a resumed one stores what was recorded since."""
     check_settings(config)
     with ExitStack() as stack:
         person = stack.enter_context(closing(open_person(arguments)))
         make_directory(run_dir)
         env, delayed = make_vehicle(config)
-        recorder = Recorder(run_dir / DIRECTORY)
-        sitting = Sitting(person, env, recorder, speed=arguments.speed)
+        sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
         validation = PersonValidation(config, run_dir, learning, sitting)
         stack.enter_context(closing(validation))
         vehicle = PacedEnvironment(delayed or env, sitting)
-        recorders = [SittingRecorder(vehicle)]
-        parts = Parts(env, delayed, vehicle, sitting, learning, validation, [*recorders])
+        parts = Parts(env, delayed, vehicle, sitting, learning, validation, [sitting.record])
         training = TrainingRun(config, run_dir, arguments.resume, parts)
         if arguments.resume:
             _recover(training, sitting)
@@ -84,8 +75,8 @@ def _recover(training: TrainingRun, sitting: Sitting) -> None:
         steps += len(episode)
         human += sum(step.human for step in episode)
     if steps:
-        back = f"{steps} recorded steps after the checkpoint, {human} of them yours, are back"
-        print(back, file=sys.stderr)
+        yours = f"{human} of them yours"
+        print(f"{steps} recorded steps after the checkpoint, {yours}, are back", file=sys.stderr)
     # Episodes that ended after the checkpoint count: the person gave what their rows say.
     if ended := read_metrics(training.run_dir)[training.episode :]:
         training.episode += len(ended)
@@ -111,10 +102,13 @@ def _recall(training: TrainingRun, sitting: Sitting) -> None:
     period_s = training.env.control_period_s
     before = read_metrics(training.run_dir)[: training.episode]
     given = spent(before, period_s)
-    given["failures"] = sum(given["failures"].values())
     sitting.episode = training.episode
     sitting.ended = [row["outcome"] for row in before]
-    sitting.cost.update({name: given[name] for name in sitting.cost})
+    sitting.cost = {
+        "human_s": given["human_s"],
+        "takeovers": given["takeovers"],
+        "failures": sum(given["failures"].values()),
+    }
     curve = typical_curve(training.config.scenario, training.config.algorithm)
     sitting.coach = Coach(curve, learning=True)
     sitting.coach.recall(before, period_s)
@@ -130,15 +124,17 @@ def check_settings(config: RunConfig) -> None:
     if config.guided_share != 1 or config.guided_until_episode or config.guided_until_step:
         wanted = "guided_share must be 1, guided_until_episode and guided_until_step 0"
         raise UserError(f"a person watches every episode: {wanted}")
-    for name in PRETENDED:
-        if getattr(config, name):
-            raise UserError(f"a person's actions are not replaced: {name} must be 0")
+    if config.poor_guidance_share or config.late_to_s or config.missed_share:
+        wanted = "poor_guidance_share, late_to_s and missed_share must be 0"
+        raise UserError(f"a person's actions are not replaced: {wanted}")
 
 
 class Candidate(NamedTuple):
+    """An actor, after so many episodes and so much of the person's time."""
+
     actor: Actor
-    episode: int  # So many had been driven
-    human_s: float  # So much had the person given
+    episode: int
+    human_s: float
     seeds: dict[int, int]
     """Episode -> its seed, of those that the policy is to try, beside the validation's own."""
 
@@ -154,25 +150,17 @@ class PersonValidation(Validation):
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        sitting = self.sitting
-        human_s = sum(each.human_s for each in sitting.driven)
-        takeovers = sum(each.takeovers for each in sitting.driven)
-        sitting.progress = (
-            f"{counted(self.learning.added, 'step')} stored, "
-            f"{round(human_s / sitting.env.control_period_s)} yours in "
-            f"{counted(takeovers, 'intervention')} of this sitting; "
-            f"{self.learned(metrics.critic_loss)}, return {metrics.episode_return:.1f}"
-        )
+        learned = self.learned(metrics.critic_loss)
+        self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}"
         if not at_end:
             self._beside(metrics, episode, due)
             return
-        runs, every = self.config.evaluation_runs, self.config.evaluate_every_steps
+        every = self.config.evaluate_every_steps
         try:
-            sitting.close()
+            self.sitting.close()
             self.close()
             if every:
-                said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
-                print(said, file=sys.stderr, flush=True)
+                print("validating; all is saved, ^C leaves it out", file=sys.stderr, flush=True)
             with sigterm_as_interrupt():  # SIGHUP, too: this episode's row is to be written.
                 super().after(metrics, episode, bool(every), at_end)
         except KeyboardInterrupt:
@@ -180,14 +168,12 @@ class PersonValidation(Validation):
                 print("validation left out", file=sys.stderr)
 
     def learned(self, critic_loss: float) -> str:
-        """Return what the learner did in an episode: nothing before its warm-up is over."""
         added, warmup = self.learning.added, self.config.learner.warmup_steps
         if added < warmup:
             return f"not learning yet ({added} of {warmup} steps)"
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
     def close(self) -> None:
-        """Break off what is under way beside the person."""
         self._behind.close()
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
@@ -206,8 +192,7 @@ class PersonValidation(Validation):
                 number: episode_seed(self.config.seed, Purpose.TRAINING, number)
                 for number in coach.to_check()
             }
-            given_s = self.sitting.cost["human_s"]
-            self._behind.begin(Candidate(actor, episode, given_s, seeds))
+            self._behind.begin(Candidate(actor, episode, self.sitting.cost["human_s"], seeds))
         coach.checking = self._behind.busy
 
 
@@ -221,7 +206,6 @@ class BehindTheScenes:
 
     @property
     def busy(self) -> bool:
-        """Whether a validation is under way."""
         return self._begun is not None and not self._begun[1].done()
 
     def begin(self, candidate: Candidate) -> None:
@@ -236,9 +220,7 @@ class BehindTheScenes:
             self._begun = None  # It was killed; `take` has said so.
 
     def take(self) -> tuple[Candidate, list[EpisodeResult]] | None:
-        """Return what the validation that was begun has come to; None where there is nothing new,
-        or it failed: then it says why on stderr.
-        """
+        """Return a validation's result; None: nothing new, or it failed, as stderr then says."""
         if self._begun is None or self.busy:
             return None
         (candidate, answer), self._begun = self._begun, None
@@ -252,7 +234,6 @@ class BehindTheScenes:
         self._process.shutdown(cancel_futures=True)
 
     def kill(self) -> None:
-        """End the process at once, whatever it does."""
         for process in list((self._process._processes or {}).values()):
             process.kill()
 
@@ -269,7 +250,6 @@ def _without_script() -> Iterator[None]:
 
 
 def _start_validating() -> None:
-    """Begin the process: aside of the loop, and to end with it."""
     threading.Thread(target=die_with_parent, daemon=True).start()
     os.nice(NICENESS)
     torch.set_num_threads(1)

@@ -1,6 +1,6 @@
 """A sitting: a person at the wheel beside a loop, which is paced, shown and recorded for them.
 
-`Sitting` is the loop's guide, `PacedEnvironment` what it drives, `SittingRecorder` its recorder.
+`Sitting` is the loop's guide and its recorder, `PacedEnvironment` what the loop drives.
 """
 
 import argparse
@@ -44,16 +44,12 @@ from trainer.util import Purpose, episode_seed
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
 """What an environment's scene may leave out."""
-LATE_S = 0.02
-"""A control period that begins later than this counts as late: a fifth of a period, about what a
-person notices."""
+LATE_S = 0.02  # A control period that begins later than this counts as late: a person notices
 
 
 class Pacer:
-    """Keeps absolute deadlines, so that one delay does not make every later period late.
-
-    A delay of less than a period is caught up. After a longer one the deadlines begin anew: a car
-    that leaps through what was missed cannot be driven.
+    """Keeps absolute deadlines. A delay of less than a period is caught up; after a longer one the
+    deadlines begin anew: a car that leaps through what was missed cannot be driven.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -62,12 +58,10 @@ class Pacer:
         self.restart()
 
     def restart(self) -> None:
-        """Let the next period begin one period from now: after a pause, or a new episode."""
         self._deadline_s = time.monotonic() + self.period_s
 
     def wait(self) -> None:
-        # A signal that another thread took does not wake Python's main thread. A period is short
-        # enough to notice it afterwards.
+        # A signal that another thread took does not wake the main thread: it is noticed afterwards.
         while (left_s := self._deadline_s - time.monotonic()) > 0.0:
             time.sleep(left_s)
         self.late += -left_s > LATE_S
@@ -107,7 +101,6 @@ class Sitting(Guide):
         self._forget()
 
     def _forget(self) -> None:
-        """Set the state of an episode's beginning."""
         self._step = self._human_steps = self._takeovers = self._read_ns = 0
         self._taken_over_at = math.nan  # The step at which the last take-over began
         self._take_over = TakeOver()
@@ -119,9 +112,9 @@ class Sitting(Guide):
         self._control: Control = "human" if self.alone else "policy"
         self._restart = self._discard = False
 
-    def begin(self, observation: Observation, info: dict[str, Any]) -> None:
+    def begin(self, seed: int, observation: Observation, info: dict[str, Any]) -> None:
         """Start an episode as soon as the person is there; GuideGone where the person quits."""
-        self._seen = observation, info
+        self._seed, self._seen = seed, (observation, info)
         self._forget()
         while not self.person.present and not self.stop:
             self._idle("waiting for the person's device")
@@ -159,7 +152,7 @@ class Sitting(Guide):
             self.applied, self._control = hands, "human"
         else:  # The car rolls, and that demonstrates nothing.
             self._intervention, self.applied, self._control = None, self._rest, "policy"
-        self.moment, self.read_ns = self._now(), self._read_ns
+        self._moment = {**self._now(), "time_ns": self._read_ns}
         return self._intervention
 
     def moved(self, observation: Observation, info: dict[str, Any]) -> str:
@@ -168,12 +161,35 @@ class Sitting(Guide):
         if self._intervention is not None:
             self._human_steps += 1
             self.cost["human_s"] += self.env.control_period_s
-        if self._intervention is not None and self._intervention.first:
-            self._takeovers += 1
-            self._taken_over_at = float(self._step)
-            self.cost["takeovers"] += 1
+            if self._intervention.first:
+                self._takeovers += 1
+                self._taken_over_at = float(self._step)
+                self.cost["takeovers"] += 1
         self._step += 1
         return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
+
+    def record(
+        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
+    ) -> None:
+        """Keep a control period: the transition, and what the person did; UserError: disk full."""
+        self.recorder.add(
+            RecordedStep(
+                **self._moment,
+                sitting=self.recorder.sitting,
+                index=self.recorder.index,
+                seed=self._seed,
+                seen=packed(transition.observation),
+                seen_next=packed(transition.next_observation),
+                action=self.applied,
+                human=transition.human,
+                first=intervention is not None and intervention.first,
+                reward=float(transition.reward),
+                terminated=transition.terminal,
+                truncated=transition.truncated,
+                outcome=info.get("outcome", ""),
+                ahead=tuple(map(packed, transition.foreseen[1:])),
+            )
+        )
 
     def end_episode(self, outcome: str) -> str:
         """Show how the episode ended, which the person may still discard; return how it ended."""
@@ -222,19 +238,15 @@ class Sitting(Guide):
         """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
-        kept = [episode for episode in self.driven if episode.outcome != DISCARDED]
-        discarded = len(self.driven) - len(kept)
-        steps = round(sum(episode.human_s for episode in kept) / self.env.control_period_s)
+        discarded = sum(episode.outcome == DISCARDED for episode in self.driven)
         return (
-            f"{counted(len(kept), 'episode')}, "
-            + f"{counted(discarded, 'episode')} discarded, " * bool(discarded)
-            + f"{counted(sum(episode.takeovers for episode in kept), 'intervention')}, "
-            f"{counted(steps, 'step')} yours, "
+            f"{counted(len(self.driven) - discarded, 'episode')}, "
+            f"{counted(discarded, 'episode')} discarded, "
             f"{counted(self.pacer.late, 'control period')} late: {self.recorder.path}"
         )
 
     def quit(self) -> bool:
-        """Ask for the end of the sitting; False where it is over already."""
+        """End the sitting; False where it is over already."""
         self.stop = self.stop or not self.closed
         return not self.closed
 
@@ -246,8 +258,7 @@ class Sitting(Guide):
         self.person.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return how far the recording is, for a checkpoint; the person sees why nothing moves."""
-        self.show("saving")
+        self.show("saving")  # The person sees why nothing moves.
         return {"recorded": [self.recorder.sitting, self.recorder.index]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -273,7 +284,6 @@ class Sitting(Guide):
         }
 
     def _read(self) -> None:
-        """Read the hands, and note their wishes."""
         self._read_ns = time.time_ns()
         self._reading = self.person.poll(time.monotonic())
         wishes = self._reading.wishes
@@ -299,8 +309,7 @@ class PacedEnvironment:
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; GuideGone where the person quits before it begins."""
         observation, info = self.env.reset(seed=seed)
-        self.seed = seed
-        self.sitting.begin(observation, info)
+        self.sitting.begin(seed, observation, info)
         return observation, info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -311,44 +320,7 @@ class PacedEnvironment:
         return observation, reward, terminated, truncated, info
 
 
-class SittingRecorder:
-    """Keeps every control period of a sitting: the transition, and what the person did in it."""
-
-    def __init__(self, vehicle: PacedEnvironment) -> None:
-        self._vehicle, self._sitting = vehicle, vehicle.sitting
-
-    def record(
-        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
-    ) -> None:
-        """Keep a control period; UserError on a full disk."""
-        sitting = self._sitting
-        recorder = sitting.recorder
-        recorder.add(
-            RecordedStep(
-                **sitting.moment,
-                sitting=recorder.sitting,
-                index=recorder.index,
-                seed=self._vehicle.seed,
-                time_ns=sitting.read_ns,
-                seen=packed(transition.observation),
-                seen_next=packed(transition.next_observation),
-                action=sitting.applied,
-                human=transition.human,
-                first=intervention is not None and intervention.first,
-                reward=float(transition.reward),
-                terminated=transition.terminal,
-                truncated=transition.truncated,
-                outcome=info.get("outcome", ""),
-                ahead=tuple(map(packed, transition.foreseen[1:])),
-            )
-        )
-
-
-SeedOf = Callable[[int], int]  # Of an episode, given its number over all sittings
-
-
 def run(arguments: argparse.Namespace) -> int:
-    """Drive until the person quits; return the exit status."""
     set_threads(arguments.threads)
     arguments.policy = arguments.policy and located(arguments.policy)
     env, seed_of = _environment(arguments)
@@ -359,22 +331,26 @@ def run(arguments: argparse.Namespace) -> int:
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
     with closing(env), closing(open_person(arguments)) as person:
-        made = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
-        with closing(made) as sitting, quit_on_signals(sitting.quit):
+        sitting = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
+        with closing(sitting), quit_on_signals(sitting.quit):
             drive(sitting, policy, seed_of, arguments.episodes)
     print(f"outcomes: {_listed(sitting) or 'none'}; {sitting.summary()}")
     return 0
 
 
 def drive(
-    sitting: Sitting, policy: Driver | None, seed_of: SeedOf, episodes: int | None = None
+    sitting: Sitting,
+    policy: Driver | None,
+    seed_of: Callable[[int], int],
+    episodes: int | None = None,
 ) -> None:
-    """Drive until the person quits, or so many episodes (None: no end).
+    """Drive so many episodes, or until the person quits.
 
     The policy drives until the person takes over; without one, the person drives alone.
+    ``seed_of``: an episode's number over all sittings -> its seed.
     """
     vehicle = PacedEnvironment(sitting.env, sitting)
-    recorder, number = SittingRecorder(vehicle), sitting.recorder.sitting
+    number = sitting.recorder.sitting
     while not sitting.stop and sitting.episode != episodes:
         try:
             observation, info = vehicle.reset(seed=seed_of((number << 32) + sitting.episode))
@@ -390,7 +366,7 @@ def drive(
             stepped = vehicle.step(action)
             step = make_transition(observation, policy_action, action, intervention, stepped)
             observation, info = step.next_observation, stepped[-1]
-            recorder.record(step, intervention, info)
+            sitting.record(step, intervention, info)
             ended = step.terminal or step.truncated
         sitting.end_episode(info["outcome"])
         sitting.progress = _listed(sitting)
@@ -401,15 +377,13 @@ def _listed(sitting: Sitting) -> str:
     return ", ".join(f"{count} {word}" for word, count in outcomes.items())
 
 
-def _environment(asked: argparse.Namespace) -> tuple[Any, SeedOf]:
+def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
     """Make what is driven: episodes that are others in every sitting, or one recorded drive's."""
     if asked.recording is None:
         if asked.at or asked.episode is not None or asked.vehicle_id:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
-        period_s = None
-        if asked.policy is not None:
-            _, period_s = trained_in(asked.policy, asked.public_key)
+        period_s = asked.policy and trained_in(asked.policy, asked.public_key)[1]
         scenario = asked.scenario or "left_turn"
         controls_of(scenario)  # Now: of some simulators only one may live, and this closes its own.
         return make_environment(scenario, period_s=period_s), seed_of

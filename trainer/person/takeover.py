@@ -24,15 +24,12 @@ from trainer.person.interface import (
 
 SILENCE_S = 0.5  # A driver who is not heard for this long has let go
 MAX_SLEW = 0.5
-"""The most that the action changes in a control period of a hand-over. From full throttle to full
-brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
+"""Most change of the action in a control period of a hand-over. From full throttle to full brake
+takes 0.4 s: about what a foot needs from pedal to pedal."""
 MOVED = 0.15
 """How far from rest a wheel or a pedal must be to take over."""
-RESTING = 0.05
-"""Below this it rests. Less than ``MOVED``, so that a hand that trembles there does not take over
-time and again."""
-REST_S = 0.6
-"""How long it must rest to hand control back: a wheel passes its middle in every bend."""
+RESTING = 0.05  # Below this it rests; less than MOVED, for a hand that trembles there
+REST_S = 0.6  # How long it must rest to hand control back: a wheel passes its middle in every bend
 State = Literal["policy", "taking", "human", "returning"]
 NEXT: dict[tuple[State, bool], tuple[State, State]] = {
     ("policy", True): ("taking", "human"),
@@ -58,7 +55,6 @@ class TakeOver:
 
     @property
     def control(self) -> Control:
-        """What decides the applied action."""
         return "human" if self.state == "taking" else self.state
 
     def step(self, policy_action: Amount, human_action: Amount, holds: bool) -> Intervention | None:
@@ -156,12 +152,10 @@ class Seat:
             self._pages = [other for other in self._pages if other != page]
 
     def is_driver(self, page: object) -> bool:
-        """Return whether ``page`` has the wheel."""
         with self._lock:
             return self._pages[:1] == [page]
 
     def is_heard(self, now_s: float) -> bool:
-        """Return whether the driver was heard lately."""
         with self._lock:
             return now_s - self._heard_s <= SILENCE_S
 
@@ -198,7 +192,6 @@ class Seat:
             return Reading(said.action, said.engaged, wishes, said.by_moving)
 
     def _wants(self, said: Reading) -> bool:
-        """Return whether something is held, or a wheel or a pedal moved."""
         return said.engaged or moved(said, self._rest)
 
     def _let_go(self) -> None:

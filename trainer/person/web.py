@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import errno
 import hmac
 import io
 import logging
@@ -34,7 +33,7 @@ from PIL import Image
 from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
-from trainer.person.interface import WISH_HELP, Reading, View, controls_of
+from trainer.person.interface import Reading, View, controls_of
 from trainer.person.takeover import Input, Seat
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
@@ -60,9 +59,12 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """The address holds the token: no browser may keep it, pass it on, or frame the page."""
-NO_PAGE = "no such page\n"
-NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
-NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
+OPEN_THE_PRINTED_ONE = "The cockpit has another address: open the one that the trainer printed.\n"
+HINTS = (
+    "or slide on the pad, or use a gamepad or wheel",
+    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
+    "    Q: quit, all is kept",
+)
 INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
 LOGGER = logging.getLogger(__name__)
@@ -75,17 +77,12 @@ def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
     host = arguments.host
     cockpit = Cockpit(host, arguments.port, arguments.scenario)
     if host not in LOOPBACK:
-        print(
-            f"warning: --host {host}: whoever reads this network's traffic can take the wheel; "
-            f"safer: leave it out, and ssh -L {cockpit.port}:127.0.0.1:{cockpit.port} from the "
-            "browser's machine",
-            file=sys.stderr,
-        )
+        danger = "whoever reads this network's traffic can take the wheel; ssh -L is safer"
+        print(f"warning: --host {host}: {danger}", file=sys.stderr)
     print(f"cockpit: open {cockpit.url}", flush=True)
     if has_display():
-        # In a thread, for it waits for some browsers.
-        args = (cockpit.one_time_url(),)
-        threading.Thread(target=webbrowser.open, args=args, daemon=True).start()
+        url = cockpit.one_time_url()  # In a thread, for it waits for some browsers.
+        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
     if cockpit.phone_url:
         print(f"on a phone in this network: {cockpit.phone_url}", flush=True)
         if sys.stdout.isatty():
@@ -112,15 +109,13 @@ class Cockpit:
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
-        hint = "or slide on the pad, or use a gamepad or wheel"
         self.controls = controls_of(scenario)
-        self.help: tuple[str, ...] = (self.controls.help, hint, WISH_HELP)
+        self.help = (self.controls.help, *HINTS)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
         self._one_time_token = ""
-        # By this name a browser elsewhere finds the cockpit.
         name = socket.gethostname() if host in EVERYWHERE else host
         self._names = {*LOOPBACK, host.lower(), name.lower()}
         self.url = self._url_of(name)
@@ -136,24 +131,18 @@ class Cockpit:
         self._thread.start()
 
     def one_time_url(self) -> str:
-        """Return an address that leads on to the cockpit for one request only.
-
-        Every user of this machine can read it in the command line of the browser that it starts.
-        """
+        """Return an address for one request: all users here can read a browser's command line."""
         self._one_time_token = secrets.token_urlsafe(TOKEN_BYTES)
         return self.url.replace(self._token, self._one_time_token)
 
     @property
     def present(self) -> bool:
-        """Whether a page has the wheel and is heard."""
         return self.seat.is_heard(time.monotonic())
 
     def poll(self, now_s: float) -> Reading:
-        """Return what the driving page said last; hands off if that is half a second ago."""
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
-        """Show a view to every page, unless the next one overtakes it."""
         self._shown += 1
         self._tell(self._take_view, self._shown, view)
 
@@ -198,12 +187,12 @@ class Cockpit:
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         given, slash, name = request.path[1:].partition("/")
         if not self._is_asked_by_name(request):
-            return _refusal(421, NO_NAME)
+            return _refusal(421, OPEN_THE_PRINTED_ONE)
         if self._one_time_token and _is_same(given, self._one_time_token):
             self._one_time_token = ""
             raise web.HTTPFound(f"/{self._token}/", headers=HEADERS)
         if not _is_same(given, self._token):
-            return _refusal(403, NO_TOKEN)
+            return _refusal(403, OPEN_THE_PRINTED_ONE)
         self._door.has_token(request.transport)
         if name == "socket":
             return await self._talk(request)
@@ -211,15 +200,14 @@ class Cockpit:
             raise web.HTTPFound(request.path + "/", headers=HEADERS)
         name = name or "index.html"
         if name not in self._files:
-            return _refusal(404, NO_PAGE)
+            return _refusal(404, "no such page\n")
         kind, body = TYPES[name.rpartition(".")[2]], self._files[name]
         return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
 
     def _is_asked_by_name(self, request: web.BaseRequest) -> bool:
-        """Whether the request names this machine.
+        """Whether the request names this machine; another site's name may resolve to it, too.
 
-        Another site's name may resolve to it, too: a page from there would be of the same origin
-        (DNS rebinding).
+        A page from there would be of the same origin (DNS rebinding).
         """
         try:
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname
@@ -232,7 +220,7 @@ class Cockpit:
     async def _talk(self, request: web.BaseRequest) -> web.StreamResponse:
         # A page of another site may open sockets to this machine, but cannot lie about its origin.
         if request.headers.get("Origin") != f"http://{request.host}":
-            return web.Response(status=403, text="another site's page\n", headers=HEADERS)
+            return _refusal(403, "another site's page\n")
         socket = web.WebSocketResponse(
             max_msg_size=MAX_INPUT_BYTES, compress=False, timeout=CLOSING_S
         )
@@ -304,12 +292,8 @@ def _listen(host: str, port: int) -> socket.socket:
         family, address = found[0][0], found[0][4]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         return socket.create_server(address, family=family, dualstack_ipv6=both)
-    # A name that is none for DNS is a UnicodeError.
-    except (OSError, OverflowError, UnicodeError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).partition(" (while")[0]
-        if getattr(error, "errno", None) == errno.EADDRINUSE:
-            reason += "; without --port any that is free will do"
-        raise UserError(f"the cockpit cannot listen on {host} port {port}: {reason}") from error
+    except (OSError, OverflowError, UnicodeError) as error:  # The last: no name for DNS.
+        raise UserError(f"the cockpit cannot listen on {host} port {port}: {error}") from error
 
 
 def _encode(kind: str, **fields: Any) -> str:
@@ -350,10 +334,7 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 
 def lan_address(host: str) -> str:
-    """Return the address at which others in this network reach a server that listens on ``host``.
-
-    With several networks it is that of the route to the internet; nothing is sent.
-    """
+    """Return this machine's address for others: of the route to the internet; nothing is sent."""
     if host not in EVERYWHERE:
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

@@ -395,8 +395,8 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     assert controls.mix({"up": 1.0}) == (1.0, 1.0)
     assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
     for keys, says in (
-        ({"KeyQ": (0.0, 0.0)}, r"is driven with q, which pause, .*: name others"),
-        ({}, "it has several actions, and no keys"),
+        ({"KeyQ": (0.0, 0.0)}, "is driven with q, which"),
+        ({}, "several actions, and no keys"),
     ):
         monkeypatch.setattr(Rover, "keys", keys)
         controls_of.cache_clear()

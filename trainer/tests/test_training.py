@@ -6,7 +6,6 @@ import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -98,7 +97,7 @@ def test_a_robot_that_asks_or_foresees_goes_on_as_it_would_have(
         reasons.add(intervention and intervention.reason)
         foreseen.add(len(transition.foreseen))
 
-    whole.recorders.append(SimpleNamespace(record=record))
+    whole.recorders.append(record)
     whole.train()
     assert (foreseen != {0}) == (row == "ppl_td3")
     assert (ASKED in reasons) == (row == "phil_gated")

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import count
 from os import PathLike
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from bridge.outcomes import GOAL
@@ -24,13 +25,7 @@ from trainer import options
 from trainer.drivers import CHECKPOINT_FILE, is_expert, located
 from trainer.environments import scenario_of
 from trainer.learner.config import find_algorithm
-from trainer.person.interface import (
-    FASTEST,
-    HUMANS,
-    PERSON,
-    SLOWEST,
-    check_person_options,
-)
+from trainer.person.interface import FASTEST, HUMANS, PERSON, SLOWEST, check_person_options
 from trainer.training.config import (
     CONFIG_FILE,
     DEFAULTS,
@@ -49,9 +44,6 @@ from trainer.training.config import (
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals, write_learning_curve
 from trainer.training.run import TrainingRun
 from trainer.util import claimed
-
-_STDERR = 2
-_ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
 
 
 @dataclass(frozen=True)
@@ -72,7 +64,6 @@ class Run:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train, showing progress; return the exit status."""
     given = {name: value for name, value in vars(arguments).items() if name in TYPED}
     own = Path(arguments.out) / CONFIG_FILE
     in_file: dict[str, Any] = {}
@@ -146,7 +137,6 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
 
 
 def _new_directory(config: RunConfig) -> Path:
-    """Return the first free path of ``runs/SCENARIO-ALGORITHM-1``, ``-2`` and so on."""
     stem = re.sub(r"[^\w-]+", "_", f"{config.scenario}-{config.algorithm}")
     paths = (Path("runs") / f"{stem}-{number}" for number in count(1))
     return next(path for path in paths if not path.exists())
@@ -168,9 +158,9 @@ def _train(
             check_person_options(person)
             training = TrainingRun(config, run_dir, person.resume)
             quit_training = partial(_quit, training)
-        extent = (
-            (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
-        )
+        extent = config.episodes, training.episode
+        if config.steps:
+            extent = config.steps, training.steps
         bar = stack.enter_context(ProgressBar("training", *extent))
         watch = None
         if sink:
@@ -180,20 +170,14 @@ def _train(
         # Entered last: the first signal is ours, and the second the viewer's.
         stack.enter_context(quit_on_signals(quit_training))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)
-        validation = "-"
+        figures = {"validation": "-"}
 
         def on_episode(metrics: EpisodeMetrics) -> None:
-            nonlocal validation
             recent.append(metrics)
             if not math.isnan(metrics.validation_success):
-                validation = f"{metrics.validation_success:.2f}"
-            count = len(recent)
-            figures = {
-                "return": f"{sum(m.episode_return for m in recent) / count:.1f}",
-                "distance": f"{sum(m.distance_m for m in recent) / count:.1f} m",
-                "success": f"{sum(m.outcome == GOAL for m in recent) / count:.2f}",
-                "validation": validation,
-            }
+                figures["validation"] = f"{metrics.validation_success:.2f}"
+            figures["return"] = f"{fmean(m.episode_return for m in recent):.1f}"
+            figures["success"] = f"{fmean(m.outcome == GOAL for m in recent):.2f}"
             bar.advance(figures, metrics.steps if config.steps else 1)
             if watch:
                 watch(metrics)
@@ -215,8 +199,9 @@ def _quit(training: TrainingRun) -> bool:
     # Not print: a signal may come in the midst of one, which takes no other. And the reader, such
     # as `tee`, may have had the same ^C.
     with suppress(OSError):
-        os.write(_STDERR, _ENDING)
-    return training.quit()
+        os.write(2, b"ending after this episode; a second time: at once, back to the checkpoint\n")
+    training.quitting = True
+    return True
 
 
 def _summary(run_dir: Path, period_s: float) -> str:
@@ -224,11 +209,7 @@ def _summary(run_dir: Path, period_s: float) -> str:
     if not found:
         return "no episodes"
     amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
-    steps = counted(found["human_steps"], "step")
-    human = f"{counted(found['takeovers'], 'take-over')} with {steps}, {found['human_s']:.0f} s"
-    alone = [f"{float(level):.0%} alone after {there['human_s']:.0f}"
-             for level, there in found["until"].items() if there]  # fmt: skip
-    human += f" ({', '.join(alone)})" if alone and found["human_steps"] else ""
+    human = f"{counted(found['takeovers'], 'take-over')} with {found['human_s']:.0f} s"
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
@@ -238,20 +219,18 @@ def _config_file(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
     values = settings_in(found, str(path))
     if "preset" in found:
         values["preset"] = found["preset"]
-    clashes: dict[str, set[str]] = {}
-    if "preset" in given:
-        clashes["preset"] = _changed_by(given["preset"])
+    decided = _changed_by(given["preset"]) if "preset" in given else set()
     rows = {given.get("algorithm"), values.get("algorithm")} - {None}
-    if "algorithm" in given and len(rows) == 2:
-        clashes["algorithm"] = set().union(*(find_algorithm(str(row)).settings for row in rows))
-    for option, names in clashes.items():
-        if clash := [name for name in values if name in names]:
-            raise UserError(f"config {path} sets {clash[0]}, and so does --{option}: leave one out")
+    if len(rows) == 2:
+        decided = decided.union(*(find_algorithm(str(row)).settings for row in rows))
+    if clash := decided & values.keys():
+        what = "--preset or --algorithm"
+        raise UserError(f"config {path} sets {min(clash)}, and so does {what}: leave one out")
     return values
 
 
 def _own_config(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a resumed run's own config; a name of a module must be typed: no file imports one."""
+    """Read a resumed run's config; a name of a module must be typed: no file imports one."""
     values = settings_in(read_json(path, "run config"), str(path))
     if "preset" in given:
         names = _changed_by("ours") | _changed_by("printed")
@@ -262,7 +241,6 @@ def _own_config(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _changed_by(preset: str) -> set[str]:
-    """Return the settings that a preset changes."""
     changed = flat(PRESETS[preset])
     return {name for name, default in SETTINGS.items() if changed[name] != default}
 
@@ -277,8 +255,8 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
         raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
     if resume and not started:
         # It may have been killed before the first one.
-        begun, done = (run_dir / CONFIG_FILE).is_file(), len(read_metrics(run_dir))
-        if not begun or done > config.checkpoint_every:
+        begun = (run_dir / CONFIG_FILE).is_file()
+        if not begun or len(read_metrics(run_dir)) > config.checkpoint_every:
             raise UserError(f"{run_dir} holds no checkpoint to resume from")
         print(f"{run_dir} holds no checkpoint yet: it begins anew", file=sys.stderr)
     if resume:
@@ -290,13 +268,13 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
     saved, wanted = settings_in(read_json(path, "run config"), str(path)), flat(config)
     saved = {name: SETTINGS[name] for name in LATER if name in SETTINGS} | saved
-    if not all(name in saved for name in EXTENT):
+    if not saved.keys() >= set(EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
-    changed = []
-    for name in wanted:
-        if name not in EXTENT and (name not in saved or saved[name] != wanted[name]):
-            before = _option(name, saved) if name in saved else f"no {name}"
-            changed.append(f"{before} (now {_typed(name, wanted)})")
+    changed = [
+        f"{_option(name, saved[name]) if name in saved else f'no {name}'} (now {_typed(name, now)})"
+        for name, now in wanted.items()
+        if name not in EXTENT and (name not in saved or saved[name] != now)
+    ]
     if changed:
         raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
     for name in EXTENT:
@@ -305,12 +283,12 @@ def _check_settings(run_dir: Path, config: RunConfig) -> None:
             raise UserError(f"{run_dir} is a run of --{name} {saved[name]}: repeat that, or more")
 
 
-def _option(name: str, values: dict[str, Any]) -> str:
+def _option(name: str, value: Any) -> str:
     """Return an option with its value, as it was typed."""
     if name == "period_s":  # 0: what the environment says
-        return f"--period {values[name]}" if values[name] else "no --period"
-    return (f"--{name} " if name in OPTIONS else f"--set {name}=") + _typed(name, values)
+        return f"--period {value}" if value else "no --period"
+    return (f"--{name} " if name in OPTIONS else f"--set {name}=") + _typed(name, value)
 
 
-def _typed(name: str, values: dict[str, Any]) -> str:
-    return "|".join(HUMANS) if (name, values[name]) == ("human", PERSON) else str(values[name])
+def _typed(name: str, value: Any) -> str:
+    return "|".join(HUMANS) if (name, value) == ("human", PERSON) else str(value)

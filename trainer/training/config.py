@@ -45,8 +45,8 @@ RANDOM, BIASED = GUIDANCE = ("random", "biased")
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run's settings; the same settings on the same machine give the same
-    weights (with the compiled kernel or without it, not across the two).
+    """A run's settings; the same ones on the same machine, with the compiled kernel or without it,
+    give the same weights.
     """
 
     scenario: str = "left_turn"
@@ -105,9 +105,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
         if self.poor_guidance not in GUIDANCE:
-            raise UserError(
-                f"poor_guidance must be one of {', '.join(GUIDANCE)}: {self.poor_guidance}"
-            )
+            known = ", ".join(GUIDANCE)
+            raise UserError(f"poor_guidance must be one of {known}: {self.poor_guidance}")
         if self.late_to_s < self.late_from_s:
             raise UserError(f"late_to_s {self.late_to_s} is below late_from_s {self.late_from_s}")
 
@@ -120,7 +119,7 @@ class RunConfig:
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
 
     def as_toml(self) -> str:
-        """A file for ``--config``."""
+        """Return a file for ``--config``."""
         values = asdict(self)
         parts = values, values.pop("learner")
         own, learner = (
@@ -131,17 +130,13 @@ class RunConfig:
 
     @property
     def kept_actor(self) -> str:
-        """The learner's network that is validated and kept."""
+        """Name of the learner's network that is validated and kept."""
         return "target_actor" if self.averaged_actor else "actor"
 
     def label(self, episode: int) -> dict[str, Any]:
-        """What a file of the run says of its run and episode."""
-        return {
-            "scenario": self.scenario,
-            "algorithm": self.algorithm,
-            "seed": self.seed,
-            "episode": episode,
-        }
+        """Return what a file of the run says of its run and episode."""
+        names = ("scenario", "algorithm", "seed")
+        return {**{name: getattr(self, name) for name in names}, "episode": episode}
 
 
 PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
@@ -201,7 +196,7 @@ def parse_setting(assignment: str) -> tuple[str, Any]:
 
 
 def flat(config: RunConfig) -> dict[str, Any]:
-    """Return all settings by their names, those of the learner among them."""
+    """Return all settings, those of the learner among them."""
     values = asdict(config)
     return values | values.pop("learner")
 
@@ -226,10 +221,7 @@ def settings_in(values: Mapping[str, Any], place: str) -> dict[str, Any]:
 
 
 def period_of(config: Mapping[str, Any]) -> float | None:
-    """How long a step was in a saved run, s; None where the environment said it.
-
-    Raises UserError where its config is damaged.
-    """
+    """Return the control period of a saved run, s; None where the environment said it."""
     period_s = config.get("period_s", 0.0)
     if not isinstance(period_s, int | float):
         raise UserError(f"period_s of the run's config is no number: {period_s!r}")

@@ -37,7 +37,6 @@ class DelayedVehicle:
         self._braking = False
 
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode, of the network as well."""
         observation, info = self.env.reset(seed=seed)
         self.link: VirtualLink[Observation] = VirtualLink(
             self.spec, seed, self.control_period_s, observation.nbytes
@@ -74,7 +73,6 @@ class DelayedVehicle:
         return carried_out
 
     def release_brake(self) -> None:
-        """Let a human drive, whatever the network does."""
         self._press_brake(False)
 
     def _press_brake(self, pressed: bool) -> None:

@@ -39,11 +39,9 @@ LOOK_S = 0.002  # Between two looks whether an update is done, where it must be 
 class LearningThread:
     """A learner with its replay buffer; the updates run in a thread of their own.
 
-    The policy acts in that thread, too, in validation as well: another would bring a second pool
-    of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
-    loop's thread, beside the update: a batch of one needs no other thread.
-
-    The networks are on the config's device, the replay buffer is in the processor's memory.
+    The policy acts in that thread, too: another would bring a second pool of OpenMP threads, and
+    the two would fight for the same cores. The networks are on the config's device, the replay
+    buffer is in the processor's memory.
 
     Raises UserError: there is no memory for the replay buffer.
     """
@@ -61,10 +59,9 @@ class LearningThread:
                 env.layout, row.human_share, bool(row.foresight),
             )  # fmt: skip
         except MemoryError:
-            raise UserError(
-                f"there is no memory for a replay buffer of {c.replay_capacity} "
-                "transitions: --set replay_capacity=N, a smaller one"
-            ) from None
+            what = f"a replay buffer of {c.replay_capacity} transitions"
+            hint = "--set replay_capacity=N, a smaller one"
+            raise UserError(f"there is no memory for {what}: {hint}") from None
         self._random = random_stream(config.seed, Purpose.REPLAY)
         late = ticks_late(parse_spec(config.latency), env.control_period_s)
         self._seen: deque[Observation] = deque(maxlen=late + 1)
@@ -83,11 +80,9 @@ class LearningThread:
 
     @property
     def updating(self) -> bool:
-        """Whether ``finish`` would wait now."""
         return self._begun is not None and not self._begun[1].done()
 
     def act(self, observation: Observation) -> Action:
-        """Return the actor's action; not while updating."""
         return self.in_thread(self.learner.actor.act, observation[None])[0]
 
     def doubt(self, observation: Observation, action: Action) -> float:
@@ -95,7 +90,6 @@ class LearningThread:
         return self.in_thread(self.learner.doubt, observation, action)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """Return ``work(*arguments)``, done in the updates' thread after the update under way."""
         return self._thread.submit(work, *arguments).result()
 
     def add(self, transition: Transition) -> None:
@@ -152,11 +146,9 @@ class LearningThread:
         """
         self.learner.decay_learning_rates(progress)
         means = np.mean(self._losses, axis=0) if self._losses else [math.nan] * len(LOSSES)
-        policy_priority, human_priority = self.replay.mean_priorities()
+        names = (*LOSSES, "policy_priority", "human_priority")
         learned = {
-            **dict(zip(LOSSES, map(float, means), strict=True)),
-            "policy_priority": policy_priority,
-            "human_priority": human_priority,
+            **dict(zip(names, map(float, (*means, *self.replay.mean_priorities())), strict=True)),
             "learning_s": self._learning_s,
             "waiting_s": self._waiting_s,
         }
@@ -171,20 +163,17 @@ class LearningThread:
 
     def check_weights(self) -> None:
         """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
-        for name in NETWORKS:
-            for parameter in getattr(self.learner, name).parameters():
-                if not parameter.isfinite().all():
-                    raise FloatingPointError("its weights are no longer finite")
+        networks = (getattr(self.learner, name) for name in NETWORKS)
+        if not all(p.isfinite().all() for network in networks for p in network.parameters()):
+            raise FloatingPointError("its weights are no longer finite")
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "learner": self.learner.state_dict(),
-            "replay": {
-                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-                for name, value in self.replay.state_dict().items()
-            },
-            "drawing": self._random.bit_generator.state,
+        replay = {
+            name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+            for name, value in self.replay.state_dict().items()
         }
+        drawing = self._random.bit_generator.state
+        return {"learner": self.learner.state_dict(), "replay": replay, "drawing": drawing}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.learner.load_state_dict(state["learner"])
@@ -195,7 +184,7 @@ class LearningThread:
         self._thread.shutdown()
 
     def _shaped(self, transition: Transition) -> float:
-        """Shape the reward by eq. 17 as it is printed, unless the overruled action is charged."""
+        """Return eq. 17's reward as printed, unless the overruled action is charged."""
         reward = transition.reward if self.algorithm.rewarded else 0.0
         charged = transition.penalised and self.config.penalty_on == HUMANS_ACTION
         return equations.shaped_reward(reward, self.config.intervention_penalty, charged, False)
@@ -214,9 +203,7 @@ class UnhurriedLearning(LearningThread):
     """A learner beside a person: ``act``, ``begin`` and ``finish`` never wait for an update.
 
     The policy acts in the loop's thread, from a copy of the actor as of the last finished update.
-    The next update begins in the first control period after the last one's end. An episode's steps
-    are stored at its end, when it is known whether the person discards it. A run with a person is
-    not repeatable anyway.
+    An episode's steps are stored at its end, when it is known whether the person discards it.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
@@ -226,11 +213,9 @@ class UnhurriedLearning(LearningThread):
         self.in_thread(_step_aside)
 
     def act(self, observation: Observation) -> Action:
-        """Return the action of the actor's copy."""
         return self._actor.act(observation[None])[0]
 
     def add(self, transition: Transition) -> None:
-        """Keep a transition for the end of the episode."""
         self._kept.append(transition)
 
     def begin(self, beta: float) -> None:
@@ -239,16 +224,13 @@ class UnhurriedLearning(LearningThread):
             super().begin(beta)
 
     def finish(self) -> float:
-        """Wait for nothing: 0 seconds."""
         return 0.0
 
     def end_episode(self, progress: float, keep: bool = True) -> dict[str, Any]:
-        """End an episode after the update that is under way."""
         self.settle()
         return super().end_episode(progress, keep)
 
     def release(self, keep: bool = True) -> None:
-        """Store what was taken since the last call, or forget it."""
         self.settle()
         kept, self._kept = self._kept, []
         for transition in kept if keep else ():
@@ -256,7 +238,6 @@ class UnhurriedLearning(LearningThread):
         super().release()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that is needed to go on, after the update under way."""
         self.settle()
         return super().state_dict()
 
@@ -284,6 +265,5 @@ class UnhurriedLearning(LearningThread):
 
 
 def _step_aside() -> None:
-    """Lower the priority of the thread that calls this, where threads have one (Linux)."""
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -23,17 +23,10 @@ from trainer.training.config import CURVE_FILE
 
 NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
-ALWAYS = (
-    "episode",
-    "total_steps",
-    "steps",
-    "episode_return",
-    "distance_m",
-    "interventions",
-    "human_steps",
-)
+COUNTED = ("episode", "total_steps", "interventions", "human_steps")
+WHOLE = (*COUNTED, "updates")
+ALWAYS = (*COUNTED, "steps", "episode_return", "distance_m")
 """Columns that hold a number in every row; others are empty in runs from before they came."""
-WHOLE = ("episode", "total_steps", "updates", "interventions", "human_steps")  # What is counted
 
 
 @dataclass
@@ -85,8 +78,7 @@ class MetricsWriter:
         self.path = run_dir / METRICS_FILE
         kept = read_metrics(run_dir)[:from_episode]
         if len(kept) < from_episode:
-            lost = f"{self.path} holds {len(kept)} episodes, and the checkpoint was after"
-            raise UserError(f"{lost} {from_episode}: put the missing rows back")
+            raise UserError(f"{self.path} lacks episodes before the checkpoint: {from_episode}")
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
@@ -111,9 +103,8 @@ class MetricsWriter:
         for level in LEARNED:
             if is_reached(level, metrics.validation_success):
                 self._human_s_to.setdefault(f"{level:g}", metrics.total_human_s)
-        metrics.human_s_to_90, metrics.human_s_to_98 = (
-            self._human_s_to.get(f"{level:g}", NAN) for level in LEARNED
-        )
+        reached = (self._human_s_to.get(f"{level:g}", NAN) for level in LEARNED)
+        metrics.human_s_to_90, metrics.human_s_to_98 = reached
         row = asdict(metrics)
         try:
             self._csv.writerow(row)
@@ -127,7 +118,7 @@ class MetricsWriter:
                 self._board.add_scalar(name, value, metrics.episode)
 
     def close(self) -> None:
-        with suppress(OSError):  # What could not be written is tried once more, and was said.
+        with suppress(OSError):  # Closing tries once more to write what `add` could not.
             self._file.close()
         self._board.close()
 
@@ -144,28 +135,18 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
     try:
         # As csv ends lines: an outcome may hold what `str.splitlines` takes for another end.
         whole, end, _ = read_bytes(path, "metrics").rpartition(b"\n")
-        return _rows((whole + end).decode())
-    except (ValueError, csv.Error) as error:
-        raise UserError(f"{path} is no metrics of a training, or damaged: {error}") from None
-
-
-def _rows(text: str) -> list[dict[str, str]]:
-    """Read whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
-        raise ValueError("its columns are others")
-    rows = list(reader)
-    for number, row in enumerate(rows, start=1):
-        try:
+        reader = csv.DictReader(io.StringIO((whole + end).decode(), newline=""), strict=True)
+        if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
+            raise ValueError("its columns are others")
+        rows = list(reader)
+        for number, row in enumerate(rows):
             for name, value in row.items():  # None stands for a column too few or too many.
                 if name in ALWAYS or (value != "" and name != "outcome"):
                     (int if name in WHOLE else float)(value)
-        except (ValueError, TypeError):
-            raise ValueError(f"row {number} is broken") from None
-        if int(row["episode"]) != number - 1:
-            raise ValueError(
-                f"row {number} is of episode {row['episode']}: one is missing, or double"
-            )
+            if int(row["episode"]) != number:
+                raise ValueError(f"row {number + 1} is of episode {row['episode']}")
+    except (ValueError, TypeError, csv.Error) as error:
+        raise UserError(f"{path} is no metrics of a training, or damaged: {error}") from None
     return [{**dict.fromkeys(NAMES, ""), **row} for row in rows]
 
 
@@ -174,7 +155,6 @@ LEARNED = (0.9, 0.98)
 
 
 def was_validated(row: Mapping[str, str]) -> bool:
-    """Return whether the policy was validated after this row's episode."""
     return row["validation_success"] not in ("", "nan")
 
 
@@ -202,10 +182,9 @@ def totals(
     """Sum up what a run cost and what it reached, from its rows; empty without rows.
 
     ``failures``: training episodes, with the human's help, that missed the goal, by outcome.
-    ``validation``: the best and the last success rate, and the steps after which the kept actor
-    reached the best; empty without a validation. ``until``: what was spent until the policy alone
-    first reached each of ``LEARNED``, or None. ``kept_episode``: episodes before the kept actor,
-    where known; else the rows tell.
+    ``validation``: best and last success rate, and the steps after which the kept actor reached the
+    best. ``until``: what was spent until the policy alone first reached each of ``LEARNED``, or
+    None. ``kept_episode``: episodes before the kept actor; None: the rows tell.
     """
     if not rows:
         return {}
@@ -254,9 +233,7 @@ def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
     """Draw return, surviving distance, success and human share over the episodes as a PNG.
 
     Each of several runs is a thin line; the thick one is their mean, up to the end of the shortest.
-    ``out`` is by default in the first run's directory.
-
-    Raises UserError: a run has no metrics yet, or the file cannot be written.
+    ``out`` is by default in the first run's directory. UserError: a run has no metrics yet.
     """
     path = run_dirs[0] / CURVE_FILE if out is None else Path(out)
     check_writable(path)
@@ -292,7 +269,6 @@ def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH)
     write_atomic(path, buffer.getvalue())

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -104,8 +104,8 @@ class Validation(Trials):
     def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
         """Validate the policy as it stands, into ``metrics``; keep it if it is the best so far.
 
-        A resumed run forgets a validation that was not ``due`` but came from an early stop: when a
-        run was stopped must not decide which actor it ends with.
+        A resumed run forgets a validation that was not ``due``: when a run was stopped must not
+        decide which actor it ends with.
         """
         actor = getattr(self.learning.learner, self.config.kept_actor)
         driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
@@ -148,18 +148,13 @@ class Validation(Trials):
 NOBODY = Guide()
 
 
-class Recorder(Protocol):
-    """What takes every control period, once it is stored: a view, or a person's recording."""
-
-    def record(
-        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
-    ) -> None:
-        """Take one control period, and the info of its step; nothing in it changes afterwards."""
+Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]
+"""Takes a control period and the info of its step, once it is stored: a view, or a recording."""
 
 
 @dataclass
 class Parts:
-    """What a run is made of; `make_parts` has them as they are without a person."""
+    """What a run is made of; `make_parts` makes those of a run without a person."""
 
     env: Any  # The environment itself: it is foreseen in
     delayed: DelayedVehicle | None  # The environment behind the config's network, if any
@@ -167,7 +162,7 @@ class Parts:
     guide: Guide
     learning: LearningThread
     validation: Validation
-    recorders: list[Recorder] = field(default_factory=list)
+    recorders: list[Record] = field(default_factory=list)
 
 
 def make_parts(config: RunConfig, run_dir: Path) -> Parts:
@@ -191,10 +186,8 @@ def make_vehicle(config: RunConfig) -> tuple[Any, DelayedVehicle | None]:
 
 def make_guide(config: RunConfig, env: Any) -> Guide:
     """Make the human of a run as its config describes it."""
-    row, random = (
-        find_algorithm(config.algorithm),
-        util.random_stream(config.seed, util.Purpose.GUIDANCE),
-    )
+    row = find_algorithm(config.algorithm)
+    random = util.random_stream(config.seed, util.Purpose.GUIDANCE)
     if not row.guided:
         return Guide()
     driver, _ = load_driver(config.human, env)
@@ -237,11 +230,7 @@ class TrainingRun:
         on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
         deadline_s: float = math.inf,
     ) -> None:
-        """Train until the configured end, or ``time.monotonic() > deadline_s``.
-
-        Call it once: its end stops the learner's thread. A new run with
-        ``resume`` goes on.
-        """
+        """Train until the configured end, or ``time.monotonic() > deadline_s``; call it once."""
         if not self.over:  # Else another revision has trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
@@ -270,8 +259,8 @@ class TrainingRun:
             self.learning.close()
             self.env.close()
             rows, kept = read_metrics(self.run_dir), self.validation.kept_episode
-            so_far = totals(rows, self.env.control_period_s, kept)
-            write_json(self.run_dir / REPORT_FILE, so_far)
+            report = totals(rows, self.env.control_period_s, kept)
+            write_json(self.run_dir / REPORT_FILE, report)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
@@ -293,13 +282,7 @@ class TrainingRun:
         episodes = self.episode / self.config.episodes
         return max(episodes, self.steps / self.config.steps) if self.config.steps else episodes
 
-    def quit(self) -> bool:
-        """Ask for the end after the episode under way, with a checkpoint; True: it will come."""
-        self.quitting = True
-        return True
-
     def save(self) -> None:
-        """Write the checkpoint."""
         with self._divergence_said():  # The update under way beside a person may be the one.
             state = {
                 **self.config.label(self.episode),
@@ -313,10 +296,9 @@ class TrainingRun:
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        counts = state["episode"], state["steps"], state["learning"]["learner"]["updates"]
-        if not all(type(count) is int and count >= 0 for count in counts):
-            raise ValueError(f"counts of {counts}")
-        self.episode, self.steps, _ = counts
+        self.episode, self.steps = state["episode"], state["steps"]
+        if not (type(self.episode) is type(self.steps) is int and self.episode >= 0 <= self.steps):
+            raise ValueError("no counts")
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guide.load_state_dict(state)
@@ -382,8 +364,8 @@ class TrainingRun:
         metrics.acting_s += acted_s - began_s
         metrics.environment_s += moved_s - begun_s
         metrics.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
-        for recorder in self.recorders:
-            recorder.record(transition, intervention, info)
+        for record in self.recorders:
+            record(transition, intervention, info)
         return next_observation, terminated or truncated, info
 
     def penalises(self, intervention: Intervention | None) -> bool:
@@ -391,7 +373,7 @@ class TrainingRun:
         row = self.algorithm
         if intervention is None or not intervention.first or not row.penalty:
             return False
-        if intervention.reason == ASKED:  # That is no objection.
+        if intervention.reason == ASKED:  # no objection
             return False
         return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
 
@@ -399,11 +381,9 @@ class TrainingRun:
         action = self.learning.act(observation)
         if not np.isfinite(action).all():  # No car is to be driven by it.
             raise FloatingPointError("its actions are no longer finite")
-        c = self.config.learner
+        c, std = self.config.learner, self._exploration_std()
         self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
-        noise = equations.exploration_noise(
-            self._exploration_std(), c.exploration_bound, self._drawn
-        )
+        noise = equations.exploration_noise(std, c.exploration_bound, self._drawn)
         return np.clip(action + noise, -1.0, 1.0)
 
     def _exploration_std(self) -> float:
@@ -417,7 +397,7 @@ class TrainingRun:
         return c.beta * (1.0 - self.progress) if c.importance_sampling else 0.0
 
     def _due(self, steps_before: int) -> bool:
-        """Return whether a run that is never stopped validates after the last episode, too."""
+        """Return whether a run that is never stopped validates here."""
         every = self.config.evaluate_every_steps
         return bool(every) and (self.over or self.steps // every > steps_before // every)
 
@@ -427,7 +407,6 @@ class TrainingRun:
         try:
             yield
         except FloatingPointError as error:
-            raise UserError(
-                f"the training diverged in episode {self.episode + 1}: {error}; a smaller "
-                "--set actor_learning_rate or critic_learning_rate may help"
-            ) from None
+            hint = "a smaller --set actor_learning_rate or critic_learning_rate may help"
+            where = f"the training diverged in episode {self.episode + 1}"
+            raise UserError(f"{where}: {error}; {hint}") from None
