@@ -40,7 +40,7 @@ TOLD = [
     ("plot x --out a.jpg", "a picture is a .png"),
     ("plot one two --out c.png", "one holds no metrics"),
     ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
-    ("experiment report status", "stand alone"),
+    ("experiment report status", "no other name"),
     ("experiment fig7 --ray auto --device cuda", "on processors"),
     ("experiment guidance --ray auto", "lacks hill, racetrack"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
