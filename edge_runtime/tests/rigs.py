@@ -19,7 +19,7 @@ from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
 
 
 def scenario_car(*numbers):
-    return Car(**dict(zip(Car.__struct_fields__, numbers, strict=True)))
+    return Car(**dict(zip(Car.__struct_fields__, numbers)))
 
 
 SPEC = SPECS["2.0"]
