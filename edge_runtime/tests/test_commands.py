@@ -15,7 +15,7 @@ from hil_tests.testing.messages import HEALTH
 from hil_tests.testing.policies import write_policy
 
 import edge_runtime
-from edge_runtime import cli
+from edge_runtime import cli, commands
 from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
@@ -204,3 +204,8 @@ def test_numbers_within_and_beyond_their_limits(kind, taken, refused):
     for text in refused:
         with pytest.raises(ArgumentTypeError, match=f"'{text}'"):
             kind(text)
+
+
+def test_a_policy_that_is_slow_here_may_not_drive(refuses, make_policy, monkeypatch):
+    monkeypatch.setattr(commands, "quantiles_ms", lambda _: {"p50": 1.0, "p99": 143.0, "max": 150})
+    refuses(["check", *make_policy().flags[1:]], "143 ms")

@@ -1,5 +1,7 @@
 """The table of rights as Zenoh will read it; that Zenoh obeys: hil_tests/tests/test_tls.py."""
 
+from datetime import datetime, timezone
+
 import pytest
 from cryptography.hazmat.primitives import serialization as form
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -75,3 +77,11 @@ def test_only_an_ed25519_key_without_a_password_signs(tmp_path):
             tls.read_signing_key(path)
     with pytest.raises(UserError):
         tls.read_signing_key(tmp_path / "absent")
+
+
+def test_a_certificate_is_valid_until_the_second_of_its_end():
+    ends = datetime(2026, 1, 2, tzinfo=timezone.utc)
+    files = tls.TlsFiles("ca.pem", "cert.pem", "key.pem", "edge-a", ends)
+    files.require_valid(ends.timestamp() - 0.001)
+    with pytest.raises(UserError, match=r"cert.pem expired at 2026-01-02"):
+        files.require_valid(ends.timestamp())
