@@ -13,8 +13,9 @@ import ctypes
 import hashlib
 import io
 import time
+from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterator, Mapping, NamedTuple, Optional, Sequence
+from typing import TYPE_CHECKING, Any, Iterator, Mapping, NamedTuple, Optional
 
 import numpy as np
 
@@ -96,28 +97,25 @@ def open_policy(data: bytes, trust: str) -> Policy:
 
 def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
     """Raise UserError unless the network's inputs and output are the task's."""
-    inputs = {each.name: each for each in session.get_inputs()}
+    wanted = {}
     for name, entry in task.observation.items():
-        found = [inputs.pop(name)] if name in inputs else session.get_inputs()
         kind = "float" if entry.dtype == "float32" else entry.dtype
-        _check_tensor("input", found, name, f"tensor({kind})", entry.shape)
-    if inputs:
-        raise UserError(f"its input {next(iter(inputs))} is not in the manifest's observation")
-    _check_tensor("output", session.get_outputs(), OUTPUT, "tensor(float)", (len(task.action),))
+        wanted[name] = (f"tensor({kind})", entry.shape)
+    _compare("inputs", session.get_inputs(), wanted)
+    _compare("output", session.get_outputs(), {OUTPUT: ("tensor(float)", [len(task.action)])})
+
+
+def _compare(what: str, tensors: list, wanted: dict[str, tuple[str, list[int]]]) -> None:
+    """Raise UserError unless these are the tensors, each behind a batch that is 1 or open."""
+    found = {each.name: (each.type, each.shape[1:]) for each in tensors}
+    batches = [each.shape[0] if each.shape else 0 for each in tensors]
+    if found != wanted or any(batch != 1 and isinstance(batch, int) for batch in batches):
+        raise UserError(f"its {what} must be {wanted} behind a batch, it has {found}")
 
 
 def policy_id_of(data: bytes) -> str:
     """Name a policy: SHA-256 of its whole file, in hex."""
     return hashlib.sha256(data).hexdigest()
-
-
-def _check_tensor(what: str, found: list, name: str, kind: str, shape: Sequence[int]) -> None:
-    """Raise UserError unless one tensor is found, of this kind behind a batch that is 1 or open."""
-    shown = [(each.name, each.type, *each.shape[1:]) for each in found]
-    batch = found[0].shape[0] if found and found[0].shape else 0
-    if shown != [(name, kind, *shape)] or (batch != 1 and isinstance(batch, int)):
-        has = ", ".join(f"{each.name} {each.type} {each.shape}" for each in found) or "none"
-        raise UserError(f"its {what} must be {name} {kind} {['batch', *shape]}, it is {has}")
 
 
 def open_network(data: bytes) -> onnxruntime.InferenceSession:
@@ -185,14 +183,11 @@ def _probe(policy: Policy) -> None:
 
 def check_answer(action: np.ndarray, task: Task, what: str) -> None:
     """Raise UserError unless the answer to `what` is finite and in the manifest's ranges."""
-    words = f"it answers {what} with"
-    if not np.all(np.isfinite(action)):
-        raise UserError(f"{words} {action.tolist()}, not finite")
     for row, value in zip(task.action, action.tolist()):
         slack = _RANGE_TOLERANCE * (row.high - row.low)
-        if not row.low - slack <= value <= row.high + slack:
-            outside = f"outside its manifest's {row.low} to {row.high}"
-            raise UserError(f"{words} {row.name} {value:.3f}, {outside}")
+        if not row.low - slack <= value <= row.high + slack:  # nor is NaN
+            found = f"{row.name} {value:.3f}, outside its manifest's {row.low} to {row.high}"
+            raise UserError(f"it answers {what} with {found}")
 
 
 def infer(
@@ -200,11 +195,11 @@ def infer(
 ) -> tuple[Optional[np.ndarray], int]:
     """Infer the action, float32 [n], and its duration in ns; no action where that fails."""
     begun_ns = time.perf_counter_ns()
-    output: Optional[np.ndarray] = None
     try:
-        output = policy.act(observation)
+        output: Optional[np.ndarray] = policy.act(observation)
     except Exception as error:  # as in open_network
         log.event("error", "inference_failed", detail=error)
+        output = None
     return output, time.perf_counter_ns() - begun_ns
 
 
@@ -217,14 +212,11 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
 
     try:
         key = load_pem_public_key(public_key_pem)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        raise UserError("the public key is not a PEM public key") from None
-    if not isinstance(key, Ed25519PublicKey):
-        raise UserError("the public key is not an Ed25519 key")
-    if len(signature) != 64:
-        raise UserError(f"the signature holds {len(signature)} bytes, not 64")
-    try:
+        if not isinstance(key, Ed25519PublicKey):
+            raise ValueError
         key.verify(signature, policy_bytes)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise UserError("the public key is not an Ed25519 key in PEM") from None
     except InvalidSignature:
         raise UserError("the file was changed, or another key signed it") from None
 
@@ -232,19 +224,18 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
 def check_trust(
     path: PathLike, policy_bytes: bytes, public_key: Optional[PathLike], allow_unsigned: bool
 ) -> tuple[str, Optional[str]]:
-    """Verify a policy: VERIFIED, BESIDE, UNVERIFIED or UNSIGNED; UserError where it may not drive.
+    """Return VERIFIED, BESIDE, UNVERIFIED or UNSIGNED, and the file of the key that verified.
 
-    Also returns the file of the public key that verified it, if any. A signature is always
-    verified where a key is known; `allow_unsigned` lets through only what cannot be verified, never
-    what fails to. With it, a key beside the policy comes before that of the working directory.
-    Without it, such a key counts for nothing: who brings a policy could bring it, too.
+    A signature is always verified where a key is known: `allow_unsigned` lets through only what
+    cannot be verified. With it a key beside the policy comes before that of the working directory;
+    without it such a key counts for nothing, because whoever brings a policy could bring it, too.
+    Raises UserError where the policy may not drive.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
         if allow_unsigned:
             return UNSIGNED, None
         raise UserError(f"policy {path} is not signed; --allow-unsigned lets it drive all the same")
-    signature = read_bytes(signature_path, "signature")
     trust, beside = VERIFIED, Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
     if public_key is None and allow_unsigned and beside.exists():
         public_key, trust = beside, BESIDE
@@ -254,9 +245,9 @@ def check_trust(
         if allow_unsigned:
             return UNVERIFIED, None
         raise UserError(f"no public key to verify {signature_path.name} with: use --public-key")
-    key_pem = read_bytes(public_key, "public key")
+    signature = read_bytes(signature_path, "signature")
     try:
-        verify(policy_bytes, signature, key_pem)
+        verify(policy_bytes, signature, read_bytes(public_key, "public key"))
     except UserError as error:
         where = f"signature {signature_path}, public key {public_key}"
         raise UserError(f"{where}: {error}; name its signer's with --public-key") from None
@@ -264,27 +255,18 @@ def check_trust(
 
 
 # Field numbers of onnx.proto (ONNX 1.12 and later; they never change), by kind of message: plain
-# fields, messages by field, and refused fields with a name. Any other field is refused, too: it
-# could keep weights where nobody looks, or in a file that nobody has signed.
-_SPARSE, _OUTSIDE = "sparse weights", "weights in another file (export it in one file)"
-# A loop may take any time, and a branch a time that no probe has met.
-_FLOW = "control flow (a Loop, an If or a Scan)"
-_KINDS: dict[str, tuple[tuple[int, ...], dict[int, str], dict[int, str]]] = {
-    "model": (
-        (1, 2, 3, 4, 5, 6, 8, 14),
-        {7: "graph"},
-        {20: "graphs for training", 25: "functions of its own"},
-    ),
-    "graph": ((2, 10, 11, 12, 13, 14, 16), {1: "node", 5: "tensor"}, {15: _SPARSE}),
-    "node": ((1, 2, 3, 4, 6, 7, 8, 9), {5: "attribute"}, {}),
-    "attribute": (
-        (1, 2, 3, 4, 7, 8, 9, 13, 14, 15, 20),
-        {5: "tensor", 10: "tensor"},
-        {6: _FLOW, 11: _FLOW, 22: _SPARSE, 23: _SPARSE},
-    ),
-    "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
+# fields, and messages by field. Any other field is refused: weights in another file or sparse, a
+# subgraph (a loop may take any time, a branch a time that no probe has met), functions, training.
+_KINDS: dict[str, tuple[tuple[int, ...], dict[int, str]]] = {
+    "model": ((1, 2, 3, 4, 5, 6, 8, 14), {7: "graph"}),
+    "graph": ((2, 10, 11, 12, 13, 14, 16), {1: "node", 5: "tensor"}),
+    "node": ((1, 2, 3, 4, 6, 7, 8, 9), {5: "attribute"}),
+    "attribute": ((1, 2, 3, 4, 7, 8, 9, 13, 14, 15, 20), {5: "tensor", 10: "tensor"}),
+    "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}),
 }
+_DATA_LOCATION = 14  # of a tensor: 0 is inside the file
 
+_OWN_DOMAINS = ("", "ai.onnx")
 # Refused operators: why, which inputs matter, and the names. _RANDOM: refused where one of these
 # inputs is there; _COST: where one follows from the observation, not from weights and shapes alone.
 # None: always.
@@ -294,16 +276,14 @@ _OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
                      "RandomUniform", "RandomUniformLike")),
     (_RANDOM, slice(2, 3), ("Dropout",)),
     (_COST, slice(0, 5), ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow",
-                          "MelWeightMatrix", "NonMaxSuppression", "NonZero", "Range",
-                          "StringNormalizer", "StringSplit", "Unique")),
+                          "MaxUnpool", "MelWeightMatrix", "NonMaxSuppression", "NonZero",
+                          "Range", "SequenceInsert", "StringNormalizer", "StringSplit", "Unique")),
     (_COST, slice(1, 5), ("AffineGrid", "CenterCropPad", "Col2Im", "Compress", "DFT", "Expand",
-                          "OneHot", "Pad", "Reshape", "Resize", "RoiAlign", "SequenceAt",
+                          "GRU", "LSTM", "OneHot", "Pad", "Reshape", "Resize", "RoiAlign", "SequenceAt",
                           "SequenceErase", "Slice", "Split", "SplitToSequence", "Squeeze", "STFT",
                           "Tile", "TopK", "Unsqueeze", "ReduceL1", "ReduceL2", "ReduceLogSum",
                           "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceProd",
-                          "ReduceSum", "ReduceSumSquare")),
-    (_COST, slice(2, 3), ("MaxUnpool", "SequenceInsert")),
-    (_COST, slice(4, 5), ("GRU", "LSTM", "RNN")),
+                          "ReduceSum", "ReduceSumSquare", "RNN")),
 )  # fmt: skip
 
 
@@ -316,35 +296,29 @@ def check_graph(data: bytes) -> dict[str, str]:
     try:
         model = _checked(memoryview(data), "model")
         # A protobuf library would merge two graphs into one that was not looked at here.
-        graphs = sum(number == 7 for number, _ in model)
-        versions = [value for number, value in model if number == 1 and isinstance(value, int)]
-        if graphs != 1 or not versions:
-            raise ValueError(f"it holds {graphs} graphs, not one")
-        opsets = [dict(_fields(_bytes(value))) for number, value in model if number == 8]
-        known = [opset.get(2, 0) for opset in opsets if _text(opset.get(1)) in ("", "ai.onnx")]
-        numbers = [value for value in known if isinstance(value, int)]
-        if not numbers:
-            raise ValueError("it names no operator set")
-        entries = [dict(_fields(_bytes(value))) for number, value in model if number == 14]
-        metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
-        _check_operators(next(_bytes(value) for number, value in model if number == 7))
-    except ValueError as error:
+        if len(model[7]) != 1:
+            raise ValueError(f"it holds {len(model[7])} graphs, not one")
+        opsets = [_fields(each) for each in model[8]]
+        opset = max([0, *(each[2][-1] for each in opsets if _text(each, 1) in _OWN_DOMAINS)])
+        ir_version = model[1][-1]
+        entries = [_fields(each) for each in model[14]]
+        metadata = {_text(each, 1): _text(each, 2) for each in entries}
+        _check_operators(_fields(model[7][0]))
+        if opset not in OPSETS or ir_version > MAX_IR_VERSION:
+            needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
+            raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
+    except (ValueError, TypeError, IndexError) as error:  # also bytes where a number is expected
         raise UserError(f"not a whole ONNX file: {error}") from None
-    ir_version, opset = versions[-1], max(numbers)
-    if opset not in OPSETS or ir_version > MAX_IR_VERSION:
-        needs = f"opset {OPSETS[0]} to {OPSETS[-1]} and at most IR version {MAX_IR_VERSION}"
-        raise UserError(f"it has opset {opset} and IR version {ir_version}; it needs {needs}")
     return metadata
 
 
-def _check_operators(graph: memoryview) -> None:
+def _check_operators(graph: dict[int, Any]) -> None:
     """Raise UserError for an operator of `_OPERATORS`, or one that is not ONNX's own."""
-    fields = list(_fields(graph))
-    fixed = {"", *(_text(dict(_fields(tensor)).get(8)) for number, tensor in fields if number == 5)}
-    for node in (list(_fields(value)) for number, value in fields if number == 1):
-        name, domain = (_text(dict(node).get(number)) for number in (4, 7))
-        inputs, outputs = ([_text(v) for n, v in node if n == number] for number in (1, 2))
-        if domain not in ("", "ai.onnx", "ai.onnx.ml"):
+    fixed = {"", *(_text(_fields(tensor), 8) for tensor in graph[5])}
+    for node in map(_fields, graph[1]):
+        name, domain = _text(node, 4), _text(node, 7)
+        inputs, outputs = ([str(each, "utf-8") for each in node[number]] for number in (1, 2))
+        if domain not in (*_OWN_DOMAINS, "ai.onnx.ml"):
             raise UserError(f"its operator {name} is of {domain}, and not ONNX's own")
         for reason, part, names in _OPERATORS:
             harmless = fixed if reason == _COST else {""}
@@ -354,45 +328,40 @@ def _check_operators(graph: memoryview) -> None:
             fixed.update(outputs)
 
 
-def _checked(message: memoryview, kind: str) -> list[tuple[int, Any]]:
+def _checked(message: memoryview, kind: str) -> dict[int, Any]:
     """Return the fields of a message; UserError where it or one inside it holds a refused field."""
-    plain, nested, refused = _KINDS[kind]
-    fields = list(_fields(message))
-    for number, value in fields:
-        what = ""
-        if number in nested:
-            _checked(_bytes(value), nested[number])
-        elif number not in plain:
-            what = refused.get(number, f"an unknown field {number}")
-        elif (kind, number) == ("tensor", 14) and value != 0:  # data_location; 0 is inside
-            what = _OUTSIDE
-        if what:
-            raise UserError(f"the policy file holds {what}, which the runtime does not read")
+    plain, nested = _KINDS[kind]
+    fields = _fields(message)
+    for number, values in list(fields.items()):
+        for value in values if number in nested else ():
+            _checked(value, nested[number])
+        is_outside = kind == "tensor" and number == _DATA_LOCATION and any(values)
+        if is_outside or number not in (*plain, *nested):
+            only = "weights in plain tensors, and no control flow or functions"
+            raise UserError(f"field {number} of its {kind} is refused: it may hold {only}")
     return fields
 
 
-def _fields(message: memoryview) -> Iterator[tuple[int, Any]]:
-    """Read number and value (int or memoryview) of each field; protobuf's wire format."""
+def _fields(message: Any) -> dict[int, Any]:
+    """Read the values (int or memoryview) of each field by number; protobuf's wire format."""
+    fields: dict[int, Any] = defaultdict(list)
     position = 0
     while position < len(message):
         tag, position = _varint(message, position)
         number, wire_type = tag >> 3, tag & 7
-        if number == 0:
-            raise ValueError("a field has number 0")
-        if wire_type == 0:  # a number
-            value, position = _varint(message, position)
-            yield number, value
-            continue
-        if wire_type == 2:  # bytes
+        if number == 0 or wire_type not in (0, 1, 2, 5):
+            raise ValueError(f"it holds a field {number} of wire type {wire_type}")
+        length = {1: 8, 5: 4}.get(wire_type, 0)  # numbers of 64 and 32 bits
+        if wire_type in (0, 2):  # a number, or the length of bytes
             length, position = _varint(message, position)
-        elif wire_type in (1, 5):  # numbers of 64 and 32 bits
-            length = 8 if wire_type == 1 else 4
-        else:
-            raise ValueError(f"unknown wire type {wire_type}")
+        if wire_type == 0:
+            fields[number].append(length)
+            continue
         if position + length > len(message):
             raise ValueError("it ends within a field")
-        yield number, message[position : position + length]
+        fields[number].append(message[position : position + length])
         position += length
+    return fields
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:
@@ -405,11 +374,5 @@ def _varint(message: memoryview, position: int) -> tuple[int, int]:
     raise ValueError("it ends within a number, or one is longer than 10 bytes")
 
 
-def _bytes(value: Any) -> memoryview:
-    if isinstance(value, int):
-        raise ValueError("a number where bytes were expected")
-    return value
-
-
-def _text(value: Any) -> str:
-    return "" if value is None else bytes(_bytes(value)).decode("utf-8")
+def _text(fields: dict[int, Any], number: int) -> str:
+    return str(fields[number][-1], "utf-8") if fields[number] else ""
