@@ -101,7 +101,7 @@ def check_tensors(session: onnxruntime.InferenceSession, task: Task) -> None:
     for name, entry in task.observation.items():
         kind = "float" if entry.dtype == "float32" else entry.dtype
         wanted[name] = (f"tensor({kind})", entry.shape)
-    _compare("inputs", session.get_inputs(), wanted)
+    _compare("input", session.get_inputs(), wanted)
     _compare("output", session.get_outputs(), {OUTPUT: ("tensor(float)", [len(task.action)])})
 
 
@@ -110,7 +110,11 @@ def _compare(what: str, tensors: list, wanted: dict[str, tuple[str, list[int]]])
     found = {each.name: (each.type, each.shape[1:]) for each in tensors}
     batches = [each.shape[0] if each.shape else 0 for each in tensors]
     if found != wanted or any(batch != 1 and isinstance(batch, int) for batch in batches):
-        raise UserError(f"its {what} must be {wanted} behind a batch, it has {found}")
+        asked, has = (
+            ", ".join(f"{name} {kind} {['batch', *shape]}" for name, (kind, shape) in each.items())
+            for each in (wanted, found)
+        )
+        raise UserError(f"its {what} must be {asked}; it has {has or 'none'}")
 
 
 def policy_id_of(data: bytes) -> str:
@@ -279,11 +283,11 @@ _OPERATORS: tuple[tuple[str, Optional[slice], tuple[str, ...]], ...] = (
                           "MaxUnpool", "MelWeightMatrix", "NonMaxSuppression", "NonZero",
                           "Range", "SequenceInsert", "StringNormalizer", "StringSplit", "Unique")),
     (_COST, slice(1, 5), ("AffineGrid", "CenterCropPad", "Col2Im", "Compress", "DFT", "Expand",
-                          "GRU", "LSTM", "OneHot", "Pad", "Reshape", "Resize", "RoiAlign", "SequenceAt",
-                          "SequenceErase", "Slice", "Split", "SplitToSequence", "Squeeze", "STFT",
-                          "Tile", "TopK", "Unsqueeze", "ReduceL1", "ReduceL2", "ReduceLogSum",
-                          "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceProd",
-                          "ReduceSum", "ReduceSumSquare", "RNN")),
+                          "GRU", "LSTM", "OneHot", "Pad", "Reshape", "Resize", "RoiAlign",
+                          "SequenceAt", "SequenceErase", "Slice", "Split", "SplitToSequence",
+                          "Squeeze", "STFT", "Tile", "TopK", "Unsqueeze", "ReduceL1", "ReduceL2",
+                          "ReduceLogSum", "ReduceLogSumExp", "ReduceMax", "ReduceMean",
+                          "ReduceMin", "ReduceProd", "ReduceSum", "ReduceSumSquare", "RNN")),
 )  # fmt: skip
 
 
