@@ -8,7 +8,6 @@ seniority.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import threading
@@ -31,7 +30,6 @@ _POLL_S = 0.1
 # Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
 _FIRST_LOOKS_S = 0.3
 _LOOK_S = 1.0
-_CONNECT_S = 0.2
 _JOIN_S = 0.5
 _LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
 
@@ -90,7 +88,11 @@ class Link:
         session, state_key = self._session, key(self.vehicle_id, "state")
         rearm_key = key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(state_key, _at_once(only_own(state_key, state_came))),
+            session.declare_subscriber(
+                state_key,
+                # Zenoh's own thread calls: no queue of old states can form.
+                zenoh.handlers.Callback(only_own(state_key, state_came), indirect=False),
+            ),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(rearm_key, rearm_asked),
         ]
@@ -141,42 +143,21 @@ class Link:
             self._session.close()
 
 
-def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
-    """Let Zenoh's own thread call: no second thread to wake, and no queue of old states between.
-
-    The callback must be quick, for nothing else is received meanwhile. A native thread that calls
-    into Python builds a Python state and takes it down for each call: tens of microseconds. One
-    PyGILState_Ensure that is never released keeps it, as long as the thread and its session live.
-    """
-    thread = threading.local()
-
-    def call(sample: zenoh.Sample) -> None:
-        if not hasattr(thread, "keeps_its_state"):
-            ctypes.pythonapi.PyGILState_Ensure()
-            thread.keeps_its_state = True
-        callback(sample)
-
-    return zenoh.handlers.Callback(call, indirect=False)
-
-
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
     query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
 
 
-def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
-    """Return whether a router answers. Raises UserError where another runtime has this vehicle id.
+def require_free(open_client: OpenClient, vehicle_id: str) -> None:
+    """Raise UserError where a router knows another runtime with this vehicle id.
 
     Two peers do not hear each other through a router, so a client asks it. The token of a process
     that was just killed may stay for a lease, so a token counts only if it outlasts that.
     """
     selector = f"{key(vehicle_id, 'alive')}/**"
-    found = _ask(open_client, selector)
-    if found:
+    if _ask(open_client, selector):
         time.sleep(_LEFTOVER_S)
-        found = _ask(open_client, selector)
-        if found:
+        if _ask(open_client, selector):
             raise taken(vehicle_id)
-    return found is not None
 
 
 def taken(vehicle_id: str) -> UserError:
@@ -205,8 +186,6 @@ class Presence:
         self._session, self._key, self._open_client = session, alive_key, open_client
         self._give_way, self._listener = give_way, listener
         self._known: Set[str] = set()
-        self._seen_before: Set[str] = set()
-        self._looks = 0
         self._tokens: List[Any] = []
         self._routers = self._seen_routers()
         self._declare()
@@ -215,29 +194,27 @@ class Presence:
 
     def refresh(self) -> bool:
         """Declare the tokens again if other routers are there than the last time."""
-        before, self._routers = self._routers, self._seen_routers()
-        if not self._routers or self._routers == before:
-            return False
-        if self._listener:
-            self._listener.look()  # before anybody sees the tokens, and sends
-        try:
-            self._declare()
-        except zenoh.ZError:
-            self._routers = []  # so that it is tried again
-            raise
-        return True
+        routers = self._seen_routers()
+        if routers and routers != self._routers:
+            if self._listener:
+                self._listener.look()  # before anybody sees the tokens, and sends
+            self._declare()  # it is tried again where this fails
+            self._routers = routers
+            return True
+        self._routers = routers
+        return False
 
     def look(self) -> None:
         """Look for other claims; give way to an elder one that is seen for the second time."""
-        found = _ask(self._open_client, f"{self._key}/*") or []
+        found = _ask(self._open_client, f"{self._key}/*")
         claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
-        seen_twice = claims & self._seen_before
+        seen_twice = claims & (self._seen_before or set())
         for claim in sorted(seen_twice - self._known):
             self._known.add(claim)
             self.rivals += 1
             log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
+        self._pause_s = _FIRST_LOOKS_S if self._seen_before is None else _LOOK_S
         self._seen_before = claims
-        self._looks += 1
         if any(claim < self.claim for claim in seen_twice):
             self._give_way()
 
@@ -252,11 +229,10 @@ class Presence:
         self._take_back()
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
-        self._seen_before, self._looks = set(), 0
-        self._tokens = [
-            self._session.liveliness().declare_token(key)
-            for key in (self._key, f"{self._key}/{self.claim}")
-        ]
+        self._seen_before: Optional[Set[str]] = None
+        self._pause_s = _FIRST_LOOKS_S
+        for token in (self._key, f"{self._key}/{self.claim}"):
+            self._tokens.append(self._session.liveliness().declare_token(token))
 
     def _take_back(self) -> None:
         while self._tokens:
@@ -266,34 +242,26 @@ class Presence:
         return sorted(map(str, self._session.info.routers_zid()))
 
     def _run(self) -> None:
-        next_look_s = time.monotonic() + _FIRST_LOOKS_S
+        looked_s = time.monotonic()
         while not self._stopping.wait(_POLL_S):
             try:
                 if self.refresh():
-                    next_look_s = time.monotonic() + _FIRST_LOOKS_S
-                if self._routers and time.monotonic() >= next_look_s:
+                    looked_s = time.monotonic()
+                if self._routers and time.monotonic() >= looked_s + self._pause_s:
+                    looked_s = time.monotonic()
                     if self._listener and self._listener.refusal(time.time()):
                         self._listener.look()
                     self.look()
-                    pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
-                    next_look_s = time.monotonic() + pause_s
             except zenoh.ZError as error:
                 log.event("error", "token_not_declared", detail=error)
 
 
-def wait_for_router(session: zenoh.Session) -> None:
-    """Wait up to 0.2 s for the router that answered: before it is linked tokens go out twice."""
-    end_s = time.monotonic() + _CONNECT_S
-    while not session.info.routers_zid() and time.monotonic() < end_s:
-        time.sleep(0.002)
-
-
-def _ask(open_client: OpenClient, selector: str) -> Optional[List[str]]:
-    """Return the tokens that a router knows, None where no router answers."""
+def _ask(open_client: OpenClient, selector: str) -> List[str]:
+    """Return the tokens that a router knows; none where no router answers."""
     try:
         session = open_client()
     except UserError:
-        return None
+        return []
     try:
         replies = session.liveliness().get(selector, timeout=1.0)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

@@ -43,10 +43,10 @@ class _Way:
         self.newest = -1
 
     def note(self, number: int, came: int = 1) -> None:
-        """Count `came` messages up to this number; a late one is no longer lost."""
-        self.sent += max(number - self.newest, 0)
+        """Count `came` messages up to this number."""
+        self.sent += number - self.newest
         self.came += came
-        self.newest = max(number, self.newest)
+        self.newest = number
         self.counts.append((self.sent, self.came))
 
     def lost_percent(self) -> float:
@@ -56,16 +56,15 @@ class _Way:
 
 
 class LinkQuality:
-    """Measures the link by each message that is noted. Every call takes some microseconds."""
+    """Measures the link by each accepted state and each command that is sent."""
 
     def __init__(self) -> None:
-        self._session = ""
-        self._begin()
+        self._begin("")
 
-    def _begin(self) -> None:
+    def _begin(self, session: str) -> None:
+        self._session = session
         self.up, self.down = _Way(), _Way()
-        self._episode, self._first = -1, 0  # `_first`: the number of its step 0
-        self._recent: Deque[int] = deque(maxlen=64)  # numbers of states: a copy is no message
+        self._episode = -1
         self._sent: Dict[int, Tuple[int, int]] = {}  # a command's number and episode by its stamp
         self._commands = self._heard = self._heard_ns = 0
         self._answered = -1  # the episode of the command that was heard last
@@ -76,28 +75,18 @@ class LinkQuality:
         if len(self._sent) > TIMES:
             del self._sent[next(iter(self._sent))]
 
-    def note_state(self, state: State, arrived_ns: int, is_new: bool = True) -> None:
-        """Note a state that came; `is_new` is False where a newer one has overtaken it."""
-        if state.session != self._session:  # another simulator: another clock, another network
-            if not is_new:
-                return  # it is the simulator before that is heard once more
-            self._begin()
-            self._session = state.session
-            self.up.newest = state.step - 1  # what came before it was not ours to hear
-        if state.episode > self._episode:
-            self._first = 0 if self._episode < 0 else self.up.newest + 1
+    def note_state(self, state: State, arrived_ns: int) -> None:
+        is_first = state.session != self._session
+        if is_first:  # another simulator: another clock, another network
+            self._begin(state.session)
+        if state.episode != self._episode:  # what was under way when one ended is no loss
             self._episode = state.episode
-        number = self._first + state.step
-        if state.episode < self._episode or number in self._recent:
+            self.up.newest = state.step - 1 if is_first else -1
+        if state.final:  # no network carries it
             return
-        self._recent.append(number)
-        if state.final:  # no network carries it, and what was under way is forgotten
-            self.up.newest = max(number, self.up.newest)
-            return
-        self.up.note(number)
+        self.up.note(state.step)
         self.up.times_ms.append((arrived_ns - state.sent_ns) * 1e-6)
-        if number == self.up.newest:
-            self._note_heard(state.heard, state.heard_sent_ns, state.heard_ns)
+        self._note_heard(state.heard, state.heard_sent_ns, state.heard_ns)
 
     def _note_heard(self, heard: Any, sent_ns: Any, heard_ns: Any) -> None:
         number, episode = self._sent.get(sent_ns, (0, -1))
@@ -137,6 +126,9 @@ def link_words(link: Mapping[str, float]) -> str:
     """Render the link for a person; that of another version, with other fields, is not known."""
     if not link.keys() >= set(FIELDS):
         return "not known yet"
-    way = "{0} {{{0}_ms:.1f}} ms, jitter {{{0}_jitter_ms:.1f}}, {{{0}_lost_percent:.1f}} % lost"
-    text = f"{way.format('up')}; {way.format('down')}; delays +-{{error_ms:.1f}} ms"
-    return text.format(**link)
+    ways = (
+        f"{way} {link[f'{way}_ms']:.1f} ms, jitter {link[f'{way}_jitter_ms']:.1f},"
+        f" {link[f'{way}_lost_percent']:.1f} % lost"
+        for way in ("up", "down")
+    )
+    return f"{'; '.join(ways)}; delays +-{link['error_ms']:.1f} ms"

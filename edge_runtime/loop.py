@@ -28,7 +28,7 @@ from edge_runtime.link_quality import LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms
-from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Reason, Rejection, is_foreign
+from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Rejection, is_foreign
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
     from edge_runtime.vehicles.base import VehicleRunner
@@ -164,11 +164,10 @@ class ControlLoop:
                 self._log_rejection(self._latest.reject(state), arrived_s)
                 return
             rejection = self._latest.offer(state, arrived_s)
-            if rejection is None or rejection.reason is Reason.STALE:
-                self._link_quality.note_state(state, arrived_ns, is_new=rejection is None)
             if rejection is not None:
                 self._log_rejection(rejection, arrived_s)
                 return
+            self._link_quality.note_state(state, arrived_ns)
             is_waiting = self._slot is not None
             self._superseded += int(is_waiting)
             self._slot = Received(state, arrived_s, arrived_ns)

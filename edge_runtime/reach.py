@@ -7,7 +7,6 @@ and of a busy port neither its number nor the cause.
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
 import socket
 import ssl
@@ -37,9 +36,19 @@ def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
         plain = socket.create_connection((host, port), timeout=_LOOK_S)
     except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
         return False, f"port {port} of {host}: {error}".lower()
-    with contextlib.closing(plain):
-        why = _why_not(plain, host, files)
-    return True, why and f"{endpoint} {why}"
+    with plain:
+        if files is None:
+            return True, f"{endpoint} gives no plain link: with TLS it wants --tls, tls/ for tcp/"
+        try:
+            with _context(files).wrap_socket(plain, server_hostname=host) as link:
+                link.settimeout(_ALERT_S)
+                with contextlib.suppress(socket.timeout):  # it is silent: we are let in
+                    link.recv(1)
+        except ssl.SSLCertVerificationError as error:
+            return True, f"{endpoint} is not believed here: {error.verify_message}"
+        except OSError as error:
+            return True, f"{endpoint} gives no TLS link to {files.name}: {error}"
+    return True, ""
 
 
 def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
@@ -51,35 +60,10 @@ def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
     return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
 
 
-def _why_not(plain: socket.socket, host: str, files: Optional[TlsFiles]) -> str:
-    """Shake hands; say what is wrong. Without files nobody should be able to."""
-    try:
-        with _context(files).wrap_socket(plain, server_hostname=host) as link:
-            link.settimeout(_ALERT_S)
-            with contextlib.suppress(socket.timeout):  # it is silent: we are let in
-                link.recv(1)
-    except ssl.SSLCertVerificationError as error:
-        return f"shows a certificate that is not believed here: {error.verify_message}"
-    except OSError as error:
-        reason = str(getattr(error, "reason", "") or error.strerror or error)
-        is_tls = "ALERT" in reason
-    else:
-        reason, is_tls = "", True
-    if files is None:
-        other = "answers, but not as a simulator or a router does"
-        return "listens with TLS and wants --tls, with tls/ for tcp/" if is_tls else other
-    if is_tls and reason:
-        return f"refuses the certificate of {files.name} ({reason})"
-    return reason and f"gives no TLS link to {files.name}: {reason}"
-
-
-def _context(files: Optional[TlsFiles]) -> ssl.SSLContext:
+def _context(files: TlsFiles) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
-    if files is None:
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    else:
-        context.load_verify_locations(files.ca)
-        context.load_cert_chain(files.certificate, files.key)
+    context.load_verify_locations(files.ca)
+    context.load_cert_chain(files.certificate, files.key)
     return context
 
 
@@ -130,9 +114,8 @@ def check_port_is_free(endpoint: str) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(protocol != "udp"))
             probe.bind(target)
     except (OSError, UnicodeError) as error:
-        is_busy = getattr(error, "errno", None) == errno.EADDRINUSE
-        why = "is in use" if is_busy else f"cannot be listened at ({error})"
-        raise UserError(f"{endpoint} {why}; choose another with --listen") from None
+        what = f"cannot listen at {endpoint} ({error})"
+        raise UserError(f"{what}; choose another with --listen") from None
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
-from edge_runtime.link import Link, require_free, taken, wait_for_router
+from edge_runtime.link import Link, require_free, taken
 from edge_runtime.link_quality import link_words
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, look
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
-from edge_runtime.transport import is_tls, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.util import PathLike, ending_signals, ends_within, printable, take_signals
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
@@ -156,11 +156,9 @@ class _Runtime:
         # Both sessions hear only what this vehicle's edge may hear.
         connected = partial(open_session, connect=config.connect, tls=self._tls, access=access)
         self._open_client = partial(connected, mode="client")
-        has_router = require_free(self._open_client, config.vehicle_id)
+        require_free(self._open_client, config.vehicle_id)
         self._session = connected(mode="peer")
         unbuilt.callback(self._session.close)  # An open one would hang the process at its exit.
-        if has_router:
-            wait_for_router(self._session)
         listener = None if self._tls is None else Listener(config.connect, self._tls)
         self._link = Link(self._session, config.vehicle_id, manifest, listener)
         self._vehicle: Optional[VehicleRunner] = None
@@ -286,5 +284,5 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
 
 def rearm_command(connect: str, vehicle_id: str) -> str:
     """Return what an operator types to let a vehicle drive again."""
-    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
+    tls = f" --tls certs/operator-{vehicle_id}" if connect.startswith("tls/") else ""
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"

@@ -121,14 +121,3 @@ def test_a_poor_link_is_poor_until_it_is_well_within_the_limits(name):
         found.append(poor)
         assert is_poor({}, 0.1, poor) is poor  # an unknown one is as it was
     assert found == [False, True, True, True, False, False]
-
-
-def test_late_states_are_not_lost_and_copies_count_once():
-    network = Network()
-    network.run(100)
-    first, second, third = (make_state(100 + n, session="a", sent_ns=n) for n in range(3))
-    for state in (third, first, first, third):
-        network.quality.note_state(state, 0)
-    assert network.quality.up.sent - network.quality.up.came == 1
-    network.quality.note_state(second, 0)
-    assert network.quality.measured()["up_lost_percent"] == 0.0
