@@ -1,20 +1,149 @@
-"""The command line: `python -m edge_runtime`, or `phil-edge` where the wheel is installed."""
+"""The command line: `python -m edge_runtime`, or `phil-edge` where the wheel is installed.
+
+Here are the commands that do not drive: `check` of a policy, and an operator's `status` and
+`rearm`. `run` is in run.py.
+"""
 
 from __future__ import annotations
 
+import argparse
+import itertools
+import json
 import os
+from typing import Any, Dict
 
-from edge_runtime.cli import program, run_cli
+import msgspec
 
-COMMANDS = {
-    "check": ("edge_runtime.commands:CHECK", "say whether a policy may drive, and how fast it is"),
-    "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
-    "status": ("edge_runtime.commands:STATUS", "print the status of a running edge runtime"),
-    "rearm": ("edge_runtime.commands:REARM", "let a vehicle drive again after a safe stop"),
-}
+from edge_runtime.cli import Subcommand, examples, program, run_cli
+from edge_runtime.config import Config, add_flags, add_trust
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link import ask
+from edge_runtime.link_quality import link_words
+from edge_runtime.policy import infer, load_policy, probes
+from edge_runtime.service import peak_memory_mb, quantiles_ms
+from edge_runtime.tls import OPERATOR, check_name, common_name
+from edge_runtime.transport import check_endpoint, tls_for
+from edge_runtime.util import UserError, printable
+
+_RUNS = 300
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("policy", metavar="POLICY.onnx", help="policy file to check")
+    parser.add_argument("--out", metavar="FILE.json", help="also write the report to this file")
+    add_trust(parser)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    """Print the report as JSON. Raises UserError where the policy may not drive."""
+    check_writable(arguments.out)
+    policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
+    runs = itertools.islice(itertools.cycle(probes(policy.layout)), _RUNS)
+    inference_ms = quantiles_ms([infer(policy, seen)[1] for seen in runs])
+    limit_ms = policy.manifest.control_period_s * 1000
+    if inference_ms["p99"] > limit_ms:
+        took = f"its inference takes {inference_ms['p99']:.0f} ms (p99), over {limit_ms:.0f} ms"
+        raise UserError(f"policy {arguments.policy} may not drive: {took}")
+    import onnxruntime  # Here: an operator's commands need none.
+
+    report = {
+        "policy_id": policy.policy_id,
+        "trust": policy.trust,
+        "public_key": policy.public_key,
+        "manifest": msgspec.to_builtins(policy.manifest),
+        "inference_ms": inference_ms,
+        "inference_runs": _RUNS,
+        "memory_mb": peak_memory_mb(),
+        "onnxruntime": onnxruntime.__version__,
+    }
+    print(json.dumps(report, indent=2))
+    write_json_out(arguments.out, report)
+    return 0
+
+
+def _add_operator(parser: argparse.ArgumentParser) -> None:
+    add_flags(parser, "connect", "tls", "vehicle_id")
+    parser.set_defaults(connect=Config().connect, vehicle_id=Config().vehicle_id)
+
+
+def _add_status(parser: argparse.ArgumentParser) -> None:
+    _add_operator(parser)
+    parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    check_writable(arguments.out)
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
+    try:
+        print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
+    except (LookupError, TypeError, ValueError, AttributeError):
+        raise UserError(f"what answers for {arguments.vehicle_id} is no edge runtime") from None
+    write_json_out(arguments.out, reply)
+    return 0
+
+
+def _rearm(arguments: argparse.Namespace) -> int:
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    if tls is not None:
+        check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
+    reply = ask(arguments.connect, arguments.vehicle_id, "rearm", tls)
+    if reply.get("accepted") is not True:
+        why = reply.get("detail", "it does not say why")
+        raise UserError(f"{arguments.vehicle_id} was not re-armed: {why}")
+    print(f"{arguments.vehicle_id} is re-armed; it drives once 5 states in a row were fresh")
+    return 0
+
+
+_NOT_SHOWN = ("manifest", "schema", "sent_ns")
+
+
+def render_status(status: Dict[str, Any]) -> str:
+    """Render the reply of the queryable: a line for each field, some in words."""
+    rows = {
+        **{name: value for name, value in status.items() if name not in _NOT_SHOWN},
+        "policy_id": f"{status['policy_id'][:12]} ({status['manifest']['task']})",
+        "link": link_words(status.get("link", {})),
+    }
+    width = max(map(len, rows))
+    return "\n".join(f"{name:<{width}}  {printable(_words(rows[name]))}" for name in rows)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(each)}" for name, each in value.items()) or "none"
+    return f"{value:.2f}" if isinstance(value, float) else str(value) or "none"
 
 
 _TRUSTED = "my.onnx \\\n    --public-key keys/policy.pub"
+CHECK = Subcommand(
+    examples(
+        f"python -m edge_runtime check {_TRUSTED}",
+        "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
+    ),
+    _add_check,
+    _check,
+)
+STATUS = Subcommand(
+    examples("python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01"),
+    _add_status,
+    _status,
+)
+REARM = Subcommand(
+    examples(
+        "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
+        "    --tls certs/operator-hunter01 --vehicle-id hunter01",
+    ),
+    _add_operator,
+    _rearm,
+)
+COMMANDS = {
+    "check": (CHECK, "say whether a policy may drive, and how fast it is"),
+    "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
+    "status": (STATUS, "print the status of a running edge runtime"),
+    "rearm": (REARM, "let a vehicle drive again after a safe stop"),
+}
 main = program(
     "python -m edge_runtime",
     "Drives a verified policy over Zenoh, and stops safely when in doubt.",

@@ -6,51 +6,51 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import math
 import os
 import signal
 import sys
-import textwrap
+import threading
 import time
 from importlib import import_module
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
+from typing import (
+    Any,
+    Callable,
+    Dict,
+    Iterable,
+    Iterator,
+    List,
+    NamedTuple,
+    NoReturn,
+    Optional,
+    Tuple,
+)
 
 from edge_runtime import __version__
-from edge_runtime.util import UserError, ending_signals, printable, take_signals
+from edge_runtime.util import UserError, printable
 
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+ENDING_SIGNALS = (*SIGNALS, signal.SIGHUP)
 AGAIN_S = 0.3  # A second signal so soon is the same one: `timeout` signals process and group
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
-_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
-class HelpFormatter(argparse.HelpFormatter):
-    """Shows the default of every option that has one, and keeps paragraphs, examples and words."""
-
-    def _split_lines(self, text: str, width: int) -> List[str]:
-        # An option's name broken at its hyphen could not be copied.
-        return textwrap.wrap(text, width, break_on_hyphens=False, break_long_words=False)
+class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows the default of every option that has one, and keeps the lines of examples."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        # Examples are copied into a shell: their lines stay as they are.
-        return "\n\n".join(
-            paragraph
-            if paragraph.startswith("example")
-            else "\n".join(indent + line for line in self._split_lines(paragraph, width))
-            for paragraph in text.strip().split("\n\n")
-        )
+        # Examples are copied into a shell.
+        return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
-        text = action.help or ""
         # By identity: 0 is a default worth showing, though it equals False.
-        hidden = any(action.default is nothing for nothing in (None, False, argparse.SUPPRESS))
-        if hidden or action.default == [] or "(default: " in text or "%(default)" in text:
-            return text
-        return f"{text} (default: %(default)s)".strip()
+        hidden = any(action.default is nothing for nothing in (None, False))
+        if hidden or action.default == [] or "(default: " in (action.help or ""):
+            return action.help
+        return super()._get_help_string(action)
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -65,15 +65,6 @@ class ArgumentParser(argparse.ArgumentParser):
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(*args, **kwargs)
         self.register("type", "path", os.path.abspath)
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, and refuse an empty value: as a path it is the current directory."""
-        given = sys.argv[1:] if args is None else list(args)
-        pairs = [] if self._subparsers else zip(["", *given], given)
-        for before, value in pairs:  # a command's own parser does it for the words after it
-            if not value or (value.startswith("--") and value.find("=") == len(value) - 1):
-                self.error(f"an empty value after {value[:-1] or before}")
-        return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
@@ -91,8 +82,7 @@ def add_public_key(parser: Any) -> None:
     parser.add_argument(
         "--public-key",
         metavar="FILE",
-        # One that is missing is named in the error as it was typed.
-        type=lambda text: os.path.abspath(text) if os.path.exists(text) else text,
+        type="path",
         help="public key that verifies the policy's signature, Ed25519 as PEM (default:"
         " keys/policy.pub where it exists; with --allow-unsigned first policy.pub beside the"
         " policy)",
@@ -114,13 +104,12 @@ def command(place: str, *shown: str) -> Callable[[Callable[[Any], None]], Subcom
 
 
 def program(
-    name: str, description: str, commands: Dict[str, Tuple[str, str]], *shown: str
+    name: str, description: str, commands: Dict[str, Tuple[Any, str]], *shown: str
 ) -> Callable[[List[str]], int]:
     """Make the `main(argv)` that runs one of many commands. `shown` are examples for its help.
 
-    `commands` has for each name a place and one line on what it does. The place is a module with
-    EXAMPLE, `add_arguments(parser)` and `run(arguments)`, or `module:name` of a `Subcommand`.
-    Only the command that is asked for is loaded: a mock of a chassis need not wait for torch.
+    `commands` has for each name a `Subcommand` and one line on what it does; or a place that is
+    loaded only when it is asked for: `module:name` of a Subcommand, or a module that is like one.
     """
 
     def main(argv: List[str]) -> int:
@@ -132,7 +121,7 @@ def program(
             text = f"{summary[0].upper()}{summary[1:]}."
             subparser = parsers.add_parser(command, help=summary, description=text)
             if argv[:1] == [command]:
-                chosen = _load(place)
+                chosen = _load(place) if isinstance(place, str) else place
                 subparser.epilog = chosen.EXAMPLE
                 chosen.add_arguments(subparser)
         arguments = parser.parse_args(argv or ["--help"])
@@ -142,7 +131,6 @@ def program(
 
 
 def _load(place: str) -> Any:
-    """Import a module, or `module:name` in it."""
     module, _, name = place.partition(":")
     found = import_module(module)
     return getattr(found, name) if name else found
@@ -151,32 +139,24 @@ def _load(place: str) -> Any:
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:
     """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
 
-    UserError, an OSError about a file and a full disk, also behind stdout, become one line on
-    stderr and status 2. ^C is status 130; a reader that closed the pipe (`| head`) is 141.
-    Use: `sys.exit(run_cli(main))`.
+    UserError and OSError, such as that of a full disk, become one line on stderr and status 2. ^C
+    is status 130; a reader that closed the pipe (`| head`) is 141. Use: `sys.exit(run_cli(main))`.
     """
     try:
         try:
             return main(sys.argv[1:] if argv is None else argv)
         finally:
-            if sys.stdout is not None:  # now: at the exit nobody could say what is wrong
-                sys.stdout.flush()
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        return BAD_INPUT
+            sys.stdout.flush()  # now: at the exit nobody could say what is wrong
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr, flush=True)
         return INTERRUPTED
     except BrokenPipeError:
         _drop_stdout()
         return BROKEN_PIPE
-    except OSError as error:
-        if error.filename is None:
-            if error.errno not in _DISK_IS_FULL:
-                raise
+    except (UserError, OSError) as error:
+        if isinstance(error, OSError):
             _drop_stdout()  # it may be stdout that takes no more
-        what = printable(str(error.filename or "cannot write"))
-        print(f"error: {what}: {error.strerror}", file=sys.stderr, flush=True)
+        print(f"error: {UserError(error)}", file=sys.stderr, flush=True)
         return BAD_INPUT
 
 
@@ -216,7 +196,7 @@ share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the block for SIGTERM and all else that would end this process.
+    """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too.
 
     So sessions are closed and files are finished. Outside of the main thread it does nothing.
     """
@@ -224,8 +204,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
     def interrupt(number: int, frame: Any) -> NoReturn:
         raise KeyboardInterrupt
 
-    with contextlib.ExitStack() as undo:
-        take_signals(ending_signals(), _once(interrupt), undo)
+    with handled(ENDING_SIGNALS, interrupt):
         yield
 
 
@@ -245,18 +224,31 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
             os.kill(os.getpid(), number)
 
     with contextlib.ExitStack() as undo:
-        take_signals(SIGNALS, _once(stop), undo)
+        undo.enter_context(handled(SIGNALS, stop))
         yield
 
 
-def _once(handler: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
-    """Ignore signals within ``AGAIN_S`` of the last one that was handled."""
+@contextlib.contextmanager
+def handled(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle signals in the block; a signal within ``AGAIN_S`` of the last one is the same one.
+
+    A signal that is ignored stays so (SIGHUP under nohup). Does nothing outside of the main thread.
+    """
     had_s = -math.inf
 
-    def handle(number: int, frame: Any) -> None:
+    def once(number: int, frame: Any) -> None:
         nonlocal had_s
         if (now_s := time.monotonic()) - had_s > AGAIN_S:
             had_s = now_s
             handler(number, frame)
 
-    return handle
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in numbers if is_main}
+    before = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
+    try:
+        for number in before:
+            signal.signal(number, once)
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

@@ -10,12 +10,10 @@ import fcntl
 import json
 import os
 import secrets
-import stat
-import zlib
 from pathlib import Path
-from typing import Any, BinaryIO, Optional
+from typing import Any, Optional
 
-from edge_runtime.util import PathLike, UserError, open_regular
+from edge_runtime.util import PathLike, UserError
 
 
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
@@ -26,35 +24,18 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """
     target = _checked(path)
     make_directory(target.parent)
-    temporary = None
+    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
-        with _temporary(target) as stream:
-            temporary = stream.name
+        with temporary.open("xb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-            os.replace(temporary, target)
-    except BaseException as error:
-        if temporary is not None:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
-        if isinstance(error, OSError):
-            raise UserError(f"cannot write {target}: {error.strerror}") from None
-        raise
-
-
-def _temporary(target: Path) -> BinaryIO:
-    """Open a locked file beside the target; delete those of writers that were killed."""
-    begin = f".{zlib.crc32(os.fsencode(target.name)):08x}-"
-    for left in target.parent.glob(f"{begin}*"):
-        with contextlib.suppress(OSError), open_regular(left) as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            left.unlink()
-    stream = target.with_name(f"{begin}{secrets.token_hex(8)}").open("xb")
-    with contextlib.suppress(OSError):  # No locks on this file system: then nothing is deleted.
-        fcntl.flock(stream, fcntl.LOCK_EX)
-    # Another writer may have deleted it just before the lock.
-    return stream if os.fstat(stream.fileno()).st_nlink else _temporary(target)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise UserError(f"cannot write {target}: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
@@ -66,10 +47,10 @@ def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
         return None
     target = _checked(path)
     directory = next(place for place in target.absolute().parents if os.path.exists(place))
-    if not directory.is_dir():
-        raise UserError(f"cannot write {target}: {directory} is no directory")
-    if not os.access(str(directory), os.W_OK | os.X_OK):
-        raise UserError(f"cannot write {target}: the directory {directory} is read-only")
+    if not directory.is_dir() or not os.access(str(directory), os.W_OK | os.X_OK):
+        raise UserError(
+            f"cannot write {target}: {directory} is no directory that can be written to"
+        )
     return os.path.abspath(path)
 
 
@@ -94,13 +75,7 @@ def write_json_out(path: Optional[PathLike], value: Any) -> None:
 
 def _checked(path: PathLike) -> Path:
     """Return the file to replace; UserError for a directory, a device or a pipe."""
-    try:
-        is_file = stat.S_ISREG(os.stat(path).st_mode)
-    except FileNotFoundError:
-        is_file = True
-    except (OSError, ValueError) as error:  # ValueError: a NUL inside the name
-        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', error)}") from None
-    if not is_file:
+    if os.path.exists(path) and not os.path.isfile(path):
         raise UserError(f"cannot write {path}: it is no regular file")
     return Path(path)
 
@@ -111,6 +86,4 @@ def try_to_lock_file(descriptor: int) -> bool:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # No locks on this file system: then nobody can hold one.
-        pass
     return True

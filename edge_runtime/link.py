@@ -20,8 +20,9 @@ import zenoh
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
 from edge_runtime.reach import Listener
-from edge_runtime.transport import LEASE_MS, only_own
-from edge_runtime.util import UserError
+from edge_runtime.tls import TlsFiles
+from edge_runtime.transport import LEASE_MS, only_own, open_session
+from edge_runtime.util import UserError, parse_json
 from edge_runtime.wire import Health, Message, Rejection, encode, key
 
 OpenClient = Callable[[], zenoh.Session]
@@ -267,3 +268,20 @@ def _ask(open_client: OpenClient, selector: str) -> List[str]:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
     finally:
         session.close()
+
+
+def ask(
+    connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
+) -> Dict[str, Any]:
+    """Query a runtime for its JSON reply. Raises UserError where none comes in 2 s.
+
+    `topic` is "status" or "rearm".
+    """
+    selector = key(vehicle_id, topic)
+    with open_session(connect=connect, mode="client", tls=tls) as session:
+        for reply in session.get(selector, timeout=2.0):
+            if reply.ok is not None:
+                return parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
+    # A query without the right to it looks the same from here as a runtime that is not there.
+    hint = f", or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
+    raise UserError(f"no edge runtime with vehicle id {vehicle_id} is connected to {connect}{hint}")

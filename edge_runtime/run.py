@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import os
-import queue
 import signal
 import threading
 import time
@@ -14,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 
 from edge_runtime import log, service
+from edge_runtime.cli import ENDING_SIGNALS, handled
 from edge_runtime.config import NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
 from edge_runtime.link import Link, require_free, taken
@@ -22,8 +21,8 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, look
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
-from edge_runtime.transport import open_session
-from edge_runtime.util import PathLike, ending_signals, ends_within, printable, take_signals
+from edge_runtime.transport import is_tls, open_session
+from edge_runtime.util import PathLike, ends_within, printable
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
     from edge_runtime.vehicles.base import Vehicle, VehicleRunner
@@ -31,7 +30,6 @@ if TYPE_CHECKING:  # Loaded only where there is a vehicle.
 
 _WAITING_PERIOD_S = 5.0
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
-_FORCE_S = 10.0  # longer than all that is waited for in the end
 
 EXAMPLE = r"""examples:
   python -m edge_runtime run --policy my.onnx --public-key keys/policy.pub
@@ -44,7 +42,7 @@ add_arguments = add_run_flags
 def run(arguments: argparse.Namespace) -> int:
     flags = {name: getattr(arguments, name, None) for name in (*Config.__struct_fields__, "bus")}
     drive(config=arguments.config, **flags)
-    for number in ending_signals():  # a second one must not change how it has ended
+    for number in ENDING_SIGNALS:  # a second one must not change how it has ended
         signal.signal(number, signal.SIG_IGN)
     return 0
 
@@ -64,13 +62,14 @@ def drive(
     TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
     it in the main thread only. Returns False where a thread hangs and would hold the interpreter's
     exit. Raises UserError where it cannot begin, and where it gave way to another runtime of the
-    same vehicle id.
+    same vehicle id; KeyboardInterrupt for a signal before the drive.
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
     flags = {"policy": policy and str(policy), "connect": connect, **settings}
+    stop = _Stop()
     try:
         # `unbuilt` closes what a build that fails has opened.
-        with contextlib.ExitStack() as undo, contextlib.ExitStack() as unbuilt:
+        with handled(ENDING_SIGNALS, stop.by_signal), contextlib.ExitStack() as unbuilt:
             if driver is not None:
                 from edge_runtime.vehicles import check_driver
 
@@ -78,47 +77,24 @@ def drive(
                 _close_unless_built(driver, unbuilt)
             loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
             log.configure(loaded.log_level, loaded.log_format)
-            stop = _StopSignal(until, undo)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
-            ended = runtime.run(stop)
+            ended = runtime.run(stop, until)
     finally:
         written = log.close()
     return ended and written
 
 
-class _StopSignal:
-    """Remembers from the start that the run shall end, and hands it on once there is a loop."""
+class _Stop:
+    """Ends the drive at a signal; before there is one, the signal is ^C."""
 
-    def __init__(self, until: Optional[threading.Event], undo: contextlib.ExitStack) -> None:
-        self.came = False
-        self.on_stop: Callable[[], None] = lambda: None
-        self._signals: queue.SimpleQueue[Any] = queue.SimpleQueue()  # a handler may put at any time
-        self._over = threading.Event()
-        undo.callback(self._signals.put, None)
-        undo.callback(self._over.set)
-        threading.Thread(target=self._force, name="force", daemon=True).start()
-        take_signals({signal.SIGTERM, signal.SIGINT, *ending_signals()}, self._handle, undo)
-        if until is not None:
-            threading.Thread(target=self._wait, args=(until,), daemon=True).start()
+    def __init__(self) -> None:
+        self.on_stop: Optional[Callable[[], None]] = None
 
-    def _wait(self, until: threading.Event) -> None:
-        until.wait()
-        self._handle()
-
-    def _handle(self, *signalled: Any) -> None:
-        self.came = True
-        if signalled:
-            self._signals.put(None)
+    def by_signal(self, number: int, frame: Any) -> None:
+        if self.on_stop is None:
+            raise KeyboardInterrupt
         self.on_stop()
-
-    def _force(self) -> None:
-        """End the process where the main thread hangs, as in a driver's constructor."""
-        self._signals.get()
-        if not self._over.wait(_FORCE_S):
-            log.event("error", "ended_by_force", waited_s=_FORCE_S)
-            log.close()
-            os._exit(1)
 
 
 def _close_unless_built(vehicle: Vehicle, unbuilt: contextlib.ExitStack) -> None:
@@ -145,7 +121,6 @@ class _Runtime:
             from edge_runtime.vehicles import find_vehicle, make_vehicle
 
             find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
-        service.claim_resources(config.realtime_priority, config.cpus, config.lock_memory)
         self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
         manifest = self._policy.manifest
         if config.vehicle != NONE:
@@ -180,12 +155,16 @@ class _Runtime:
         self._over = threading.Event()
         self._failures: List[BaseException] = []
 
-    def run(self, stop: _StopSignal) -> bool:
+    def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
         """Drive until it is told to stop; returns False where a thread hangs.
 
         Raises UserError where a vehicle cannot be enabled, and where it gave way.
         """
         stop.on_stop = self._loop.stop
+        if until is not None:
+            waiter = threading.Thread(target=lambda: until.wait() and self._loop.stop())
+            waiter.daemon = True
+            waiter.start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
         # What is loaded stays: the collector need not look at it again in the middle of a drive.
@@ -196,8 +175,7 @@ class _Runtime:
                 self._vehicle.start(self._config.is_armed_at_start)
             self._loop.start()
             announcer.start()
-            if not stop.came:
-                self._loop.run()
+            self._loop.run()
         finally:
             ended = self._close(announcer)
         if self._failures:
@@ -284,5 +262,5 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
 
 def rearm_command(connect: str, vehicle_id: str) -> str:
     """Return what an operator types to let a vehicle drive again."""
-    tls = f" --tls certs/operator-{vehicle_id}" if connect.startswith("tls/") else ""
+    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"

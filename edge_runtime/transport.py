@@ -35,12 +35,16 @@ def check_endpoint(endpoint: str) -> str:
     return endpoint
 
 
+def is_tls(endpoint: str) -> bool:
+    return endpoint.startswith("tls/")
+
+
 def check_fits(endpoint: str, with_tls: bool) -> None:
     """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
-    if with_tls and not endpoint.startswith("tls/"):
+    if with_tls and not is_tls(endpoint):
         right = f"write tls/{endpoint.split('/', 1)[1]}"
         raise UserError(f"endpoint {endpoint} would send plain text despite --tls: {right}")
-    if not with_tls and endpoint.startswith("tls/"):
+    if not with_tls and is_tls(endpoint):
         raise UserError(f"endpoint {endpoint} needs certificates: name their directory with --tls")
 
 

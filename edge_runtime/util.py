@@ -1,33 +1,21 @@
 """What every part of the repository shares, with the standard library alone: the error that a user
-meets, text for a terminal, files to read, and signals that end a process.
+meets, text for a terminal, and files to read.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
 import shlex
-import signal
-import stat
 import threading
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Dict, Iterable, Set, Union
+from typing import Any, BinaryIO, Callable, Dict, Union
 
 PathLike = Union[str, "os.PathLike[str]"]
 DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
 """Where `deploy keys` writes it, and where every reader of a policy looks for it."""
 MAX_FILE_MIB = 64  # More than any certificate, configuration or report needs
-
-_NOT_ENDING = {
-    *(signal.SIGKILL, signal.SIGSTOP),  # cannot be caught
-    # The processor raises these, and would raise them again before Python could act.
-    *(signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL),
-    # These end no process.
-    *(signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH),
-    *(signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU),
-}
 
 
 class UserError(Exception):
@@ -61,16 +49,10 @@ def printable(text: str) -> str:
 
 
 def open_regular(path: PathLike) -> BinaryIO:
-    """Open an existing regular file to read; OSError for anything else, ValueError for a NUL.
-
-    Opening a pipe would wait for its writer, and a device may have no end.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISREG(mode):
-        return os.fdopen(descriptor, "rb")
-    os.close(descriptor)
-    raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    """Open an existing regular file to read; OSError for a pipe or a device without end."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    return open(path, "rb")
 
 
 def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes:
@@ -78,34 +60,31 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
 
     `what` names the file in the error, as in "policy file".
     """
-    limit = most_mib << 20
     try:
         with open_regular(path) as stream:
-            data = stream.read(limit + 1)
-    except FileNotFoundError:
-        raise UserError(f"{what} {path} does not exist") from None
-    except (OSError, ValueError) as error:
+            data = stream.read((most_mib << 20) + 1)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         why = getattr(error, "strerror", error)
         raise UserError(f"{what} {path} cannot be read: {why}") from None
-    if len(data) > limit:
+    if len(data) > most_mib << 20:
         raise UserError(f"{what} {path} is larger than {most_mib} MiB")
     return data
 
 
 def read_json(path: PathLike, what: str) -> Dict[str, Any]:
     """Read the object in a JSON file. Raises UserError where there is none."""
-    value = parse_json(read_bytes(path, what), f"{what} {path}")
-    if not isinstance(value, dict):
-        raise UserError(f"{what} {path} holds no JSON object")
-    return value
+    return parse_json(read_bytes(path, what), f"{what} {path}")
 
 
-def parse_json(data: bytes, what: str) -> Any:
-    """Parse a JSON text. Raises UserError where it is none, or nested too deep."""
+def parse_json(data: bytes, what: str) -> Dict[str, Any]:
+    """Parse the text of a JSON object. Raises UserError where it is none, or nested too deep."""
     try:
-        return json.loads(data)
+        value = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{what} is not JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise UserError(f"{what} holds no JSON object")
+    return value
 
 
 def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
@@ -124,25 +103,3 @@ def ends_within(limit_s: float, call: Callable[[], Any]) -> bool:
     thread.start()
     thread.join(limit_s)
     return not thread.is_alive()
-
-
-def ending_signals() -> Set[int]:
-    """Return the signals that would end this process now and that it can catch.
-
-    A signal that is ignored (SIGHUP under nohup) or has a handler already is none of them.
-    """
-    ends = (signal.SIG_DFL, signal.default_int_handler)
-    found = signal.valid_signals() - _NOT_ENDING
-    return {int(number) for number in found if signal.getsignal(number) in ends}
-
-
-def take_signals(
-    numbers: Iterable[int],
-    handler: Union[Callable[[int, Any], Any], signal.Handlers],
-    undo: contextlib.ExitStack,
-) -> None:
-    """Handle these signals until `undo` closes; does nothing outside of the main thread."""
-    if threading.current_thread() is threading.main_thread():
-        for number in numbers:
-            undo.callback(signal.signal, number, signal.getsignal(number))
-            signal.signal(number, handler)

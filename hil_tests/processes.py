@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from edge_runtime.commands import ask
+from edge_runtime.link import ask
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from trainer.util import kept

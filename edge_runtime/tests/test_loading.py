@@ -20,7 +20,7 @@ from edge_runtime.reach import free_endpoint
 ROOT = Path(edge_runtime.__file__).parent
 LOCK = ROOT.parent / "requirements" / "edge-py38.txt"
 # Only who asks for them loads them.
-LAZY = {"commands", "files", "vehicles"}
+LAZY = {"vehicles"}
 _LOADED = """
 import json, sys
 {what}

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 import msgspec
 import numpy as np
 
-from edge_runtime.commands import ask
+from edge_runtime.link import ask
 from edge_runtime.manifest import Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError

@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from edge_runtime import wire
-from edge_runtime.commands import ask
+from edge_runtime.link import ask
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 from hil_tests.processes import PATIENCE_S, Process, wait_until

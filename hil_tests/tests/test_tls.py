@@ -20,7 +20,7 @@ from bridge.recording import Recording
 from deploy.__main__ import main as deploy
 from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
 from edge_runtime import wire
-from edge_runtime.commands import ask
+from edge_runtime.link import ask
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
