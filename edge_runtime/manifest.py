@@ -145,26 +145,22 @@ def check_task(task: Task) -> None:
     if not MIN_PERIOD_S <= task.control_period_s <= MAX_PERIOD_S:  # nor is NaN
         within = f"it must lie in {MIN_PERIOD_S} to {MAX_PERIOD_S} s"
         raise UserError(f"the control period is {task.control_period_s} s; {within}")
-    if not task.observation:
-        raise UserError("the manifest names no observation")
     for name, entry in task.observation.items():
-        if entry.dtype not in DTYPES:
-            known = ", ".join(DTYPES)
-            raise UserError(f"the observation {name!r} is {entry.dtype}; the wire carries {known}")
-        if len(entry.shape) > 32 or any(length < 1 for length in entry.shape):  # numpy's most
-            raise UserError(f"the observation {name!r} has the shape {entry.shape}")
+        if entry.dtype not in DTYPES or len(entry.shape) > 32 or min(entry.shape, default=1) < 1:
+            found = f"the observation {name!r} is {entry.dtype} of shape {entry.shape}"
+            raise UserError(f"{found}; the wire carries {', '.join(DTYPES)}, not empty")
     Layout(task)
     names = [row.name for row in task.action]
-    if not 1 <= len(names) <= MAX_ACTIONS or len(set(names)) != len(names):
-        raise UserError(f"the manifest names {len(names)} actions; 1 to {MAX_ACTIONS}, each once")
+    if not task.observation or not 1 <= len(set(names)) == len(names) <= MAX_ACTIONS:
+        found = f"{len(task.observation)} arrays of observation and {len(names)} actions"
+        raise UserError(f"the manifest names {found}; 1 to {MAX_ACTIONS} actions, each once")
     for row in task.action:
-        its_range = f"range of {row.name}, {row.low} to {row.high},"
-        if not (row.low < row.high and math.isfinite(row.low) and math.isfinite(row.high)):
-            raise UserError(f"the {its_range} must be finite, and not empty")
-        if row.stop is not None and not row.low <= row.stop <= row.high:
-            raise UserError(f"the safe stop {row.stop} lies outside the {its_range}")
-        if row.slew_per_s is not None and not 0.0 < row.slew_per_s < math.inf:
-            raise UserError(f"the slew_per_s of {row.name} is {row.slew_per_s}; it must be above 0")
+        stop = row.low if row.stop is None else row.stop
+        slew_per_s = 1.0 if row.slew_per_s is None else row.slew_per_s
+        in_order = -math.inf < row.low <= stop <= row.high < math.inf and row.low < row.high
+        if not (in_order and 0.0 < slew_per_s < math.inf):
+            must = "finite, low below high, stop between them, slew_per_s above 0"
+            raise UserError(f"the action {row} must be {must}")
 
 
 class _Part(NamedTuple):

@@ -62,28 +62,23 @@ def load_tls(directory: PathLike) -> TlsFiles:
     from cryptography.exceptions import InvalidSignature
 
     folder = Path(os.path.abspath(directory))  # Zenoh opens the files later.
-    if not folder.is_dir():
-        raise UserError(f"--tls {directory} is no directory; `python -m deploy certs` makes one")
     ca_path, path, key_path = (folder / name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE))
-    certificates = {}
-    for each in (path, ca_path):
-        data = read_bytes(each, "certificate")
-        try:
-            certificates[each] = x509.load_pem_x509_certificate(data)
-        except ValueError:
-            raise UserError(f"{each} is not a certificate in PEM") from None
-    certificate, key = certificates[path], read_private_key(key_path)
+    try:
+        ca, certificate = (
+            x509.load_pem_x509_certificate(read_bytes(each, "certificate"))
+            for each in (ca_path, path)
+        )
+        certificate.verify_directly_issued_by(ca)
+    except (ValueError, TypeError, InvalidSignature):
+        raise UserError(f"{path} is no certificate that {ca_path} has issued") from None
+    key = read_private_key(key_path)
     # A group may read, not write: systemd hands a service its credentials so.
     if key_path.stat().st_mode & 0o027:
         raise UserError(f"private key {key_path} is open to others; close it: chmod 600 {key_path}")
     if key.public_key() != certificate.public_key():
         raise UserError(f"private key {key_path} does not fit {CERTIFICATE_FILE} beside it")
-    try:
-        certificate.verify_directly_issued_by(certificates[ca_path])
-    except (ValueError, TypeError, InvalidSignature):
-        raise UserError(f"{path} was not issued by the authority in {CA_FILE} beside it") from None
     now = datetime.datetime.now(datetime.timezone.utc)
-    for each, dated in certificates.items():
+    for each, dated in ((path, certificate), (ca_path, ca)):
         begins, ends = dated.not_valid_before_utc, dated.not_valid_after_utc
         if now >= ends:
             raise UserError(f"{each} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
@@ -91,8 +86,8 @@ def load_tls(directory: PathLike) -> TlsFiles:
             raise UserError(f"{each} is valid from {begins:%Y-%m-%d %H:%M} UTC on; set the clock")
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
-    paths = (str(ca_path), str(path), str(key_path))
-    return TlsFiles(*paths, name, min(each.not_valid_after_utc for each in certificates.values()))
+    ends = min(certificate.not_valid_after_utc, ca.not_valid_after_utc)
+    return TlsFiles(str(ca_path), str(path), str(key_path), name, ends)
 
 
 def read_private_key(path: PathLike) -> Any:
@@ -190,10 +185,11 @@ def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
 
     All else is denied: other names, other keys, and `delete` for everybody.
     """
-    parties: Dict[str, List[Dict[str, Any]]] = {}
-    for role, rights in ROLES.items():
-        for vehicle_id in (None,) if rights.all_vehicles else vehicle_ids:
-            parties[common_name(role, vehicle_id)] = _rules(rights, vehicle_id)
+    parties = {
+        common_name(role, vehicle_id): _rules(rights, vehicle_id)
+        for role, rights in ROLES.items()
+        for vehicle_id in ((None,) if rights.all_vehicles else vehicle_ids)
+    }
     return _access_control(parties)
 
 
@@ -204,22 +200,20 @@ def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
     its certificate is a server's, too, and of the same authority.
     """
     # The edge's own rules, as it applies them itself: what it may send leaves here.
-    turned = {"ingress": "egress", "egress": "ingress"}
-    rules = [
-        {**rule, "flows": [turned[flow] for flow in rule["flows"]]}
-        for rule in _rules(ROLES[EDGE], vehicle_id)
-    ]
+    rules = _rules(ROLES[EDGE], vehicle_id, from_it="egress", to_it="ingress")
     return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
 
 
-def _rules(rights: Rights, vehicle_id: Optional[str]) -> List[Dict[str, Any]]:
+def _rules(
+    rights: Rights, vehicle_id: Optional[str], from_it: str = "ingress", to_it: str = "egress"
+) -> List[Dict[str, Any]]:
     """Make the rules of one party, as its neighbour applies them."""
     rules = []
-    for right, (from_it, to_it) in _MESSAGES.items():
+    for right, (sent, received) in _MESSAGES.items():
         keys = [f"phil/{vehicle_id or '*'}/{suffix}" for suffix in getattr(rights, right)]
         if keys:
-            rules.append({"messages": from_it, "flows": ["ingress"], "key_exprs": keys})
-            rules.append({"messages": to_it, "flows": ["egress"], "key_exprs": keys})
+            rules.append({"messages": sent, "flows": [from_it], "key_exprs": keys})
+            rules.append({"messages": received, "flows": [to_it], "key_exprs": keys})
     return rules
 
 
@@ -231,10 +225,5 @@ def _access_control(rules_by_name: Dict[str, List[Dict[str, Any]]]) -> Dict[str,
             rules += [{"id": i, "permission": "allow", **rule} for i, rule in zip(ids, own)]
             subjects.append({"id": name, "cert_common_names": [name]})
             policies.append({"rules": ids, "subjects": [name]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    access = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **access}

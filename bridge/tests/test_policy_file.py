@@ -61,7 +61,7 @@ def test_the_period_that_is_asked_for_wins(tmp_path):
     [
         ("(float[b, 4] obs) => (float[b, 1] out) { " + TORQUE + " }", STOP, "must be observation"),
         (f"{PENDULUM} {{ {TORQUE} }}", (), "does not say how action_0 stops safely; give --set"),
-        (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.0.stop=9"), "lies outside the range"),
+        (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.0.stop=9"), "stop between"),
         (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.1.stop=0"), "N from 0 to 0"),
         (f"{PENDULUM} {{ {TORQUE} }}", ("--set", "action.0.low=0"), "expected action.N.stop"),
     ],
