@@ -69,7 +69,6 @@ def _add_operator(parser: argparse.ArgumentParser) -> None:
 def _add_status(parser: argparse.ArgumentParser) -> None:
     _add_operator(parser)
     parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def _status(arguments: argparse.Namespace) -> int:
@@ -77,7 +76,7 @@ def _status(arguments: argparse.Namespace) -> int:
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
     try:
-        print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
+        print(render_status(reply))
     except (LookupError, TypeError, ValueError, AttributeError):
         raise UserError(f"what answers for {arguments.vehicle_id} is no edge runtime") from None
     write_json_out(arguments.out, reply)

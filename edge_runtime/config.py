@@ -49,7 +49,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hold: Optional[str] = None
     ride_through: RideThrough = RideThrough()
     log_level: str = "info"
-    log_format: str = "text"
     vehicle_settings: Dict[str, Dict[str, Any]] = msgspec.field(default_factory=dict)
 
     @property
@@ -75,7 +74,6 @@ _FLAGS: Dict[str, Tuple[str, str]] = {
     ),
     "bus": ("INTERFACE:CHANNEL", "CAN bus of --vehicle hunter, such as socketcan:can0"),
     "log_level": ("LEVEL", f"log events of this level or above: {', '.join(log.LEVELS)}"),
-    "log_format": ("FORMAT", "format of the log on stderr: text, or json (one object a line)"),
 }
 
 
@@ -105,7 +103,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     more = parser.add_argument_group("settings and log")
     text = "settings file (edge_runtime/config.example.toml explains each); options override it"
     more.add_argument("--config", metavar="FILE.toml", help=text)
-    add_flags(more, "log_level", "log_format")
+    add_flags(more, "log_level")
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: bool = True) -> Config:
@@ -157,7 +155,6 @@ def _check(config: Config) -> Config:
     check_endpoint(config.connect)
     check_vehicle_id(config.vehicle_id)
     check_choice("log_level", config.log_level, log.LEVELS)
-    check_choice("log_format", config.log_format, log.FORMATS)
     return config
 
 

@@ -1,12 +1,11 @@
 """Log to stderr, one line an event: time, level, event, then its fields.
 
-As text (`time LEVEL event key=value`) or as JSON, one object a line. A thread of its own writes
-the lines, so that a stalled reader of stderr cannot hold the thread that drives.
+A thread of its own writes the lines, so that a stalled reader of stderr cannot hold the thread that
+drives.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import time
@@ -16,18 +15,17 @@ from typing import Any, Optional
 from edge_runtime.util import ends_within
 
 LEVELS = ("debug", "info", "warning", "error")
-FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
 _WAITING_LINES = 1000
 _FLUSH_S = 0.5
 _listener: Optional[QueueListener] = None
 
 
-def configure(level: str, log_format: str = "text") -> None:
+def configure(level: str) -> None:
     """Send lines of at least `level` to stderr."""
     global _listener
     stream = logging.StreamHandler()
-    stream.setFormatter(_Formatter(as_json=log_format == "json"))
+    stream.setFormatter(_Formatter())
     close()
     lines: queue.Queue[logging.LogRecord] = queue.Queue(_WAITING_LINES)
     _listener = _Listener(lines, stream)
@@ -60,21 +58,12 @@ class _Listener(QueueListener):
 
 
 class _Formatter(logging.Formatter):
-    def __init__(self, as_json: bool) -> None:
-        super().__init__()
-        self._as_json = as_json
-
     def format(self, record: logging.LogRecord) -> str:
         # UTC, so that the logs of board and workstation can be compared.
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        at, level, name = f"{seconds}.{int(record.msecs):03d}Z", record.levelname, record.msg
         fields = getattr(record, "fields", {})
-        if self._as_json:
-            line = {"time": at, "level": level.lower(), "event": name}
-            # Twice, so that the line begins with them and no field can take their place.
-            return json.dumps({**line, **fields, **line}, default=str)
         pairs = (f" {label}={_quoted(value)}" for label, value in fields.items())
-        return f"{at} {level} {name}{''.join(pairs)}"
+        return f"{seconds}.{int(record.msecs):03d}Z {record.levelname} {record.msg}{''.join(pairs)}"
 
 
 def _quoted(value: Any) -> str:

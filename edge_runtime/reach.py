@@ -1,12 +1,7 @@
-"""Why there is no link, and whether a port can be had: with Python's own socket and ssl.
-
-Zenoh says "Unable to connect" whether nobody is there, the other end refuses us, or we refuse it,
-and of a busy port neither its number nor the cause.
-"""
+"""The far end's certificate, and ports to listen at, with Python's own socket and ssl."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import socket
 import ssl
@@ -17,54 +12,8 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import Reason, Rejection
 
 _LOOK_S = 1.0
-# A server that refuses a client's certificate says so after the handshake (TLS 1.3).
-_ALERT_S = 0.3
 _KEPT: List[socket.socket] = []
 _MOST_KEPT = 100
-
-
-def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
-    """Return whether anybody answers at `endpoint`, and why there is no link; "" if one is likely.
-
-    Of udp it knows nothing. Takes up to 1.3 s for each address of the host, and as long as the
-    name server does.
-    """
-    protocol, host, port = _parts(endpoint)
-    if protocol == "udp":
-        return False, ""
-    try:
-        plain = socket.create_connection((host, port), timeout=_LOOK_S)
-    except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
-        return False, f"port {port} of {host}: {error}".lower()
-    with plain:
-        if files is None:
-            return True, f"{endpoint} gives no plain link: with TLS it wants --tls, tls/ for tcp/"
-        try:
-            with _context(files).wrap_socket(plain, server_hostname=host) as link:
-                link.settimeout(_ALERT_S)
-                with contextlib.suppress(socket.timeout):  # it is silent: we are let in
-                    link.recv(1)
-        except ssl.SSLCertVerificationError as error:
-            return True, f"{endpoint} is not believed here: {error.verify_message}"
-        except OSError as error:
-            return True, f"{endpoint} gives no TLS link to {files.name}: {error}"
-    return True, ""
-
-
-def why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
-    """Say on one line why a client that must have a link at once gets none."""
-    answers, why = look(endpoint, files)
-    if answers and why:
-        return why
-    help_ = "start the simulator or router there first, or name another address with --connect"
-    return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
-
-
-def _context(files: TlsFiles) -> ssl.SSLContext:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
-    context.load_verify_locations(files.ca)
-    context.load_cert_chain(files.certificate, files.key)
-    return context
 
 
 class Listener:
@@ -90,9 +39,12 @@ class Listener:
     def look(self) -> None:
         """Read the certificate that the listener shows now; one that shows none keeps its last."""
         _, host, port = _parts(self._endpoint)
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # no more strictly than Zenoh does
+        context.load_verify_locations(self._files.ca)
+        context.load_cert_chain(self._files.certificate, self._files.key)
         try:
             plain = socket.create_connection((host, port), timeout=_LOOK_S)
-            with plain, _context(self._files).wrap_socket(plain, server_hostname=host) as link:
+            with plain, context.wrap_socket(plain, server_hostname=host) as link:
                 shown: Any = link.getpeercert()
         except ssl.SSLCertVerificationError as error:
             self._until_s, self._why = -math.inf, f"is not believed here: {error.verify_message}"

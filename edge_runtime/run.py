@@ -19,7 +19,7 @@ from edge_runtime.link import Link, require_free, taken
 from edge_runtime.link_quality import link_words
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
-from edge_runtime.reach import Listener, look
+from edge_runtime.reach import Listener
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
 from edge_runtime.transport import is_tls, open_session
 from edge_runtime.util import PathLike, ends_within, printable
@@ -28,14 +28,13 @@ if TYPE_CHECKING:  # Loaded only where there is a vehicle.
     from edge_runtime.vehicles.base import Vehicle, VehicleRunner
 
 
-_WAITING_PERIOD_S = 5.0
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
 
 EXAMPLE = r"""examples:
   python -m edge_runtime run --policy my.onnx --public-key keys/policy.pub
   python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \
       --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01
-  python -m edge_runtime run --config edge.toml --log-format json"""
+  python -m edge_runtime run --config edge.toml"""
 add_arguments = add_run_flags
 
 
@@ -76,7 +75,7 @@ def drive(
                 check_driver(driver)
                 _close_unless_built(driver, unbuilt)
             loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
-            log.configure(loaded.log_level, loaded.log_format)
+            log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
             ended = runtime.run(stop, until)
@@ -152,7 +151,6 @@ class _Runtime:
             hold=hold,
             rearm_command=rearm_command(config.connect, config.vehicle_id),
         )
-        self._over = threading.Event()
         self._failures: List[BaseException] = []
 
     def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
@@ -187,7 +185,7 @@ class _Runtime:
         return ended
 
     def _announce(self) -> None:
-        """Show that it is there, print "ready", and log what keeps states away."""
+        """Show that it is there, and print "ready"."""
         config, policy = self._config, self._policy
         try:
             self._link.appear(self._open_client, self._loop.stop)
@@ -201,24 +199,12 @@ class _Runtime:
                 flush=True,
             )
             self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
-            # A runtime that is linked already has some time for its first state.
-            wait_s = _WAITING_PERIOD_S if self._session.info.routers_zid() else 0.0
-            while not self._over.wait(wait_s) and not self._loop.has_heard():
-                log.event("warning", "waiting", why=self._why_no_state())
-                wait_s = _WAITING_PERIOD_S
         except BaseException as error:  # the main thread raises it
             self._failures.append(error)
             self._loop.stop()
 
-    def _why_no_state(self) -> str:
-        connect, info = self._config.connect, self._session.info
-        if not info.routers_zid() and not info.peers_zid():
-            return f"{connect}: {look(connect, self._tls)[1] or 'no link yet'}"
-        return f"{connect} is there, and has sent no state for vehicle id {self._config.vehicle_id}"
-
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
-        self._over.set()
         gc.unfreeze()  # In Python another drive may follow.
         self._notifier.tell("STOPPING=1")
         ended = self._loop.close()

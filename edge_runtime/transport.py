@@ -13,7 +13,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.reach import check_port_is_free, look, why_not_connected
+from edge_runtime.reach import check_port_is_free
 from edge_runtime.tls import TlsFiles, load_tls
 from edge_runtime.util import PathLike, UserError
 
@@ -67,8 +67,7 @@ def open_session(
 
     `mode` is "router", "peer" or "client". `access` is Zenoh's `access_control`, of tls.py; a
     session that listens with TLS must have it. Raises UserError for a malformed endpoint, one that
-    does not go with `tls`, a busy port, a link that either end refuses, and, in client mode,
-    nobody there.
+    does not go with `tls`, a busy port, and, in client mode, nobody there who gives a link.
     """
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
@@ -81,18 +80,13 @@ def open_session(
     for name, value in session_rows(listens, connect, mode, tls, access).items():
         config.insert_json5(name, json.dumps(value))
     try:
-        session = zenoh.open(config)
+        return zenoh.open(config)
     except zenoh.ZError as error:
         if connect is None or listens:
             raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
-        raise UserError(why_not_connected(connect, tls)) from None
-    if connect is not None and tls is not None and not session.info.routers_zid():
-        # A peer goes on trying for ever, also where it will never be let in: say so now.
-        answers, why = look(connect, tls)
-        if answers and why and not session.info.routers_zid():
-            session.close()
-            raise UserError(why)
-    return session
+    link = "link" if tls is None else f"TLS link as {tls.name}"
+    first = "start the simulator or router there first, or name another address with --connect"
+    raise UserError(f"nobody answers at {connect} for a {link}; {first}")
 
 
 def session_rows(

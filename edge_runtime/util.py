@@ -63,6 +63,8 @@ def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes
     try:
         with open_regular(path) as stream:
             data = stream.read((most_mib << 20) + 1)
+    except FileNotFoundError:
+        raise UserError(f"{what} {path} does not exist") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         why = getattr(error, "strerror", error)
         raise UserError(f"{what} {path} cannot be read: {why}") from None

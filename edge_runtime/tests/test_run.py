@@ -4,7 +4,6 @@ import contextlib
 import fcntl
 import gc
 import itertools
-import json
 import os
 import re
 import signal
@@ -103,7 +102,6 @@ def test_a_runtime_without_a_vehicle_from_its_first_state_to_its_end(
     assert not simulator.query("rearm")["accepted"]
     place = ("--connect", simulator.endpoint)
     assert re.search(r"\naccepted +51\n", run_command("status", *place).stdout)
-    assert set(json.loads(run_command("status", *place, "--json").stdout)) == set(status)
     # A second one with the same vehicle id does not start.
     second = run_command("run", *make_policy().flags, *place)
     assert (second.returncode, second.stdout, second.stderr.count("\n")) == (2, "", 1)
@@ -326,8 +324,7 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
 
 def test_a_poor_link_is_shown_and_logged_once_and_stops_nothing(edge_and_simulator):
     """The simulator claims how long commands take to it."""
-    flags = ("--vehicle", "mock", "--log-format", "json")
-    edge, simulator = edge_and_simulator("constant", *flags)
+    edge, simulator = edge_and_simulator("constant", "--vehicle", "mock")
     steps = itertools.count()
     heard: dict[str, int] = {}
 
@@ -346,5 +343,5 @@ def test_a_poor_link_is_shown_and_logged_once_and_stops_nothing(edge_and_simulat
     drive_until(500.0, lambda both_ms: both_ms > 480.0)
     drive_until(20.0, lambda both_ms: both_ms < 100.0)
     assert edge.end() == 0
-    told = [row for row in map(json.loads, edge.errors.splitlines()) if row["event"] == "link"]
-    assert [(row["level"], row["poor"]) for row in told] == [("warning", True), ("info", False)]
+    told = re.findall(r"(\w+) link poor=(\w+)", edge.errors)
+    assert told == [("WARNING", "True"), ("INFO", "False")]

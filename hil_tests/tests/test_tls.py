@@ -127,30 +127,22 @@ def test_zenoh_lets_in_only_who_shows_a_certificate_of_the_authority(parties, en
             bare(place, **tls)
 
 
-def test_our_own_line_says_why(parties, endpoint):
-    foreign, plain = load_tls(parties / "foreign/edge-hunter01"), endpoint.replace("tls/", "tcp/")
-    for place, tls, says in (
-        (endpoint, foreign, "not believed here"), (endpoint, None, "needs certificates"),
-        (plain, None, "wants --tls"),
-    ):  # fmt: skip
+def test_our_own_line_names_the_party(parties, endpoint):
+    foreign = load_tls(parties / "foreign/edge-hunter01")
+    for tls, says in ((foreign, "TLS link as edge-hunter01"), (None, "needs certificates")):
         with pytest.raises(UserError, match=says):
-            open_session(connect=place, mode="client", tls=tls)
+            open_session(connect=endpoint, mode="client", tls=tls)
 
 
-@pytest.mark.parametrize(
-    ("who", "host", "mode", "as_whom", "match"),
-    [  # or anybody with a certificate could pose as the simulator
-        ("viewer", "127.0.0.1", "peer", "edge-hunter01", "unsuitable certificate purpose"),
-        ("router", "127.0.0.2", "client", "viewer", "IP address mismatch"),
-    ],
-)
-def test_a_listener_needs_its_own_servers_certificate(parties, who, host, mode, as_whom, match):
+@pytest.mark.parametrize(("who", "host"), [("viewer", "127.0.0.1"), ("router", "127.0.0.2")])
+def test_a_listener_needs_its_own_servers_certificate(parties, who, host):
+    """Anybody with a certificate could pose as the simulator else."""
     place = free_endpoint("tls").replace("127.0.0.1", host)
     with (
         listener(place, parties / who, rules_for_listener(["hunter01"])),
-        pytest.raises(UserError, match=match),
+        pytest.raises(UserError, match="nobody answers"),
     ):
-        open_session(connect=place, mode=mode, tls=load_tls(parties / as_whom))
+        open_session(connect=place, mode="client", tls=load_tls(parties / "edge-hunter01"))
 
 
 def short_lived(parties, folder, life_s):
