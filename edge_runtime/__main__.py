@@ -17,8 +17,7 @@ import msgspec
 from edge_runtime.cli import Subcommand, examples, program, run_cli
 from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.link import ask
-from edge_runtime.link_quality import link_words
+from edge_runtime.link import ask, link_words
 from edge_runtime.policy import infer, load_policy, probes
 from edge_runtime.service import peak_memory_mb, quantiles_ms
 from edge_runtime.tls import OPERATOR, check_name, common_name

@@ -198,13 +198,15 @@ share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0
 def sigterm_as_interrupt() -> Iterator[None]:
     """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too.
 
-    So sessions are closed and files are finished. Outside of the main thread it does nothing.
+    So sessions are closed and files are finished. A signal that has a handler keeps it. Outside of
+    the main thread it does nothing.
     """
+    ends = (signal.SIG_DFL, signal.default_int_handler)
 
     def interrupt(number: int, frame: Any) -> NoReturn:
         raise KeyboardInterrupt
 
-    with handled(ENDING_SIGNALS, interrupt):
+    with handled([each for each in ENDING_SIGNALS if signal.getsignal(each) in ends], interrupt):
         yield
 
 

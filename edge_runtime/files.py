@@ -48,9 +48,7 @@ def check_writable(path: Optional[PathLike]) -> Optional[PathLike]:
     target = _checked(path)
     directory = next(place for place in target.absolute().parents if os.path.exists(place))
     if not directory.is_dir() or not os.access(str(directory), os.W_OK | os.X_OK):
-        raise UserError(
-            f"cannot write {target}: {directory} is no directory that can be written to"
-        )
+        raise UserError(f"cannot write {target}: Not a directory to write in: {directory}")
     return os.path.abspath(path)
 
 

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Deque, Dict, Optional
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.latest import LatestState
-from edge_runtime.link import Link
-from edge_runtime.link_quality import LinkQuality, is_poor, link_words
+from edge_runtime.link import Link, LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms

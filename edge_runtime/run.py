@@ -15,8 +15,7 @@ from edge_runtime import log, service
 from edge_runtime.cli import ENDING_SIGNALS, handled
 from edge_runtime.config import NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
-from edge_runtime.link import Link, require_free, taken
-from edge_runtime.link_quality import link_words
+from edge_runtime.link import Link, link_words, require_free, taken
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener
@@ -52,10 +51,9 @@ def drive(
     connect: Optional[str] = None,
     vehicle: Union[Vehicle, str, None] = None,
     config: Optional[PathLike] = None,
-    until: Optional[threading.Event] = None,
     **settings: Any,
 ) -> bool:
-    """Verify a policy, connect, drive until a signal comes or `until` is set: `run`, from Python.
+    """Verify a policy, connect, drive until a signal comes: `run`, from Python.
 
     `vehicle` is a driver, or what `--vehicle` takes; a driver is closed in the end. `config` is a
     TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
@@ -78,7 +76,7 @@ def drive(
             log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
-            ended = runtime.run(stop, until)
+            ended = runtime.run(stop)
     finally:
         written = log.close()
     return ended and written
@@ -153,16 +151,12 @@ class _Runtime:
         )
         self._failures: List[BaseException] = []
 
-    def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
+    def run(self, stop: _Stop) -> bool:
         """Drive until it is told to stop; returns False where a thread hangs.
 
         Raises UserError where a vehicle cannot be enabled, and where it gave way.
         """
         stop.on_stop = self._loop.stop
-        if until is not None:
-            waiter = threading.Thread(target=lambda: until.wait() and self._loop.stop())
-            waiter.daemon = True
-            waiter.start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
         # What is loaded stays: the collector need not look at it again in the middle of a drive.

@@ -35,7 +35,7 @@ from bridge.rerun.draw import Canvas, Plot
 from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
-from edge_runtime.link_quality import link_words
+from edge_runtime.link import link_words
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.transport import tls_for
 from edge_runtime.util import UserError, counted

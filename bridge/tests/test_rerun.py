@@ -35,7 +35,7 @@ from bridge.rerun import (
 )
 from bridge.rerun.wire_view import DriveTime, WireLog
 from bridge.tests.viewers import NO_GPU, in_place, listens
-from edge_runtime.link_quality import FIELDS
+from edge_runtime.link import FIELDS
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection

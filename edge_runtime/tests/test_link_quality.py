@@ -9,7 +9,7 @@ from hil_tests.testing.messages import make_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.link_quality import FIELDS, KNOWN, LinkQuality, is_poor
+from edge_runtime.link import FIELDS, KNOWN, LinkQuality, is_poor
 
 MS = 1_000_000
 GOOD = dict.fromkeys(FIELDS, 1.0)
