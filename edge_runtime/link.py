@@ -190,6 +190,7 @@ class Presence:
         self._session, self._key, self._open_client = session, alive_key, open_client
         self._give_way, self._listener = give_way, listener
         self._known: Set[str] = set()
+        self._seen_before: Optional[Set[str]] = None  # the claims of the last look
         self._tokens: List[Any] = []
         self._routers = self._seen_routers()
         self._declare()
@@ -233,8 +234,7 @@ class Presence:
         self._take_back()
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
-        self._seen_before: Optional[Set[str]] = None
-        self._pause_s = _FIRST_LOOKS_S
+        self._seen_before, self._pause_s = None, _FIRST_LOOKS_S
         for token in (self._key, f"{self._key}/{self.claim}"):
             self._tokens.append(self._session.liveliness().declare_token(token))
 

@@ -188,9 +188,7 @@ def test_the_session_is_closed_whatever_fails(session, link, monkeypatch):
 
 
 def test_a_host_that_cannot_be():
-    for place in (
-        {"connect": "tcp/no-such-host.invalid:1", "mode": "client"},
-        {"listen": "tcp/a..b:7447", "mode": "router"},
-    ):
-        with pytest.raises(UserError, match=r"no-such-host|a\.\.b"):
-            open_session(**place)
+    with pytest.raises(UserError, match="no-such-host"):
+        open_session(connect="tcp/no-such-host.invalid:1", mode="client")
+    with pytest.raises(UserError, match=r"a\.\.b"):
+        open_session(listen="tcp/a..b:7447", mode="router")

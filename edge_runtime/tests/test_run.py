@@ -3,11 +3,9 @@
 import contextlib
 import fcntl
 import itertools
-import os
 import re
 import signal
 import time
-from typing import Any
 
 import pytest
 from hil_tests.processes import Process, wait_until
@@ -16,7 +14,6 @@ from hil_tests.testing.edge import Simulator, run_edge
 from hil_tests.testing.messages import WHITE, frames, make_state
 from hil_tests.testing.policies import T
 
-from edge_runtime.__main__ import render_status
 from edge_runtime.reach import free_endpoint
 
 WHITE_FRAMES = {"observation": frames(WHITE)}
@@ -109,68 +106,6 @@ def test_a_runtime_without_a_vehicle_from_its_first_state_to_its_end(
     assert time.monotonic() - begun_s < 5.0
     assert "Traceback" not in edge.errors
     wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
-
-
-def test_a_reader_that_stands_still_holds_neither_the_watchdog_nor_the_end(make_policy):
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    with contextlib.suppress(BlockingIOError):
-        while os.write(writer, bytes(4096)):
-            pass
-    os.set_blocking(writer, True)
-    endpoint = free_endpoint()
-    run = ["run", *make_policy("constant").flags, "--connect", endpoint, "--vehicle", "mock"]
-    options: Any = {"stdout": writer, "stderr": writer}
-    with Simulator(endpoint) as simulator, Process("edge_runtime", *run, **options) as edge:
-        simulator.wait_for_edge()
-        assert drive(simulator, range(15))[0].mode == "drive"
-        assert command_of_reason(simulator, "no_fresh_state").mode == "safe_stop"
-        assert simulator.query("status")["mode"] == "safe_stop"
-        assert edge.end() == 0
-    os.close(reader)
-    os.close(writer)
-
-
-BUSY = """
-import os, time
-from edge_runtime.vehicles.mock import MockVehicle
-
-class Busy(MockVehicle):
-    def feedback(self, now_s):
-        if os.path.exists("busy"):
-            os.remove("busy")
-            time.sleep(0.8)
-        return super().feedback(now_s)
-    def brake(self, now_s, latch=True):
-        self.note("brake")
-        super().brake(now_s, latch)
-    def close(self):
-        self.note("close")
-        while os.path.exists("hangs"):
-            time.sleep(0.01)
-    def note(self, word):
-        with open("calls", "a") as calls:
-            calls.write(word + chr(10))
-"""
-
-
-@pytest.mark.parametrize("hangs", [False, True])
-def test_a_vehicle_is_left_braked_and_closed_or_the_log_says_that_it_hangs(
-    make_policy, tmp_path, hangs
-):
-    (tmp_path / "busy_vehicle.py").write_text(BUSY)
-    flags, endpoint = make_policy("constant").flags, free_endpoint()
-    arguments = [*flags, "--connect", endpoint, "--vehicle", "busy_vehicle:Busy"]
-    with Simulator(endpoint) as simulator, run_edge(*arguments, cwd=tmp_path) as edge:
-        simulator.wait_for_edge()
-        drive(simulator, range(5))
-        (tmp_path / "busy").touch()
-        if hangs:
-            (tmp_path / "hangs").touch()
-        wait_until(lambda: not (tmp_path / "busy").exists(), "the driver to be busy")
-        assert edge.end() == 0
-        assert (tmp_path / "calls").read_text().split()[-2:] == ["brake", "close"]
-        assert (" driver_hangs " in edge.errors) == hangs
 
 
 HELD = """
@@ -309,28 +244,3 @@ def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path):
     simulator.steps = steps
     simulator.drive_until(lambda: simulator.feedback[-1].mode == "drive", "a drive", rearms=True)
     assert edge.end() == 0
-
-
-def test_a_poor_link_is_shown_and_logged_once_and_stops_nothing(edge_and_simulator):
-    """The simulator claims how long commands take to it."""
-    edge, simulator = edge_and_simulator("constant", "--vehicle", "mock")
-    steps = itertools.count()
-    heard: dict[str, int] = {}
-
-    def drive_until(down_ms, holds):
-        def does_after_a_state():
-            command = simulator.ask(make_state(next(steps), **heard))
-            assert command.mode == "drive"
-            heard.update(heard=heard.get("heard", 0) + 1, heard_sent_ns=command.sent_ns)
-            heard["heard_ns"] = command.sent_ns + round(down_ms * 1e6)
-            return (link := simulator.health[-1].link) and holds(link["up_ms"] + link["down_ms"])
-
-        wait_until(does_after_a_state, "such a link")
-
-    drive_until(20.0, lambda both_ms: True)
-    assert re.search(r"\nlink +up \d+\.\d ms, jitter", render_status(simulator.query("status")))
-    drive_until(500.0, lambda both_ms: both_ms > 480.0)
-    drive_until(20.0, lambda both_ms: both_ms < 100.0)
-    assert edge.end() == 0
-    told = re.findall(r"(\w+) link poor=(\w+)", edge.errors)
-    assert told == [("WARNING", "True"), ("INFO", "False")]
