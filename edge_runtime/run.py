@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import gc
 import signal
 import threading
 import time
@@ -159,9 +158,6 @@ class _Runtime:
         stop.on_stop = self._loop.stop
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
-        # What is loaded stays: the collector need not look at it again in the middle of a drive.
-        gc.collect()
-        gc.freeze()
         try:
             if self._vehicle is not None:
                 self._vehicle.start(self._config.is_armed_at_start)
@@ -199,7 +195,6 @@ class _Runtime:
 
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
-        gc.unfreeze()  # In Python another drive may follow.
         self._notifier.tell("STOPPING=1")
         ended = self._loop.close()
         if self._vehicle is not None:
@@ -210,16 +205,9 @@ class _Runtime:
         # A peer that was stopped holds it.
         ended = ends_within(_CLOSE_S, self._link.close) and ended
         health = self._loop.health()
-        log.event(
-            "info",
-            "ended",
-            accepted=health.accepted,
-            rejected=sum(health.rejected.values()),
-            deadline_misses=health.deadline_misses,
-            safe_stops=health.safe_stops,
-            uptime_s=round(health.uptime_s, 1),
-            link=link_words(health.link),
-        )
+        shown = ("accepted", "rejected", "deadline_misses", "safe_stops")
+        fields = {name: getattr(health, name) for name in shown}
+        log.event("info", "ended", **fields, link=link_words(health.link))
         return ended
 
 
