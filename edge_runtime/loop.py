@@ -69,7 +69,7 @@ class ControlLoop:
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged, self._logged_wait = controller.safety, False
+        self._logged = (controller.safety.mode, controller.safety.reason, False)
         self._logged_rejection_s: Dict[str, float] = {}  # by reason
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
@@ -262,17 +262,15 @@ class ControlLoop:
             self._vehicle.command(command, order.answers.state.speed_mps, latch=not ends)
 
     def _log_transition(self) -> None:
-        safety = self._controller.safety
-        if (safety.mode, safety.reason) != (self._logged.mode, self._logged.reason):
-            level = "warning" if safety.mode is Mode.SAFE_STOP else "info"
-            was, now = self._logged.mode.value, safety.mode.value
-            log.event(level, "mode", was=was, now=now, reason=safety.reason)
-            self._logged = safety
-            self._notifier.tell(f"STATUS={safety.mode.value} {safety.reason}".rstrip())
-        waits = self._controller.waits_for_rearm
-        if waits and not self._logged_wait:
+        safety, waits = self._controller.safety, self._controller.waits_for_rearm
+        was_mode, was_reason, waited = self._logged
+        if (safety.mode, safety.reason) != (was_mode, was_reason):
+            level, now = "warning" if safety.mode is Mode.SAFE_STOP else "info", safety.mode.value
+            log.event(level, "mode", was=was_mode.value, now=now, reason=safety.reason)
+            self._notifier.tell(f"STATUS={now} {safety.reason}".rstrip())
+        if waits and not waited:
             log.event("warning", "waits_for_rearm", command=self._rearm_command)
-        self._logged_wait = waits
+        self._logged = (safety.mode, safety.reason, waits)
 
     def _log_link(self, link: Dict[str, float]) -> None:
         if (poor := is_poor(link, self._period_s, self._is_poor)) is not self._is_poor:
