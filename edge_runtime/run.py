@@ -50,9 +50,10 @@ def drive(
     connect: Optional[str] = None,
     vehicle: Union[Vehicle, str, None] = None,
     config: Optional[PathLike] = None,
+    until: Optional[threading.Event] = None,
     **settings: Any,
 ) -> bool:
-    """Verify a policy, connect, drive until a signal comes: `run`, from Python.
+    """Verify a policy, connect, drive until a signal comes or `until` is set: `run`, from Python.
 
     `vehicle` is a driver, or what `--vehicle` takes; a driver is closed in the end. `config` is a
     TOML file; `settings` are its other keys (`config.example.toml`), and win over it. Signals end
@@ -75,7 +76,7 @@ def drive(
             log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
-            ended = runtime.run(stop)
+            ended = runtime.run(stop, until)
     finally:
         written = log.close()
     return ended and written
@@ -150,12 +151,14 @@ class _Runtime:
         )
         self._failures: List[BaseException] = []
 
-    def run(self, stop: _Stop) -> bool:
+    def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
         """Drive until it is told to stop; returns False where a thread hangs.
 
         Raises UserError where a vehicle cannot be enabled, and where it gave way.
         """
         stop.on_stop = self._loop.stop
+        if until is not None:
+            threading.Thread(target=self._stop_when, args=(until,), daemon=True).start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
         try:
@@ -173,6 +176,10 @@ class _Runtime:
         if self._tls is not None:
             self._tls.require_valid(time.time())
         return ended
+
+    def _stop_when(self, until: threading.Event) -> None:
+        until.wait()
+        self._loop.stop()
 
     def _announce(self) -> None:
         """Show that it is there, and print "ready"."""
