@@ -9,13 +9,12 @@ from hil_tests.testing.policies import FRAMES, STEERING, T
 from hil_tests.testing.policies import PEDAL as PEDAL_ACTION
 
 from edge_runtime.manifest import Car, Manifest
-from edge_runtime.vehicles.core import VehicleState
-from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter import HunterCore, protocol
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 from edge_runtime.vehicles.ros2 import STEERING as ANGLE
 from edge_runtime.vehicles.ros2 import Ros2Core, Ros2Settings
+from edge_runtime.vehicles.streamed import VehicleState
 
 
 def scenario_car(*numbers):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.tests.rigs import CARS, CONGESTION, LEFT_TURN, SPEC
 from edge_runtime.vehicles import mapping
-from edge_runtime.vehicles.mapping import SPECS, SetPoint, similarity_to, wish_of
+from edge_runtime.vehicles.mapping import SPECS, SetPoint, Wish, similarity_to, wish_of
 
 MOST = SPEC.max_speed_mps
 unit = st.floats(-1, 1)
@@ -27,9 +27,11 @@ def test_steering_by_hand():
     assert SPEC.inner_rad(-centre) == -SPEC.inner_rad(centre)
 
 
-def pedal_to_speed(set_point, pedal, measured=None):
-    measured = set_point if measured is None else measured
-    return LEFT_TURN.pedal_to_speed(set_point, pedal, 0.1, measured)
+def pedal_to_speed(speed_mps, pedal, measured=None):
+    set_point = SetPoint(LEFT_TURN)
+    set_point.speed_mps = speed_mps
+    set_point.follow(Wish(pedal, None, None), 0.1, speed_mps if measured is None else measured)
+    return set_point.speed_mps
 
 
 @pytest.mark.parametrize(

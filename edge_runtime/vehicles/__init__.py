@@ -41,8 +41,6 @@ def check_driver(vehicle: Any) -> None:
     if not isinstance(vehicle, Vehicle):
         raise UserError(f"vehicle {vehicle!r} is no edge_runtime.vehicles.base.Vehicle")
     try:
-        if not isinstance(vehicle.name, str):
-            raise UserError(f"vehicle {type(vehicle).__name__}: its name must be text")
         _call(vehicle.name, lambda: _checked(vehicle.name, vehicle.limits))
     except UserError:
         close_in_time(vehicle)
@@ -64,26 +62,25 @@ def _checked(name: str, limits: Any) -> Limits:
     """Return the limits. Raises UserError for what a comparison would let through, or fail on."""
 
     def is_limit(limit: Any) -> bool:
-        numbers = (limit.low, limit.high, limit.slew_per_s)
-        is_real = all(isinstance(n, Real) and not isinstance(n, bool) for n in numbers)
-        return is_real and -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
+        if not isinstance(limit, ActionLimit) or not all(isinstance(n, Real) for n in limit[:3]):
+            return False
+        return -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
 
-    if isinstance(limits, dict) and all(
-        isinstance(key, str) and isinstance(limit, ActionLimit) and is_limit(limit)
-        for key, limit in limits.items()
-    ):
+    if isinstance(limits, dict) and all(map(is_limit, limits.values())):
         return limits
     form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
     raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
 
 
-def _call(name: str, door: Callable[..., _Made], *arguments: Any) -> _Made:
+def _call(what: str, door: Callable[..., _Made], *arguments: Any) -> _Made:
+    """Call what a stranger wrote: it raises what its library raises, or exits."""
     try:
         return door(*arguments)
     except UserError:
         raise
-    except BaseException as error:  # a stranger's driver raises what its library raises, or exits
-        raise UserError(f"vehicle {name} cannot be opened: {_words(error)}") from None
+    except BaseException as error:
+        words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise UserError(f"vehicle {what} cannot be opened: {words}") from None
 
 
 def find_vehicle(name: str) -> Type[Vehicle]:
@@ -91,17 +88,12 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     place = name if ":" in name else BUILT_IN.get(name)
     if place is None:
         others = {point.name: point.value for point in _others()}
-        place = others.get(name)
-    if place is None:
-        known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
-        raise UserError(f"vehicle {name!r} is not known; choose from {known}, or a module:Class")
+        if (place := others.get(name)) is None:
+            known = ", ".join((NONE, *BUILT_IN, *sorted(others)))
+            words = f"vehicle {name!r} is not known; choose from {known}, or a module:Class"
+            raise UserError(words)
     module, _, member = place.partition(":")
-    try:
-        kind = getattr(import_module(module), member)
-    except UserError:
-        raise
-    except BaseException as error:  # whatever a stranger's module raises
-        raise UserError(f"vehicle {name!r} cannot be loaded: {_words(error)}") from None
+    kind = _call(name, lambda: getattr(import_module(module), member))
     if not (isinstance(kind, type) and issubclass(kind, Vehicle)):
         raise UserError(f"vehicle {name!r}: {place} is no edge_runtime.vehicles.base.Vehicle")
     if inspect.isabstract(kind):
@@ -130,11 +122,8 @@ def _find(name: str, tables: Tables) -> Tuple[Type[Vehicle], Mapping[str, Any]]:
     kind = find_vehicle(name)
     own = kind.name if ":" in name else name
     others = {own, kind.name, *BUILT_IN, *(point.name for point in _others())}
-    for table in tables.keys() - others:
-        if difflib.get_close_matches(own.lower(), [table.lower()]):
-            raise UserError(
-                f"[vehicle.{table}] is no table of {name}; did you mean [vehicle.{own}]?"
-            )
+    for table in difflib.get_close_matches(own, tables.keys() - others):
+        raise UserError(f"[vehicle.{table}] is no table of {name}; did you mean [vehicle.{own}]?")
     return kind, tables.get(own, {})
 
 
@@ -143,7 +132,3 @@ def _others() -> Iterable[Any]:
     found: Any = entry_points()
     # Before Python 3.10 a dict of lists; two folders on the path may both name one.
     return found.select(group=GROUP) if hasattr(found, "select") else found.get(GROUP, ())
-
-
-def _words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -8,40 +8,17 @@ itself; and the loop goes on, and says safe stop, when the driver raises or hang
 from __future__ import annotations
 
 import abc
-import inspect
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
-from edge_runtime.controller import ActionLimit, Limits
-from edge_runtime.manifest import MIN_PERIOD_S
+from edge_runtime.controller import Limits
+from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.util import UserError, ends_within, printable
-from edge_runtime.vehicles.plausibility import PEDAL, REASONS, Fault, VehicleWatch
+from edge_runtime.vehicles.plausibility import PEDAL, REASONS, Fault, VehicleReport, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
-
-if TYPE_CHECKING:
-    from edge_runtime.manifest import Manifest
-
-
-class VehicleReport(NamedTuple):
-    """What the vehicle does. `action` is what its actuators have reached, in the units of `limits`.
-
-    `faults` say in words why it does not drive, until it is enabled again; `standing` are those
-    whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
-    instead of a pedal works its pedal out from its speed, and reports two speeds more: its own in
-    the scenario, and the one that it is asked for (m/s of its own).
-    """
-
-    action: dict[str, float]
-    speed_mps: float
-    self_braking: bool
-    faults: list[str]
-    standing: Sequence[str] = ()
-    scenario_speed_mps: Optional[float] = None
-    commanded_speed_mps: Optional[float] = None
-    battery_v: Optional[float] = None
 
 
 class Vehicle(abc.ABC):
@@ -63,38 +40,15 @@ class Vehicle(abc.ABC):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        """Make the driver for a policy from the settings of its table; send nothing.
+        """Make the driver for a policy; send nothing. By default its table are the arguments.
 
         Raises UserError for settings that are not valid, and where a port cannot be opened.
         """
-        bound = cls.arguments_of(settings, manifest)
-        return cls(*bound.args, **bound.kwargs)
+        return cls(**settings)
 
     @classmethod
-    def arguments_of(
-        cls, settings: Mapping[str, Any], manifest: Manifest
-    ) -> inspect.BoundArguments:
-        """Return the constructor's arguments; by default the settings. Opens nothing.
-
-        Raises UserError for settings that are not valid.
-        """
-        known = inspect.signature(cls)
-        try:
-            return known.bind(**settings)
-        except TypeError as error:
-            names = ", ".join(known.parameters) or "none"
-            raise UserError(f"settings of {cls.name}: {error}; known are {names}") from None
-
-    @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> dict[str, ActionLimit]:
-        """Return `limits` of the driver to be, by default the class's. Opens nothing.
-
-        Raises UserError where they are not known, or as `arguments_of` does.
-        """
-        if inspect.getattr_static(cls, "open") is vars(Vehicle)["open"]:  # another asks for its own
-            cls.arguments_of(settings, manifest)
-        if not hasattr(cls, "limits"):
-            raise UserError(f"vehicle {cls.name}: what it lets an action be is not known unopened")
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
+        """Return `limits` of the driver to be, by default the class's. Opens nothing."""
         return cls.limits
 
     @abc.abstractmethod
@@ -177,7 +131,6 @@ class VehicleRunner:
         self.on_fault: Callable[[], None] = lambda: None
         self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
         self._watch = VehicleWatch(vehicle.control_period_s, vehicle.limits)
-        self._order_holds_s = 2 * vehicle.control_period_s
         # As often as the topic says, and twice before silence would be a fault.
         self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
         self._refuses = self._fails = False  # the driver raised at the newest command, report
@@ -258,34 +211,28 @@ class VehicleRunner:
         return _note_end(self._vehicle, not self._thread.is_alive())
 
     def _run(self) -> None:
-        next_s = time.monotonic()
+        next_s, vehicle = time.monotonic(), self._vehicle  # of the next report
         try:
             while not self._stopping:
-                next_s = self._live(next_s)
+                with self._due:
+                    self._due.wait_for(self._has_work, max(0.0, next_s - time.monotonic()))
+                    enables, order, self._next = self._enable_due, self._next, None
+                self._busy_since_s = time.monotonic()
+                if enables:
+                    self._enable()
+                if order is not None:
+                    self._obey(order)
+                now_s = time.monotonic()
+                if now_s >= next_s:
+                    # Absolute deadlines; after a pause one report, not one for each missed period.
+                    next_s = max(next_s + self._period_s, now_s)
+                    self._report()
+                self._busy_since_s = None
         finally:
-            vehicle = self._vehicle
             _end(vehicle, lambda: vehicle.brake(time.monotonic()), vehicle.close)
 
-    def _live(self, next_s: float) -> float:
-        """Do what is due, or wait for it; return when the next report is."""
-        with self._due:
-            self._due.wait_for(
-                lambda: self._next is not None or self._enable_due or self._stopping,
-                max(0.0, next_s - time.monotonic()),
-            )
-            enables, order, self._next = self._enable_due, self._next, None
-        self._busy_since_s = time.monotonic()
-        if enables:
-            self._enable()
-        if order is not None:
-            self._obey(order)
-        now_s = time.monotonic()
-        if now_s >= next_s:
-            # Absolute deadlines; after a long pause one report, not one for each missed period.
-            next_s = max(next_s + self._period_s, now_s)
-            self._report()
-        self._busy_since_s = None
-        return next_s
+    def _has_work(self) -> bool:
+        return self._next is not None or self._enable_due or self._stopping
 
     def _enable(self) -> None:
         failure, now_s = "", time.monotonic()
@@ -307,20 +254,20 @@ class VehicleRunner:
     def _obey(self, order: _Order) -> None:
         """Ask the driver. The mode alone makes a safe stop, whatever number is the policy's."""
         self._last = command = order.command
-        now_s = time.monotonic()
+        now_s, vehicle = time.monotonic(), self._vehicle
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
         if command.mode == SAFE_STOP:
             self._watch.command({**action, PEDAL: -1.0}, now_s, drives=False)
         try:
             if command.mode == SAFE_STOP:
-                self._vehicle.brake(now_s, order.latch)
+                vehicle.brake(now_s, order.latch)
             elif len(command.action) != len(self._action_names):
                 raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif self._not_enabled:
                 return  # that is the fault
-            elif now_s - order.given_s <= self._order_holds_s:  # after a hang it has grown old
-                self._vehicle.command(action, now_s, order.scenario_speed_mps)
+            elif now_s - order.given_s <= 2 * vehicle.control_period_s:  # old after a hang
+                vehicle.command(action, now_s, order.scenario_speed_mps)
         except BaseException as error:
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)

@@ -24,7 +24,7 @@ from edge_runtime.util import UserError
 # The set-point runs ahead of the speed by what full acceleration gives in this time, and no
 # further: a vehicle that was held up must not leap when it comes free (anti-windup).
 LEAD_S = 0.5
-RUNAWAY = 0.2  # of top speed, twice core.DEVIATION: the set-point does not follow a runaway closer
+RUNAWAY = 0.2  # of top speed, twice plausibility.DEVIATION: it follows a runaway no closer
 _LONGEST_STEP_S = 0.1  # after a pause of the process the pedal was not held for it
 
 
@@ -51,19 +51,18 @@ class HunterSpec(NamedTuple):
         The inner wheel's circle is half a track narrower: tan(inner) = wheelbase / (radius -
         track/2) with the radius wheelbase / tan(centre) of the rear axle's middle (Ackermann).
         """
-        slope = math.tan(min(abs(centre_rad), self.centre_rad(self.max_inner_steering_rad)))
-        inner_rad = math.atan2(
-            self.wheelbase_m * slope, self.wheelbase_m - 0.5 * self.track_m * slope
-        )
-        return math.copysign(inner_rad, centre_rad)
+        most_rad = self.centre_rad(self.max_inner_steering_rad)
+        return self._turned(min(abs(centre_rad), most_rad), centre_rad, -0.5 * self.track_m)
 
     def centre_rad(self, inner_rad: float) -> float:
         """Return the centre angle for an inner wheel's angle: the inverse of `inner_rad`."""
-        slope = math.tan(abs(inner_rad))
-        centre_rad = math.atan2(
-            self.wheelbase_m * slope, self.wheelbase_m + 0.5 * self.track_m * slope
-        )
-        return math.copysign(centre_rad, inner_rad)
+        return self._turned(abs(inner_rad), inner_rad, 0.5 * self.track_m)
+
+    def _turned(self, angle_rad: float, sign: float, wider_m: float) -> float:
+        """Return the angle of a wheel whose circle is so much wider."""
+        slope = math.tan(angle_rad)
+        turned_rad = math.atan2(self.wheelbase_m * slope, self.wheelbase_m + wider_m * slope)
+        return math.copysign(turned_rad, sign)
 
 
 SPECS: Dict[str, HunterSpec] = {
@@ -89,23 +88,6 @@ class Similarity(NamedTuple):
         """Return the pedal that gives the robot this acceleration, within -1 to 1."""
         full_mps2 = self.car.throttle_mps2 if acceleration_mps2 > 0 else self.car.brake_mps2
         return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
-
-    def pedal_to_speed(
-        self, speed_mps: float, pedal: float, step_s: float, measured_mps: float
-    ) -> float:
-        """Return the speed to ask for after `speed_mps` when the pedal was held for `step_s`."""
-        lead_mps = self.acceleration_mps2(1.0) * LEAD_S
-        speed_mps = min(speed_mps + self.acceleration_mps2(pedal) * step_s, measured_mps + lead_mps)
-        if pedal > 0:  # a brake that does not bite is asked for all the more
-            least_mps = RUNAWAY * self.spec.max_speed_mps
-            speed_mps = max(speed_mps, measured_mps - max(lead_mps, least_mps))
-        return min(max(speed_mps, 0.0), self.spec.max_speed_mps)
-
-    def follow_speed(self, speed_mps: float, scenario_mps: float, step_s: float) -> float:
-        """Return the speed to ask for where the scenario has the pedals: that of its car."""
-        most_mps, least_mps = (self.acceleration_mps2(pedal) * step_s for pedal in (1.0, -1.0))
-        change_mps = min(max(scenario_mps * self.scale - speed_mps, least_mps), most_mps)
-        return min(max(speed_mps + change_mps, 0.0), self.spec.max_speed_mps)
 
     def centre_rad(self, steering: float) -> float:
         """Return the angle of a wheel in the middle of the front axle, for a steering in -1 to 1.
@@ -153,25 +135,22 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def similarity(self, vehicle: str, manifest: Manifest) -> Similarity:
         """Return the similarity to the policy's car. Raises UserError for bad settings."""
-        table = f"vehicle.{vehicle}"
-        check_choice(f"{table}.model", self.model, tuple(SPECS))
-        given = self.car or manifest.car
-        if given is None:
+        table = f"[vehicle.{vehicle}]"
+        check_choice(f"{table} model", self.model, tuple(SPECS))
+        car = self.car or manifest.car
+        if car is None:
             raise UserError(
                 f"the {vehicle} cannot follow a policy of the task {manifest.task!r}: its manifest"
-                f" does not say which car it was trained on; set car in [{table}] of --config"
+                f" does not say which car it was trained on; set car in {table} of --config"
             )
-        numbers = msgspec.structs.asdict(given)
-        if self.scale is not None:
-            numbers["scale"] = self.scale
-        full_rad = numbers.pop("full_steering_rad")  # below 0 where it turns to the right
-        if not 0.0 < abs(full_rad) < 1.5:
-            words = f"full_steering_rad {full_rad} is not valid"
-            raise UserError(f"{table}: {words}: it must be above 0 and below 1.5, or minus that")
+        found = similarity_to(car, SPECS[self.model], self.scale)
+        # Of the car's steering, below 0 where it turns to the right, tan must be finite.
+        numbers = {**msgspec.structs.asdict(car), "scale": found.scale}
+        numbers["full_steering_rad"] = abs(car.full_steering_rad)
         for name, value in numbers.items():
-            if not 0.0 < value < math.inf:
+            if not 0.0 < value < (1.5 if name == "full_steering_rad" else math.inf):
                 raise UserError(f"{table}: {name} {value} is not valid: it must be above 0")
-        return similarity_to(given, SPECS[self.model], self.scale)
+        return found
 
 
 class Wish(NamedTuple):
@@ -187,8 +166,7 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
 
     Raises ValueError for what is not finite, and for what leaves out how fast to drive.
     """
-    given = [*action.values(), 0.0 if scenario_speed_mps is None else scenario_speed_mps]
-    if not all(map(math.isfinite, given)):
+    if not all(map(math.isfinite, [*action.values(), scenario_speed_mps or 0.0])):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
     if not action or ("pedal" not in action and scenario_speed_mps is None):
         raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
@@ -206,14 +184,27 @@ class SetPoint:
         self._similarity = similarity
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
-        similarity, spec, speed_mps = self._similarity, self._similarity.spec, self.speed_mps
+        """Go on towards a command that was in force for `step_s`."""
+        similarity, spec = self._similarity, self._similarity.spec
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:
-            speed_mps = similarity.pedal_to_speed(speed_mps, wish.pedal, step_s, measured_mps)
-        else:
-            speed_mps = similarity.follow_speed(speed_mps, wish.scenario_speed_mps or 0.0, step_s)
-        self.speed_mps = speed_mps
+            speed_mps = self._driven_mps(wish.pedal, step_s, measured_mps)
+        else:  # the scenario has the pedals
+            gap_mps = (wish.scenario_speed_mps or 0.0) * similarity.scale - self.speed_mps
+            least_mps, most_mps = (similarity.acceleration_mps2(p) * step_s for p in (-1.0, 1.0))
+            speed_mps = self.speed_mps + min(max(gap_mps, least_mps), most_mps)
+        self.speed_mps = min(max(speed_mps, 0.0), spec.max_speed_mps)
         if wish.steering is not None:
             wanted_rad = spec.inner_rad(similarity.centre_rad(wish.steering))
             most_rad = spec.max_steering_rate_radps * step_s
             self.inner_rad += clamp(wanted_rad - self.inner_rad, most_rad)
+
+    def _driven_mps(self, pedal: float, step_s: float, measured_mps: float) -> float:
+        similarity = self._similarity
+        lead_mps = similarity.acceleration_mps2(1.0) * LEAD_S
+        speed_mps = self.speed_mps + similarity.acceleration_mps2(pedal) * step_s
+        speed_mps = min(speed_mps, measured_mps + lead_mps)
+        if pedal > 0:  # a brake that does not bite is asked for all the more
+            least_mps = RUNAWAY * similarity.spec.max_speed_mps
+            speed_mps = max(speed_mps, measured_mps - max(lead_mps, least_mps))
+        return speed_mps

@@ -6,21 +6,18 @@ test with made-up times sees exactly what a process sees.
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
+from typing import Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
 
 import msgspec
 
 from edge_runtime.config import convert
 from edge_runtime.controller import ActionLimit
+from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.vehicles.mapping import clamp
-
-if TYPE_CHECKING:
-    from edge_runtime.manifest import Manifest
 
 _INTEGRATION_STEP_S = 0.005
 _LONGEST_GAP_S = 10.0  # without a command it then stands, whatever it did before
@@ -48,16 +45,13 @@ class MockVehicle(Vehicle):
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
         self._parameters = parameters or MockParameters()
         self._pedal, self._steering, self._speed_mps = -1.0, 0.0, 0.0
-        self._now_s: Optional[float] = None
-        self._commanded_s = -math.inf
+        self._now_s, self._commanded_s = math.inf, -math.inf  # its time begins with the first call
         self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
         self._target = (-1.0, 0.0)
         self._latched = True  # until it is enabled
 
     @classmethod
-    def arguments_of(
-        cls, settings: Mapping[str, Any], manifest: Manifest
-    ) -> inspect.BoundArguments:
+    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
         """Be as quick as the policy's car, where that is known and the settings do not say."""
         car = msgspec.structs.asdict(manifest.car) if manifest.car else {}
         known = {name: car[name] for name in MockParameters.__struct_fields__ if name in car}
@@ -65,7 +59,7 @@ class MockVehicle(Vehicle):
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
-        return inspect.signature(cls).bind(parameters)
+        return cls(parameters)
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
@@ -81,11 +75,10 @@ class MockVehicle(Vehicle):
         if not all(map(math.isfinite, action.values())):
             raise ValueError(f"a command that is not finite: {action}")
         self._integrate(now_s)
-        if self._latched:
-            return
-        self._commanded_s = now_s
-        target = (clamp(action.get("pedal", 0.0), 1.0), clamp(action.get("steering", 0.0), 1.0))
-        self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
+        if not self._latched:
+            self._commanded_s = now_s
+            target = (clamp(action.get("pedal", 0.0), 1.0), clamp(action.get("steering", 0.0), 1.0))
+            self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Brake without the dead time of a command's way."""
@@ -97,15 +90,10 @@ class MockVehicle(Vehicle):
 
     def feedback(self, now_s: float) -> VehicleReport:
         self._integrate(now_s)
-        return VehicleReport(
-            action={"pedal": self._pedal, "steering": self._steering},
-            speed_mps=self._speed_mps,
-            self_braking=self._is_left_alone(now_s),
-            faults=[],
-        )
+        action = {"pedal": self._pedal, "steering": self._steering}
+        return VehicleReport(action, self._speed_mps, self._is_left_alone(now_s), faults=[])
 
     def close(self) -> None:
-        """Stand, and stay so."""
         self._latched = True
         self._on_the_way.clear()
         self._target = (-1.0, self._target[1])
@@ -114,15 +102,17 @@ class MockVehicle(Vehicle):
         return now_s - self._commanded_s > 2 * self.control_period_s
 
     def _integrate(self, until_s: float) -> None:
-        begin_s = until_s if self._now_s is None else self._now_s
-        self._now_s = max(begin_s, until_s - _LONGEST_GAP_S)
         car = self._parameters
+        self._now_s = max(min(self._now_s, until_s), until_s - _LONGEST_GAP_S)
         while until_s - self._now_s > 1e-9:
             step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)
             self._now_s += step_s
-            pedal, steering = self._target_at(self._now_s)
-            self._pedal = self._follow(self._pedal, pedal, step_s)
-            self._steering = self._follow(self._steering, steering, step_s)
+            while self._on_the_way and self._on_the_way[0][0] <= self._now_s:
+                _, self._target = self._on_the_way.popleft()
+            if self._is_left_alone(self._now_s):
+                self._target = (-1.0, self._target[1])
+            self._pedal = self._follow(self._pedal, self._target[0], step_s)
+            self._steering = self._follow(self._steering, self._target[1], step_s)
             full_mps2 = car.throttle_mps2 if self._pedal > 0.0 else car.brake_mps2
             speed_mps = self._speed_mps + self._pedal * full_mps2 * step_s
             self._speed_mps = min(max(speed_mps, 0.0), car.max_speed_mps)
@@ -130,12 +120,4 @@ class MockVehicle(Vehicle):
     def _follow(self, position: float, target: float, step_s: float) -> float:
         """Lag towards the target by the time constant, no faster than the actuator's rate."""
         change = (target - position) * (1.0 - math.exp(-step_s / self._parameters.time_constant_s))
-        most = self._parameters.slew_per_s * step_s
-        return position + min(max(change, -most), most)
-
-    def _target_at(self, now_s: float) -> Tuple[float, float]:
-        while self._on_the_way and self._on_the_way[0][0] <= now_s:
-            _, self._target = self._on_the_way.popleft()
-        if self._is_left_alone(now_s):
-            self._target = (-1.0, self._target[1])
-        return self._target
+        return position + clamp(change, self._parameters.slew_per_s * step_s)

@@ -1,8 +1,8 @@
 """Whether a vehicle can be believed. Pure: every call is passed the time, in monotonic seconds.
 
 Two watch over a vehicle with the same words (`Fault`). `VehicleWatch` sees the commands and reports
-of any driver. `DriveWatch` sees set-point and feedback of a streamed vehicle (core.py), in m/s and
-rad; so it finds a steering that does not follow, and a speed whose pedal nobody asked for.
+of any driver. `DriveWatch` sees set-point and feedback of a streamed vehicle, in m/s and rad; so it
+finds a steering that does not follow, and a speed whose pedal nobody asked for.
 """
 
 from __future__ import annotations
@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Deque, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Deque, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from edge_runtime.controller import Limits
 from edge_runtime.safety import SILENCE_PERIODS
-
-if TYPE_CHECKING:
-    from edge_runtime.vehicles.base import VehicleReport
-    from edge_runtime.vehicles.mapping import HunterSpec
+from edge_runtime.vehicles.mapping import HunterSpec
 
 PEDAL = "pedal"
 ENABLE_TIMEOUT_S = 1.0  # a vehicle may take so long to confirm that it is enabled
@@ -36,6 +33,25 @@ FOLLOWS_S = 1.0
 STEERS_S = 0.2
 DEVIATION = 0.1
 IMPOSSIBLE = 1.3  # times what the model can do
+
+
+class VehicleReport(NamedTuple):
+    """What the vehicle does. `action` is what its actuators have reached, in the units of `limits`.
+
+    `faults` say in words why it does not drive, until it is enabled again; `standing` are those
+    whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
+    instead of a pedal works its pedal out from its speed, and reports two speeds more: its own in
+    the scenario, and the one that it is asked for (m/s of its own).
+    """
+
+    action: Dict[str, float]
+    speed_mps: float
+    self_braking: bool
+    faults: List[str]
+    standing: Sequence[str] = ()
+    scenario_speed_mps: Optional[float] = None
+    commanded_speed_mps: Optional[float] = None
+    battery_v: Optional[float] = None
 
 
 class Fault(str, Enum):
@@ -59,17 +75,12 @@ class Finding(NamedTuple):
     """A fault, or another event of a streamed vehicle; `words` are empty for what we asked for."""
 
     event: Enum
-    words: str
+    words: str = ""
 
 
-class Lasting:
-    """Since when a condition has held, at every look."""
-
-    def __init__(self) -> None:
-        self.since_s = math.inf
-
-    def note(self, holds: bool, now_s: float) -> None:
-        self.since_s = min(self.since_s, now_s) if holds else math.inf
+def lasting(since_s: float, holds: bool, now_s: float) -> float:
+    """Return since when a condition has held at every look; inf where it does not hold."""
+    return min(since_s, now_s) if holds else math.inf
 
 
 class Asked:
@@ -100,16 +111,16 @@ class VehicleWatch:
         self._silence_s, self._limits = 2 * control_period_s, limits
         self._brakes_s = SILENCE_PERIODS * control_period_s
         self._drives, self._enabled_s = False, -math.inf
-        self._braking, self._deviates = Lasting(), Lasting()
+        self._brakes_since_s = self._deviates_since_s = math.inf
         self._asked = Asked(LAG_S)
-        self._reported_s: Optional[float] = None
+        self._reported_s = math.inf  # until it owes a report
         self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
         self._lies = False
 
     @property
     def silent_at_s(self) -> float:
-        """When it counts as silent if no further report comes; inf before the first report."""
-        return math.inf if self._reported_s is None else self._reported_s + self._silence_s
+        """When it counts as silent if no further report comes; inf before `begin`."""
+        return self._reported_s + self._silence_s
 
     def begin(self, now_s: float) -> None:
         """Expect reports from now on."""
@@ -129,20 +140,22 @@ class VehicleWatch:
         if not self._lies:
             self._believed = (now_s, report.speed_mps)
         self._reported_s = now_s
-        self._deviates.note(self._is_astray(report, now_s), now_s)
+        is_astray = self._is_astray(report, now_s)
+        self._deviates_since_s = lasting(self._deviates_since_s, is_astray, now_s)
         if not report.self_braking:
             self._enabled_s = -math.inf  # it has taken control
-        self._braking.note(self._drives and report.self_braking, now_s)
+        brakes = self._drives and report.self_braking
+        self._brakes_since_s = lasting(self._brakes_since_s, brakes, now_s)
 
     def fault(self, now_s: float) -> Optional[Fault]:
         if now_s > self.silent_at_s:
             return Fault.SILENT
         if self._lies:
             return Fault.LYING
-        may_brake_until_s = max(self._braking.since_s, self._enabled_s + ENABLE_TIMEOUT_S)
+        may_brake_until_s = max(self._brakes_since_s, self._enabled_s + ENABLE_TIMEOUT_S)
         if now_s - may_brake_until_s > self._brakes_s:
             return Fault.SELF_BRAKING  # it obeys nobody, and would drive off with the next command
-        return Fault.STUCK if now_s - self._deviates.since_s > DEVIATES_S else None
+        return Fault.STUCK if now_s - self._deviates_since_s > DEVIATES_S else None
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
         for name, value in report.action.items():
@@ -150,12 +163,10 @@ class VehicleWatch:
             slack = _ROUNDING * (high - low)
             if not low - slack <= value <= high + slack:  # NaN is in no range
                 return True
-        if not math.isfinite(report.speed_mps):
-            return True
         # From the last possible report on: a leap is a lie until that speed could be real.
         since_s, speed_mps = self._believed or (now_s, report.speed_mps)
         most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
-        return abs(report.speed_mps - speed_mps) > most_mps
+        return not abs(report.speed_mps - speed_mps) <= most_mps  # nor is NaN, or inf - inf
 
     def _is_astray(self, report: VehicleReport, now_s: float) -> bool:
         if report.self_braking or not self._asked.is_full(now_s):
@@ -187,7 +198,7 @@ class FollowWatch:
         self._tolerance, self._rate = tolerance, rate
         self._asked = Asked(follows_s)
         self._low = self._high = 0.0  # a healthy one is in between
-        self._deviates = Lasting()
+        self._deviates_since_s = math.inf
 
     def is_stuck(self, asked: float, measured: Optional[float], now_s: float) -> bool:
         """Note what is asked and measured now, and judge; a None is not judged."""
@@ -199,17 +210,17 @@ class FollowWatch:
         self._asked.note(asked, now_s)
         if not self._asked.is_full(now_s):  # it has had no time to follow
             self._low = self._high = measured
-            self._deviates.note(False, now_s)
+            self._deviates_since_s = math.inf
             return False
         self._low = min(*self._asked.values, self._low + nearer)
         self._high = max(*self._asked.values, self._high - nearer)
         follows = self._low - self._tolerance <= measured <= self._high + self._tolerance
-        self._deviates.note(not follows, now_s)
-        return now_s - self._deviates.since_s > DEVIATES_S
+        self._deviates_since_s = lasting(self._deviates_since_s, not follows, now_s)
+        return now_s - self._deviates_since_s > DEVIATES_S
 
 
 class DriveWatch:
-    """Watch whether the drive and the steering of a streamed vehicle follow its set-point.
+    """Watch whether drive and steering of a streamed vehicle follow its set-point.
 
     `silence_s` is how old feedback may be.
     """
@@ -226,14 +237,11 @@ class DriveWatch:
         """Note speed (m/s) and centre angle (rad; measured: None is not judged), and judge."""
         (asked_mps, asked_rad), (speed_mps, turned_rad) = asked, measured
         speed_is_stuck = self._speed.is_stuck(asked_mps, speed_mps, now_s)
-        steering_is_stuck = self._steering.is_stuck(asked_rad, turned_rad, now_s)
-        if speed_is_stuck:
-            words = f"the speed stays at {speed_mps:.2f} m/s, asked for {asked_mps:.2f}"
-            return Finding(Fault.STUCK, words)
-        if steering_is_stuck:
+        if self._steering.is_stuck(asked_rad, turned_rad, now_s) and not speed_is_stuck:
             words = f"the steering stays at {turned_rad:.2f} rad, asked for {asked_rad:.2f}"
             return Finding(Fault.STEERING_STUCK, words)
-        return None
+        words = f"the speed stays at {speed_mps:.2f} m/s, asked for {asked_mps:.2f}"
+        return Finding(Fault.STUCK, words) if speed_is_stuck else None
 
 
 def impossible(speed_mps: float, inner_rad: float, spec: HunterSpec) -> str:

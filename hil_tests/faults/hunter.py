@@ -19,7 +19,7 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
-from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
+from edge_runtime.vehicles.hunter import STATUS_SILENCE_S
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.observe import (
     REACTION_LIMIT_S,
@@ -31,8 +31,7 @@ from hil_tests.faults.observe import (
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import at_any_phase
 from hil_tests.faults.table import Try, fault
-from hil_tests.mock_hunter.chassis import BITS, FAULTS
-from hil_tests.mock_hunter.hunter import MODELS
+from hil_tests.mock_hunter import BITS, FAULTS, MODELS
 
 MODEL = "hunter-2.0"
 QUIET_S = 0.5

@@ -25,7 +25,7 @@ from edge_runtime.link import ask
 from edge_runtime.manifest import Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.hunter import GROUP
+from edge_runtime.vehicles.hunter import MULTICAST_GROUP
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, encode
 from hil_tests.faults import inside
 from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT, noise
@@ -416,4 +416,4 @@ def free_bus() -> str:
     """Return a bus of its own: Linux mixes buses that share a port, whatever their groups."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
-        return f"udp_multicast:{GROUP}:{one.getsockname()[1]}"
+        return f"udp_multicast:{MULTICAST_GROUP}:{one.getsockname()[1]}"

@@ -1,1 +1,311 @@
-"""A Hunter of arithmetic on a CAN bus: `process.py` alone has a clock and a bus."""
+"""A Hunter of arithmetic on a CAN bus: frames and time in, frames out. `process.py` has the clock.
+
+The rules of the chassis come first: CONTROL says who drives, BITS which errors stop it, FAULTS what
+can be switched on. The manual leaves open what follows when the remote control or the emergency
+stop lets go: here the chassis goes back to where it was, which gives control back by itself. That
+is the worst case for whoever commands it, as its answer to frames that come back after a time-out
+is (and that one is documented).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter import protocol
+from edge_runtime.vehicles.hunter.protocol import MotionCommand, Sent
+from edge_runtime.vehicles.mapping import clamp
+
+STEERING, REAR_RIGHT, REAR_LEFT = range(3)
+_LOW_SUPPLY, _MOTOR_HOT, _OVERCURRENT = 1 << 0, 1 << 1, 1 << 2
+_DRIVER_HOT, _SENSOR, _DRIVER, _ENABLED = 1 << 3, 1 << 4, 1 << 5, 1 << 6
+
+
+class Bit(NamedTuple):
+    """An error that the chassis shows in 0x211, by the driver's words for it.
+
+    ``stops``: it then lets nobody drive. ``latches``: it stays until 0x441 clears it. Which do
+    so the manual leaves open: assumed. ``motors`` show ``motor_bits`` in 0x261 to 0x263.
+    """
+
+    words: str
+    stops: bool = True
+    latches: bool = False
+    motors: tuple[int, ...] = ()
+    motor_bits: int = 0
+
+
+_ALL, _REAR = (STEERING, REAR_RIGHT, REAR_LEFT), (REAR_RIGHT, REAR_LEFT)
+BITS: dict[str, Bit] = {
+    "steering_encoder": Bit(protocol.STEER_ENCODER, True, True, (STEERING,), _SENSOR),
+    "driver": Bit(protocol.DRIVER, True, True, (REAR_RIGHT,), _DRIVER),
+    "undervoltage": Bit(protocol.UNDERVOLTAGE, motors=_ALL, motor_bits=_LOW_SUPPLY),
+    "link_steer": Bit(protocol.LINK_STEER),
+    "link_rear_right": Bit(protocol.LINK_REAR_RIGHT),
+    "link_rear_left": Bit(protocol.LINK_REAR_LEFT),
+    "overtemperature": Bit(
+        protocol.OVERTEMPERATURE, motors=_REAR, motor_bits=_DRIVER_HOT | _MOTOR_HOT
+    ),
+    "overcurrent": Bit(protocol.OVERCURRENT, True, True, (REAR_RIGHT,), _OVERCURRENT),
+    "remote_lost": Bit(protocol.REMOTE_LOST, stops=False),
+}
+FAULTS: dict[str, str] = {
+    "silent": "it sends nothing, and obeys",
+    "frozen": "it repeats its last frames, and obeys",
+    "stuck": "its motors stay as they are, whatever is asked; its brake works",
+    "full_lock": "its wheels go to full lock, whatever is asked",
+    "lying": "it reports a speed that cannot be",
+    "late": "all that it sends comes late",
+    "bus_off": "it neither sends nor hears",
+    "remote": "the remote control takes over, its sticks at rest",
+    "estop": "its emergency stop is pressed",
+    **{name: bit.words for name, bit in BITS.items()},
+}
+LATE_S = 0.4
+LIE_MPS = 3.0
+
+
+class Control(StrEnum):
+    """Who drives. ``*_OVER_CAN``: the bus had control and gets it back."""
+
+    STANDBY = "standby"
+    CAN = "can"
+    LINK_LOST = "link_lost"  # standby, for the commands stopped coming
+    REMOTE = "remote"
+    REMOTE_OVER_CAN = "remote_over_can"
+
+
+_S, _C, _L, _R, _O = Control
+CONTROL: dict[str, tuple[Control, ...]] = {
+    # in:         standby, can, link_lost, remote, remote_over_can
+    "0x421 = 1":         (_C, _C, _C, _R, _O),  # the remote control always outranks the bus
+    "0x421 = 0":         (_S, _S, _S, _R, _R),
+    "0x111":             (_S, _C, _C, _R, _O),  # the trap: link_lost, and nobody asked
+    "time-out":          (_S, _L, _L, _R, _O),
+    "remote takes over": (_R, _O, _O, _R, _O),
+    "remote lets go":    (_S, _C, _L, _S, _C),
+}  # fmt: skip
+"""Event -> the state after it, for each state before it in the order of `Control`."""
+
+STANDS_MPS = 0.005
+"""Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
+FAST_S = 0.02
+SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
+STEP_S = 0.005
+_LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
+_COOL_C, _HOT_C = 35, 105
+_BATTERY_V, _LOW_V, _IDLE_A = 27.9, 21.0, 1.0
+_TURNS = 20.0  # Of a motor, for each metre of path or radian of the inner wheel
+_PULSES = 100.0  # Of its encoder, for each turn
+_FAULT_BITS = {words: mask for mask, words in protocol.PROFILES["v2"].items()}
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Limits and actuators of one model. Angles are those of the inner front wheel."""
+
+    # From AgileX's user manual:
+    max_speed_mps: float
+    max_inner_rad: float
+    command_timeout_s: float = 0.5
+    # Assumed, since the manual says nothing of the actuators: measure them, and pass them by --set.
+    dead_time_s: float = 0.03  # From a command on the bus to the first movement of an actuator
+    speed_time_constant_s: float = 0.1
+    acceleration_mps2: float = 2.0
+    braking_mps2: float = 3.0
+    """Of the speed controller, and of the brake: the chassis stops a moving car with either."""
+    steering_rate_radps: float = 1.0
+
+
+MODELS: dict[str, Parameters] = {
+    "hunter-2.0": Parameters(1.5, 0.576),
+    "hunter-se": Parameters(4.8, 0.400, acceleration_mps2=3.0, braking_mps2=4.0),
+}
+TUNABLE = [field.name for field in fields(Parameters)]
+
+
+def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
+    """Return a model's row with some numbers replaced. Raises UserError for bad numbers."""
+    if unknown := changes.keys() - TUNABLE:
+        raise UserError(f"no parameter {min(unknown)!r}; choose from {', '.join(TUNABLE)}")
+    made = replace(MODELS[model], **changes)
+    for name, value in asdict(made).items():
+        if not 0.0 < value < math.inf:
+            raise UserError(f"parameter {name} must be above 0 and finite, not {value}")
+    return made
+
+
+class MockHunter:
+    """A chassis that was just switched on: standby, brake locked, no error. Not thread-safe.
+
+    Call `receive` for each frame of the bus, and `due` at `next_s`. Left is positive.
+    """
+
+    def __init__(self, parameters: Parameters, now_s: float) -> None:
+        self.control, self.brake_locked, self.faults = Control.STANDBY, True, set[str]()
+        self.errors: set[str] = set()  # of BITS, as it shows them
+        self.speed_mps = self.inner_rad = self.way_m = self._turning_radps = 0.0
+        self.next_s = now_s
+        self._parameters, self._now_s = parameters, now_s
+        self._commanded_s = -math.inf  # when the newest 0x111 came, or CAN control was taken
+        self._under_way: deque[tuple[float, MotionCommand]] = deque()
+        self._setpoint = MotionCommand(0.0, 0.0)
+        self._tick = 0
+        self._fast: list[Sent] = []
+        self._slow: list[Sent] = []
+        self._outgoing: deque[tuple[float, Sent]] = deque()
+
+    @property
+    def stands(self) -> bool:
+        return abs(self.speed_mps) < STANDS_MPS
+
+    @property
+    def state(self) -> int:
+        """State, as 0x211 has it."""
+        if "estop" in self.faults:
+            return protocol.STATE_ESTOP
+        is_stopped = any(BITS[error].stops for error in self.errors)
+        return protocol.STATE_EXCEPTION if is_stopped else protocol.STATE_OK
+
+    @property
+    def obeys(self) -> bool:
+        """Whether the body follows the set-point of the bus."""
+        may_drive = self.state == protocol.STATE_OK and not self.brake_locked
+        return self.control is Control.CAN and may_drive
+
+    def describe(self) -> str:
+        """Describe its state in a line that only changes when something happens."""
+        return (
+            f"control={self.control} state={self.state}"
+            f" brake={'locked' if self.brake_locked else 'released'}"
+            f" motion={'stands' if self.stands else 'moves'}"
+            f" errors={','.join(sorted(self.errors)) or 'none'}"
+        )
+
+    def receive(self, can_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame of the bus; ignore unknown ones, and those of a wrong length."""
+        self.advance(now_s)
+        message = protocol.decode(can_id, data)
+        if message is None or "bus_off" in self.faults:
+            return
+        if can_id == protocol.MOTION_COMMAND.can_id:
+            if "full_lock" in self.faults:
+                message = message._replace(inner_steering_rad=-self._parameters.max_inner_rad)
+            self._change_control("0x111")
+            self._commanded_s = now_s
+            self._under_way.append((now_s + self._parameters.dead_time_s, message))
+        elif can_id == protocol.MODE_COMMAND.can_id and message.value in (0, 1):
+            before = self.control
+            self._change_control(f"0x421 = {message.value}")
+            if self.control is Control.CAN and before is not Control.CAN:
+                self._commanded_s = now_s  # the time-out counts from here
+        elif can_id == protocol.BRAKE_COMMAND.can_id and message.value in (0, 1):
+            self.brake_locked = message.value == protocol.LOCK
+        elif can_id == protocol.CLEAR_COMMAND.can_id:
+            self.errors &= self.faults
+
+    def switch(self, name: str, on: bool, now_s: float) -> None:
+        """Switch a fault. An error that does not latch goes with its cause."""
+        self.advance(now_s)
+        (self.faults.add if on else self.faults.discard)(name)
+        if name in BITS and on:
+            self.errors.add(name)
+        elif name in BITS and not BITS[name].latches:
+            self.errors.discard(name)
+        elif name == "remote":
+            self._change_control("remote takes over" if on else "remote lets go")
+
+    def due(self, now_s: float) -> list[Sent]:
+        """Return the frames to send now; after a pause one report, not one a missed period."""
+        self.advance(now_s)
+        if now_s >= self.next_s:
+            self._report(now_s)
+            self._tick += 1
+            missed = int((now_s - self.next_s) / FAST_S)
+            self.next_s += (missed + 1) * FAST_S
+        found = []
+        while self._outgoing and self._outgoing[0][0] <= now_s:
+            found.append(self._outgoing.popleft()[1])
+        return found
+
+    def advance(self, now_s: float) -> None:
+        self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
+        while now_s - self._now_s > 1e-9:
+            step_s = min(STEP_S, now_s - self._now_s)
+            self._now_s += step_s
+            if self._now_s - self._commanded_s > self._parameters.command_timeout_s:
+                self._change_control("time-out")
+            while self._under_way and self._under_way[0][0] <= self._now_s:
+                self._setpoint = self._under_way.popleft()[1]
+            self._move(step_s)
+
+    def _change_control(self, event: str) -> None:
+        self.control = CONTROL[event][list(Control).index(self.control)]
+
+    def _move(self, step_s: float) -> None:
+        """Integrate one step towards the set-point, or brake with the steering held."""
+        p, before_rad = self._parameters, self.inner_rad
+        if not self.obeys:
+            # Where control comes back, it does so from a stand, not with what was asked before.
+            self._setpoint = MotionCommand(0.0, self.inner_rad)
+            self.speed_mps -= clamp(self.speed_mps, p.braking_mps2 * step_s)
+        elif "stuck" not in self.faults:
+            gap_mps = clamp(self._setpoint.speed_mps, p.max_speed_mps) - self.speed_mps
+            change_mps = gap_mps * (1 - math.exp(-step_s / p.speed_time_constant_s))
+            brakes = self.speed_mps * change_mps < 0
+            rate_mps2 = p.braking_mps2 if brakes else p.acceleration_mps2
+            self.speed_mps += clamp(change_mps, rate_mps2 * step_s)
+            turn_rad = clamp(self._setpoint.inner_steering_rad, p.max_inner_rad) - self.inner_rad
+            self.inner_rad += clamp(turn_rad, p.steering_rate_radps * step_s)
+        self._turning_radps = (self.inner_rad - before_rad) / step_s
+        self.way_m += self.speed_mps * step_s
+
+    def _report(self, now_s: float) -> None:
+        with_slow = self._tick % SLOW_EVERY == 0
+        if "frozen" not in self.faults or not self._slow:
+            self._fast = self._fast_frames()
+            self._slow = self._slow_frames() if with_slow else self._slow
+        if self.faults & {"silent", "bus_off"}:
+            return
+        release_s = now_s + (LATE_S if "late" in self.faults else 0.0)
+        if self._outgoing:
+            release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
+        frames = self._fast + (self._slow if with_slow else [])
+        self._outgoing.extend((release_s, frame) for frame in frames)
+
+    def _fast_frames(self) -> list[Sent]:
+        """Make 0x221 and 0x251 to 0x253: every 20 ms."""
+        speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
+        motion = protocol.MotionStatus(speed_mps, self.inner_rad)
+        rear = (self.speed_mps, self.way_m)
+        motors = zip(
+            protocol.MOTORS_FAST, ((self._turning_radps, self.inner_rad), rear, rear), strict=True
+        )
+        return [protocol.MOTION_STATUS.sent(motion)] + [
+            row.sent((rate * _TURNS * 60, _IDLE_A, way * _TURNS * _PULSES))
+            for row, (rate, way) in motors
+        ]
+
+    def _slow_frames(self) -> list[Sent]:
+        """Make 0x211 and 0x261 to 0x263: every 100 ms."""
+        words = [BITS[error].words for error in self.errors]
+        words += [protocol.LINK_LOST] if self.control is Control.LINK_LOST else []
+        mode = protocol.CAN_CONTROL if self.control is Control.CAN else protocol.STANDBY
+        if self.control in (Control.REMOTE, Control.REMOTE_OVER_CAN):
+            mode = protocol.REMOTE_CONTROL
+        volts = _LOW_V if "undervoltage" in self.errors else _BATTERY_V
+        faults, counter = sum(_FAULT_BITS[each] for each in words), self._tick // SLOW_EVERY % 256
+        status = (self.state, mode, volts, faults, int(self.brake_locked), counter)
+        found = [protocol.SYSTEM_STATUS.sent(status)]
+        for motor, row in enumerate(protocol.MOTORS_SLOW):
+            errors = [BITS[error] for error in self.errors if motor in BITS[error].motors]
+            hot = "overtemperature" in self.errors and motor != STEERING
+            celsius = _HOT_C if hot else _COOL_C
+            bits = _ENABLED | sum(error.motor_bits for error in errors)
+            found.append(row.sent((volts, celsius, celsius, bits)))
+        return found

@@ -1,105 +1,27 @@
-"""``python -m hil_tests mock_hunter``: the mock as a process on a CAN bus.
-
-The clock, the bus and the switches stand here, around what is pure in `hunter.py`.
-"""
+"""``python -m hil_tests mock_hunter``: the mock as a process on a CAN bus."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import queue
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from functools import partial
-from typing import Any
 
 import can
 
 from edge_runtime.cli import examples, seconds
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus
-from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
-from hil_tests.mock_hunter.chassis import FAULTS
-from hil_tests.mock_hunter.hunter import MODELS, TUNABLE, MockHunter, make_parameters
-
-Switch = tuple[str, bool]  # A fault's name, and whether it is switched on
-_WORDS = {"on": True, "off": False}
-
-
-def read_orders(
-    lines: Iterable[str], obey: Callable[[Switch], None], complain: Callable[[str], None]
-) -> None:
-    """Read ``NAME on`` or ``NAME off``, line by line, in a thread so that nobody waits for them."""
-    for line in lines:
-        name, _, word = line.strip().partition(" ")
-        if name in FAULTS and word in _WORDS:
-            obey((name, _WORDS[word]))
-        else:
-            complain(f"error: {line.strip()!r} is no order: use NAME on, or NAME off")
-
-
-class Server:
-    """Runs a mock on a bus until `stop`; every change is told as one line with its time."""
-
-    def __init__(self, hunter: MockHunter, bus: can.BusABC, tell: Callable[[str], None]) -> None:
-        self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
-        """Faults to switch next, from any thread."""
-        self._hunter, self._bus, self._tell = hunter, bus, tell
-        self._ending = threading.Event()
-        self._said = ""
-        self._fails = False
-
-    def stop(self) -> None:
-        """End `run`, from a signal handler or another thread."""
-        self._ending.set()
-
-    def run(self) -> None:
-        while not self._ending.is_set():
-            while not self.orders.empty():
-                (name, on), now_s = self.orders.get(), time.monotonic()
-                self._hunter.switch(name, on, now_s)
-                self._tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
-            for frame, data in self._hunter.due(time.monotonic()):
-                self._send(frame.can_id, data)
-            words = self._hunter.describe()
-            if words != self._said:
-                self._said = words
-                self._tell(f"chassis t={time.monotonic():.6f} {words}")
-            self._listen()
-
-    def _listen(self) -> None:
-        """Take what comes until the next report is due: one frame, or none."""
-        pause_s = max(0.0, self._hunter.next_s - time.monotonic())
-        # What a socket cannot unpack is no frame.
-        with contextlib.suppress(can.CanError):
-            message = self._bus.recv(pause_s)
-            if message is None:
-                return
-            # The chassis has data frames with an 11-bit identifier only.
-            odd = message.is_extended_id or message.is_remote_frame or message.is_error_frame
-            if not (odd or message.is_fd):
-                data = bytes(message.data)
-                self._hunter.receive(message.arbitration_id, data, time.monotonic())
-
-    def _send(self, can_id: int, data: bytes) -> None:
-        fails, frame = "", can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
-        try:
-            self._bus.send(frame)
-        except can.CanError as error:
-            fails = str(error)
-        if fails and not self._fails:
-            self._tell(f"bus t={time.monotonic():.6f} not sent: {fails}")
-        self._fails = bool(fails)
-
+from hil_tests.mock_hunter import FAULTS, MODELS, TUNABLE, MockHunter, make_parameters
 
 EXAMPLE = examples(
     "python -m hil_tests mock_hunter",
     "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer@20",
 )
+Orders = queue.SimpleQueue[tuple[str, bool]]  # a fault's name, and whether it is switched on
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,50 +30,91 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(TUNABLE)}."
     )
-    add, bits = parser.add_argument, "firmware's fault bits"
+    add = parser.add_argument
     add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
     add("--model", default="hunter-2.0", choices=list(MODELS), help="which Hunter")
-    add("--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help=bits)
-    append: Any = {"action": "append", "default": []}
-    add("--set", type=_setting, metavar="NAME=VALUE", help="a parameter's value", **append)
-    add("--fault", type=_fault, metavar="NAME[@S]", help="from the start, or later", **append)
+    text = "a parameter's value"
+    add("--set", type=setting, action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "from the start, or later"
+    add("--fault", type=_fault, action="append", default=[], metavar="NAME[@S]", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
     parameters = make_parameters(arguments.model, dict(arguments.set))
-    name, tell = parse_bus(arguments.bus), partial(print, flush=True)
+    name = parse_bus(arguments.bus)
     if name.interface == "virtual":
-        raise UserError(
-            f"--bus {arguments.bus}: a virtual bus ends with its process, and nobody could reach"
-            f" the mock; use {MULTICAST_BUS} or socketcan:vcan0"
-        )
+        raise UserError(f"a virtual bus ends with its process: use {MULTICAST_BUS}")
+    ending, orders = threading.Event(), Orders()
     with open_bus(name) as bus:
-        hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
-        server = Server(hunter, bus, tell)
         for after_s, fault in arguments.fault:
-            timer = threading.Timer(after_s, server.orders.put, ((fault, True),))
+            timer = threading.Timer(after_s, orders.put, ((fault, True),))
             timer.daemon = True
             timer.start()
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: server.stop())
-        if isinstance(sys.stdin, io.TextIOWrapper):
-            # A byte that is no text is a wrong order, not the end of all orders.
-            sys.stdin.reconfigure(errors="replace")
-        complain = partial(print, file=sys.stderr, flush=True)
-        reader = (sys.stdin or (), server.orders.put, complain)
-        threading.Thread(target=read_orders, args=reader, daemon=True).start()
-        tell(f"ready bus={arguments.bus} model={arguments.model}")
-        server.run()
+            signal.signal(number, lambda *_: ending.set())
+        threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
+        _tell(f"ready bus={arguments.bus} model={arguments.model}")
+        _serve(MockHunter(parameters, time.monotonic()), bus, orders, ending)
     return 0
 
 
-def _setting(text: str) -> tuple[str, float]:
+def _serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading.Event) -> None:
+    """Run a mock on a bus; print every change as one line with its time (monotonic)."""
+    said, works = "", True
+    while not ending.is_set():
+        while not orders.empty():
+            (name, on), now_s = orders.get(), time.monotonic()
+            hunter.switch(name, on, now_s)
+            _tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
+        for frame, data in hunter.due(time.monotonic()):
+            message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
+            try:
+                bus.send(message)
+                works = True
+            except can.CanError as error:
+                if works:
+                    _tell(f"bus t={time.monotonic():.6f} not sent: {error}")
+                works = False
+        if (words := hunter.describe()) != said:
+            said = words
+            _tell(f"chassis t={time.monotonic():.6f} {words}")
+        _listen(hunter, bus)
+
+
+def _listen(hunter: MockHunter, bus: can.BusABC) -> None:
+    """Take what comes until the next report is due: one frame, or none."""
+    with contextlib.suppress(can.CanError):  # what a socket cannot unpack is no frame
+        message = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
+        # The chassis has data frames with an 11-bit identifier only.
+        if message and not (
+            message.is_extended_id
+            or message.is_remote_frame
+            or message.is_error_frame
+            or message.is_fd
+        ):
+            hunter.receive(message.arbitration_id, bytes(message.data), time.monotonic())
+
+
+def _read_orders(orders: Orders) -> None:
+    """Read `NAME on` or `NAME off`, line by line, from standard input."""
+    with open(0, errors="replace", closefd=False) as lines:
+        for line in lines:
+            name, _, word = line.strip().partition(" ")
+            if name in FAULTS and word in ("on", "off"):
+                orders.put((name, word == "on"))
+            else:
+                message = f"error: {line.strip()!r} is no order: use NAME on, or NAME off"
+                print(message, file=sys.stderr, flush=True)
+
+
+def _tell(words: str) -> None:
+    print(words, flush=True)
+
+
+def setting(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not valid: use NAME=VALUE") from None
+    return name, float(value)
 
 
 def _fault(text: str) -> tuple[float, str]:

@@ -14,7 +14,7 @@ from hil_tests.faults import hunter, observe
 from hil_tests.faults.rig import ChassisProcess, Rig, Truth
 from hil_tests.faults.run import Outcome, report_row, run_faults, run_row
 from hil_tests.faults.table import ROWS, Row, Try
-from hil_tests.mock_hunter.chassis import FAULTS
+from hil_tests.mock_hunter import FAULTS
 from hil_tests.testing.policies import TASK
 
 PLACE = ("session", 0, 7)

@@ -1,117 +1,313 @@
-"""AgileX Hunter 2.0 and SE: the CAN bus, the gate that lets our own frames out only, the driver.
+"""AgileX Hunter 2.0 and SE: what decides, the CAN bus, and the driver between them.
+
+`HunterCore` is pure: it hears every frame of the bus, and its `tick` gives the frames to send;
+`Reports` holds what was heard of the chassis. `HunterVehicle` puts two threads around it: the
+stream's sends what `tick` gives, and is the only one that sends until `close` has joined it; the
+listener's hands every frame to `hear`. `Gate` lets our own frames out only.
 
 python-can is imported here and nowhere else in the runtime, and only when a bus is opened: a board
-without a CAN vehicle need not have it. Two threads are around the core (core.py):
-
-- The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
-  once when somebody brakes, no command came in time, or the chassis says what stops it. It is
-  the only one that sends, until `close` has joined it.
-- The listener's thread hands every frame to `hear`.
+without a CAN vehicle need not have it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import ipaddress
 import logging
+import math
 import os
-import re
 import socket
 import struct
 import threading
 import time
-from typing import Any, ClassVar, Dict, NamedTuple, Optional, Type
+from typing import Any, ClassVar, Dict, List, NamedTuple, Optional, Type
 
 from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import VehicleState
-from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.protocol import (
-    BITRATE,
-    COMMAND_IDS,
-    COMMANDS,
-    DEFAULT_PROFILE,
-    PROFILES,
-    Frame,
-)
-from edge_runtime.vehicles.mapping import RobotSettings, Similarity
-from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
+from edge_runtime.vehicles import plausibility, streamed
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.hunter import protocol
+from edge_runtime.vehicles.hunter.protocol import Frame, MotionStatus, MotorSlow, Sent, SystemStatus
+from edge_runtime.vehicles.mapping import HunterSpec, RobotSettings, Similarity
+from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding
+from edge_runtime.vehicles.streamed import STOP_TAKES_S, VehicleEvent, VehicleState
 
-_LISTEN_S = 0.1
-_JOIN_S = 0.5
+STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
+COUNTERS = 256  # byte 7 of 0x211 runs over
+ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
+BUS_PATIENCE_S = 0.1  # five frames of the stream
+
+_TAKE = protocol.MODE_COMMAND.sent(protocol.ByteCommand(protocol.CAN_CONTROL))
+_GIVE_BACK = protocol.MODE_COMMAND.sent(protocol.ByteCommand(protocol.STANDBY))
+_RELEASE = protocol.BRAKE_COMMAND.sent(protocol.ByteCommand(protocol.RELEASE))
+_LOCK = protocol.BRAKE_COMMAND.sent(protocol.ByteCommand(protocol.LOCK))
+_CLEAR = protocol.CLEAR_COMMAND.sent(protocol.ByteCommand(protocol.CLEAR_ALL))
+
+
+class Reports(streamed.Speeds):
+    """The newest frame of each kind."""
+
+    def __init__(self, spec: HunterSpec, profile: str) -> None:
+        super().__init__()
+        self.status: Optional[SystemStatus] = None
+        self.motion: Optional[MotionStatus] = None
+        self.status_s = self.motion_s = -math.inf  # of 0x211: when its counter last went on
+        self._counter, self._last_status_s = 0, -math.inf
+        self._spec, self._profile = spec, profile
+        self._motor_faults: Dict[int, List[str]] = {}
+
+    def hear(self, can_id: int, data: bytes, now_s: float) -> None:
+        """Note a frame, unless it is not in the table or of a wrong length."""
+        message = protocol.decode(can_id, data)
+        if isinstance(message, SystemStatus):
+            self.status = message
+            self._count(message.counter, now_s)
+        elif isinstance(message, MotionStatus):
+            self.motion, self.motion_s = message, now_s
+            self.note(message.speed_mps, now_s)
+        elif isinstance(message, MotorSlow):
+            self._motor_faults[can_id] = protocol.motor_faults(can_id, message)
+
+    def _count(self, counter: int, now_s: float) -> None:
+        """Take a status for a sign of life if its counter is ahead of all before, or after silence.
+
+        Up to 127 ahead is newer: frames that are replayed lie behind, and do not count.
+        """
+        was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
+        if was_silent or 0 < (counter - self._counter) % COUNTERS < COUNTERS // 2:
+            self._counter, self.status_s = counter, now_s
+        self._last_status_s = now_s
+
+    def is_known_to_stand(self, now_s: float) -> bool:
+        return self.stands and now_s - self.motion_s <= self.silence_s
+
+    @property
+    def needs_clearing(self) -> bool:
+        """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
+        if self.status is not None and self.status.state == protocol.STATE_EXCEPTION:
+            return True
+        return bool(set(self._errors()) - {protocol.LINK_LOST})
+
+    @property
+    def remote_drives(self) -> bool:
+        """Whether the remote control had the vehicle when it was last heard."""
+        return self.status is not None and self.status.mode == protocol.REMOTE_CONTROL
+
+    def _errors(self) -> List[str]:
+        words = protocol.status_faults(self.status, self._profile) if self.status else []
+        return words + [word for motor in self._motor_faults.values() for word in motor]
+
+    def silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        """Return SILENT where feedback is missing that was due since `since_s`."""
+        if now_s - max(self.motion_s, since_s) > self.silence_s:
+            return Finding(Fault.SILENT, "the chassis sends no 0x221")
+        if now_s - max(self.status_s, since_s) > STATUS_SILENCE_S:
+            repeats = now_s - self._last_status_s <= STATUS_SILENCE_S
+            words = "repeats itself: the counter of 0x211 stands still"
+            return Finding(Fault.SILENT, f"the chassis {words if repeats else 'sends no 0x211'}")
+        return None
+
+    def commander(self) -> Optional[Finding]:
+        """Return what outranks us: the remote control, or the emergency stop."""
+        if self.remote_drives:
+            return Finding(VehicleEvent.REMOTE, "the remote control drives")
+        if self.status is not None and self.status.state == protocol.STATE_ESTOP:
+            return Finding(VehicleEvent.ESTOP, "the emergency stop is pressed")
+        return None
+
+    def finding(self) -> Optional[Finding]:
+        """Return the gravest that stands between the chassis and our commands now."""
+        status = self.status
+        if status is None:
+            return Finding(Fault.SILENT, "the chassis sends no 0x211")
+        if outranked := self.commander():
+            return outranked
+        if errors := self._errors():
+            return Finding(VehicleEvent.FAULT, ", ".join(errors))
+        if status.state != protocol.STATE_OK:
+            words = f"the chassis is in state {status.state} (exception)"
+            return Finding(VehicleEvent.FAULT, words)
+        if status.mode != protocol.CAN_CONTROL:
+            name = "standby" if status.mode == protocol.STANDBY else f"mode {status.mode}"
+            words = f"the chassis is in {name}, not under CAN control"
+            return Finding(VehicleEvent.STANDBY, words)
+        if status.brake:
+            return Finding(VehicleEvent.LOCKED, "the chassis has locked its brake")
+        return self.lie()
+
+    def lie(self) -> Optional[Finding]:
+        """Return LYING where it reports what the model cannot do."""
+        words = plausibility.impossible(*self.motion, self._spec) if self.motion else ""
+        return Finding(Fault.LYING, f"the chassis reports {words}") if words else None
+
+
+class HunterCore(streamed.StreamedCore):
+    def __init__(self, similarity: Similarity, profile: str) -> None:
+        self.reports = Reports(similarity.spec, profile)
+        super().__init__(similarity, self.reports)
+        self._ask_s = math.inf  # when to ask the chassis for something next
+        self._bus_fails_since_s = math.inf
+        self._bus_words = ""  # empty while it works
+
+    def enable(self, now_s: float) -> None:
+        super().enable(now_s)
+        self._ask_s = now_s
+
+    def close(self, now_s: float) -> List[Sent]:
+        """Return the last frames: stand, park, give control back; none if it was never taken."""
+        if self.state is VehicleState.DISABLED:
+            return []
+        self._apply(Finding(VehicleEvent.CLOSE), now_s)
+        park = [] if self.reports.remote_drives else [_LOCK]
+        return [self._motion(), *park, _GIVE_BACK]
+
+    def hear(self, can_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame of the bus, from any sender; never raises."""
+        if self.state is VehicleState.DISABLED:
+            self.bus_works()  # nothing is sent then that it could take
+        if can_id in protocol.COMMAND_IDS:
+            words = f"somebody else sends 0x{can_id:x}"
+            self._apply(Finding(VehicleEvent.FOREIGN, words), now_s)
+            return
+        self.reports.hear(can_id, data, now_s)
+        if can_id == protocol.SYSTEM_STATUS.can_id or can_id in protocol.MOTOR_OF_SLOW:
+            is_older = self.reports.status_s <= self._since_s  # from before it was asked
+            if self.state is not VehicleState.ENABLING or not is_older:
+                found = self.reports.finding()
+                self._apply(found or Finding(VehicleEvent.CONFIRMED), now_s)
+        elif can_id == protocol.MOTION_STATUS.can_id and (lie := self.reports.lie()):
+            # At once, not with the next tick: else the runtime's own watch would stop it first,
+            # and what it then says is over with the lie.
+            self._apply(lie, now_s)
+
+    def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:
+        """Note that the bus did not take a frame, or gave none; `fatal`: it says that it is off."""
+        self._bus_fails_since_s = min(self._bus_fails_since_s, now_s)
+        if fatal or now_s - self._bus_fails_since_s > BUS_PATIENCE_S:
+            self._bus_words = f"the CAN bus fails: {words}"
+            self._apply(Finding(VehicleEvent.BUS, self._bus_words), now_s)
+
+    def bus_works(self) -> None:
+        """Note that the bus took a frame, or (while none is sent) gave one."""
+        self._bus_fails_since_s, self._bus_words = math.inf, ""
+
+    def tick(self, now_s: float) -> List[Sent]:
+        """Return the frames to send now; none while DISABLED."""
+        self._look(now_s)
+        if self.state is VehicleState.DISABLED:
+            return []
+        parts = self._requests(now_s) if now_s >= self._ask_s else []
+        self._step(now_s)
+        return [*parts, self._motion()]
+
+    def report(self, now_s: float) -> VehicleReport:
+        status = self.reports.status
+        return super().report(now_s)._replace(battery_v=status.battery_v if status else None)
+
+    def is_at_rest(self, now_s: float) -> bool:
+        """Return whether it is known to stand, or the bus is dead or the remote control drives."""
+        is_blind = bool(self._bus_words) or self.reports.remote_drives
+        is_off = self.state is VehicleState.DISABLED
+        return is_off or is_blind or self.reports.is_known_to_stand(now_s)
+
+    def _apply(self, finding: Finding, now_s: float) -> None:
+        before = self.state
+        super()._apply(finding, now_s)
+        if self.state is not before and self.state is VehicleState.STOPPED:
+            at_once = finding.event is Fault.STUCK  # no set-point will stop it: the brake must
+            self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
+        elif self.state is VehicleState.ENABLED:
+            self._ask_s = math.inf
+
+    def _obstacles(self, now_s: float) -> List[str]:
+        outranked = self.reports.commander()
+        words = [outranked.words] if outranked else []
+        return words + super()._obstacles(now_s) + ([self._bus_words] if self._bus_words else [])
+
+    def _why_not_confirmed(self, now_s: float) -> str:
+        why = self._silence(self._since_s, now_s) or self.reports.finding()
+        words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
+        return f"{words}: {why.words}" if why else words
+
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        return self.reports.silence(since_s, now_s)
+
+    def _requests(self, now_s: float) -> List[Sent]:
+        """Return what goes beside the stream: for control if ENABLING, for the brake if STOPPED."""
+        self._ask_s = now_s + ASK_AGAIN_S
+        if self.state is VehicleState.STOPPED:
+            # A person with the remote control knows better than we do.
+            is_over = self.reports.remote_drives or self.reports.is_known_to_stand(now_s)
+            return [] if is_over else [_LOCK]
+        return [*([_CLEAR] if self.reports.needs_clearing else []), _TAKE, _RELEASE]
+
+    def _motion(self) -> Sent:
+        return protocol.motion(self.set_point.speed_mps, self.set_point.inner_rad, self._spec)
+
+    def _centre_rad(self) -> Optional[float]:
+        motion = self.reports.motion
+        return self._spec.centre_rad(motion.inner_steering_rad) if motion else None
+
 
 DEFAULT_BUS = "socketcan:can0"
 UDP = "udp_multicast"
-GROUP, PORT = "239.74.163.2", 43113  # python-can's own
+MULTICAST_GROUP = "239.74.163.2"  # python-can's own
 # Two buses need two ports: Linux hands what comes for any group to every socket of its port.
-MULTICAST_BUS = f"{UDP}:{GROUP}:{PORT}"
+MULTICAST_BUS = f"{UDP}:{MULTICAST_GROUP}:43113"
 _LOOPBACK = "lo"
+_LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
-_SYNTAX = {
-    "socketcan": f"{DEFAULT_BUS}; its bit rate is set by `ip link`",
-    UDP: MULTICAST_BUS,
-    "": "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0",
-}
 _ADVICE = {
     "socketcan": "bring it up with `ip link set CHANNEL up type can bitrate 500000`",
     UDP: "it needs msgpack, and a route for multicast (`ip route`)",
-    "": "see python-can's manual for what this interface needs",
 }
 
 
 class BusName(NamedTuple):
-    """What to open. `bitrate` is None where the interface has none to set."""
+    """What python-can opens."""
 
     interface: str
     channel: str
-    bitrate: Optional[int]
-    port: Optional[int] = None  # of udp_multicast
+    options: Dict[str, Any]
 
 
 def parse_bus(text: str) -> BusName:
-    """Parse INTERFACE:CHANNEL[:BITRATE], udp_multicast:GROUP[:PORT] too. Raises UserError."""
+    """Parse INTERFACE:CHANNEL, or udp_multicast:GROUP:PORT. Raises UserError."""
     interface, _, channel = text.partition(":")
-    name, colon, number = channel.partition(":")
-    count = int(number) if re.fullmatch("[0-9]{1,9}", number) else 0
-    if interface == "virtual" and channel:
-        return BusName(interface, channel, None)
-    if interface == UDP:
-        port, group = count if colon else PORT, name or GROUP
-        with contextlib.suppress(ValueError):  # no address
-            if ipaddress.IPv4Address(group).is_multicast and 1 <= port <= 65535:
-                return BusName(interface, group, None, port)
-    elif interface and name and not colon:
-        return BusName(interface, name, None if interface == "socketcan" else BITRATE)
-    elif interface != "socketcan" and interface and name and count:
-        return BusName(interface, name, count)
-    syntax = _SYNTAX.get(interface, _SYNTAX[""])
-    kind = "IPv4 multicast group and port" if interface == UDP else "CAN bus"
-    raise UserError(f"bus {text!r} is no {kind}: write it as {syntax}")
+    group, _, port = channel.partition(":")
+    if interface == UDP and port.isdecimal():
+        # Pinned to the loopback device as well: no neighbour hears it.
+        return BusName(interface, group, {"port": int(port), "hop_limit": 0, "fd": False})
+    if interface not in ("", UDP) and channel:
+        sets_bitrate = interface not in ("socketcan", "virtual")
+        return BusName(interface, channel, {"bitrate": protocol.BITRATE} if sets_bitrate else {})
+    raise UserError(f"bus {text!r} is not valid: write it as {DEFAULT_BUS} or {MULTICAST_BUS}")
 
 
 def open_bus(name: BusName) -> Any:
     """Open a python-can bus; send nothing. Raises UserError."""
-    can = import_can()
-    options: Dict[str, Any] = {} if name.bitrate is None else {"bitrate": name.bitrate}
-    if name.port is not None:  # pinned to the loopback device as well: no neighbour hears it
-        options = {"port": name.port, "hop_limit": 0, "fd": False}
-    bus = None
+    # Its backends say on stderr what they miss; our error says it in its one line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
-        bus = can.Bus(interface=name.interface, channel=name.channel, **options)
-        if name.port is not None:
-            pin_to_loopback(bus, name.channel)
+        import can
+    except ImportError:
+        words = "the hunter needs python-can, which is not installed: pip install python-can"
+        raise UserError(words) from None
+    bus: Any = None
+    try:
+        bus = can.Bus(interface=name.interface, channel=name.channel, **name.options)
+        if name.interface == UDP:
+            _pin_to_loopback(bus, name.channel)
     except Exception as error:  # each backend raises what its library raises, NameError included
         if bus is not None:
             bus.shutdown()
         where, cause = f"{name.interface}:{name.channel}", str(error) or type(error).__name__
-        advice = _ADVICE.get(name.interface, _ADVICE[""])
+        advice = _ADVICE.get(name.interface, "see python-can's manual for what it needs")
         raise UserError(f"the CAN bus {where} cannot be opened: {cause}; {advice}") from None
     return bus
 
 
-def pin_to_loopback(bus: Any, group: str) -> None:
+def _pin_to_loopback(bus: Any, group: str) -> None:
     """Let the python-can bus speak and hear on the loopback device only. Raises OSError.
 
     It sends to whatever network the machine has. Pinned, no frame leaves the machine and none comes
@@ -133,24 +329,13 @@ def pin_to_loopback(bus: Any, group: str) -> None:
         pass  # from before
 
 
-def import_can() -> Any:
-    """Return the python-can package. Raises UserError where it is not installed."""
-    # Its backends say on stderr what they miss; our error says it in its one line.
-    logging.getLogger("can").setLevel(logging.CRITICAL)
-    try:
-        import can
-    except ImportError:
-        words = "the hunter needs python-can, which is not installed: pip install python-can"
-        raise UserError(words) from None
-    return can
-
-
 class Gate:
-    """The only way out to the bus: closed until `is_open`, and then for our commands only."""
+    """The only way out to the bus: for our commands alone."""
 
     def __init__(self, bus: Any) -> None:
-        self.is_open = False
-        self._bus, self._can = bus, import_can()
+        import can
+
+        self._bus, self._message = bus, can.Message
 
     def send(self, frame: Frame, data: bytes) -> None:
         """Put a frame on the bus without waiting.
@@ -158,14 +343,9 @@ class Gate:
         Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
         anything is sent, for a frame that must not leave.
         """
-        if not self.is_open:
-            raise RuntimeError("nothing is sent before the vehicle is enabled")
-        can_id, length = frame.can_id, len(data)
-        if frame not in COMMANDS or length != frame.length:
-            raise RuntimeError(f"0x{can_id:x} with {length} bytes is not on the allow-list")
-        message = self._can.Message(
-            arbitration_id=can_id, data=data, is_extended_id=False, check=True
-        )
+        if frame not in protocol.COMMANDS or len(data) != frame.length:
+            raise RuntimeError(f"0x{frame.can_id:x} with {len(data)} bytes is no command of ours")
+        message = self._message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
         # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
         self._bus.send(message, timeout=0.0)
 
@@ -174,14 +354,14 @@ class HunterSettings(RobotSettings, frozen=True, kw_only=True):
     """[vehicle.hunter]: its bus, and a row of protocol.PROFILES."""
 
     bus: str = DEFAULT_BUS
-    profile: str = DEFAULT_PROFILE
+    profile: str = protocol.DEFAULT_PROFILE
 
     def __post_init__(self) -> None:
         parse_bus(self.bus)
-        check_choice("vehicle.hunter.profile", self.profile, tuple(PROFILES))
+        check_choice("vehicle.hunter.profile", self.profile, tuple(protocol.PROFILES))
 
 
-class HunterVehicle(StreamedVehicle):
+class HunterVehicle(streamed.StreamedVehicle):
     """Opens its bus when made (UserError where it cannot), and sends nothing before `enable`."""
 
     name: ClassVar[str] = "hunter"
@@ -195,50 +375,44 @@ class HunterVehicle(StreamedVehicle):
         self._ignores_commands = bus.interface == UDP
         self._core: HunterCore
         super().__init__(HunterCore(similarity, settings.profile))
-        self._stopping = False
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
         self._stream.start()
         self._listener.start()
 
-    def enable(self, now_s: float) -> None:
-        """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
-        self._gate.is_open = True  # the core gives no frame before it is enabled
-        super().enable(now_s)
-
     def _leave(self) -> None:
         """Lock the brake, give control back, and leave the bus."""
-        self._stopping = True
         self._listener.join(_JOIN_S)
         with self._lock:
             parts = self._core.close(time.monotonic())
-        try:
-            for part in parts:
-                self._gate.send(*part)
-        except Exception as error:  # the chassis stops by itself, and the bus must be freed
-            log.event("warning", "hunter_not_parked", detail=error)
+        if parts and not self._send(parts):
+            log.event("warning", "hunter_not_parked")  # it stops by itself
         self._bus.shutdown()
 
     def _send_due(self) -> bool:
         with self._lock:
             parts = self._core.tick(time.monotonic())
+        if not (parts and self._send(parts)):
+            return False
+        with self._lock:
+            self._core.bus_works()
+        return True
+
+    def _send(self, parts: List[Sent]) -> bool:
         try:
             for part in parts:
                 self._gate.send(*part)
         except Exception as error:  # CanError, OSError, or what else a backend raises
             self._note_bus(error)
             return False
-        if parts:
-            with self._lock:
-                self._core.bus_works()
-        return bool(parts)
+        return True
 
     def _listen(self) -> None:
-        while not self._stopping:
+        while not self._ending:
             try:
                 message = self._bus.recv(_LISTEN_S)
-            except Exception as error:  # as in _send_due; it may raise at once, again and again
+            except Exception as error:  # as in _send; it may raise at once, again and again
                 self._note_bus(error)
-                time.sleep(PERIOD_S)
+                time.sleep(streamed.PERIOD_S)
                 continue
             if message is not None:
                 self._hear(message)
@@ -250,16 +424,16 @@ class HunterVehicle(StreamedVehicle):
             return
         if message.is_extended_id or message.is_remote_frame or message.is_fd:
             return  # no frame of this protocol
-        if self._ignores_commands and message.arbitration_id in COMMAND_IDS:
+        if self._ignores_commands and message.arbitration_id in protocol.COMMAND_IDS:
             return
         with self._lock:
             was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
             stopped = self._core.state is VehicleState.STOPPED and was is not VehicleState.STOPPED
         if stopped:
-            self._stream.wake()
+            self._wake.set()
 
     def _note_bus(self, error: object, fatal: bool = False) -> None:
-        words = " ".join(str(error).split()) or type(error).__name__
+        words = str(error) or type(error).__name__
         with self._lock:
             self._core.bus_failed(words, time.monotonic(), fatal)

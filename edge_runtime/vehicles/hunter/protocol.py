@@ -18,8 +18,10 @@ from edge_runtime.vehicles.mapping import HunterSpec, clamp
 
 BITRATE = 500_000
 
-# Values of ModeCommand.mode and of SystemStatus.mode.
+# Values of 0x421 (REMOTE_CONTROL aside) and of SystemStatus.mode; of 0x131 and .brake; of 0x441.
 STANDBY, CAN_CONTROL, REMOTE_CONTROL = 0, 1, 2
+RELEASE, LOCK = 0, 1
+CLEAR_ALL = 0
 # Values of SystemStatus.state.
 STATE_OK, STATE_ESTOP, STATE_EXCEPTION = 0, 1, 2
 
@@ -31,22 +33,10 @@ class MotionCommand(NamedTuple):
     inner_steering_rad: float
 
 
-class ModeCommand(NamedTuple):
-    """0x421: STANDBY or CAN_CONTROL."""
+class ByteCommand(NamedTuple):
+    """0x421: STANDBY or CAN_CONTROL. 0x131: RELEASE or LOCK. 0x441: CLEAR_ALL."""
 
-    mode: int
-
-
-class BrakeCommand(NamedTuple):
-    """0x131: 0 releases the parking brake, 1 locks it."""
-
-    locked: int
-
-
-class ClearCommand(NamedTuple):
-    """0x441: clear errors; 0 clears all."""
-
-    what: int = 0
+    value: int
 
 
 class SystemStatus(NamedTuple):
@@ -68,7 +58,7 @@ class MotionStatus(NamedTuple):
 
 
 class MotorFast(NamedTuple):
-    """0x251 to 0x253 (steering, rear right, rear left): turning."""
+    """0x251 to 0x253 (steering, rear right, rear left): how it turns."""
 
     speed_rpm: int
     current_a: float
@@ -111,7 +101,7 @@ class Sent(NamedTuple):
     data: bytes
 
 
-_MILLI, _TENTH = 0.001, 0.1
+_MILLI, _TENTH = 0.001, 0.1  # m/s, rad; V, A
 _BYTE = (">B", (1,))
 _MOTION = (">h4xh", (_MILLI, _MILLI))
 _FAST = (">hhi", (1, _TENTH, 1))
@@ -119,16 +109,14 @@ _SLOW = (">HhbB2x", (_TENTH, 1, 1, 1))
 _STATUS = (">BBHHBB", (1, 1, _TENTH, 1, 1, 1))
 
 MOTION_COMMAND = Frame(0x111, MotionCommand, *_MOTION, 0.02)
-BRAKE_COMMAND = Frame(0x131, BrakeCommand, *_BYTE)
-MODE_COMMAND = Frame(0x421, ModeCommand, *_BYTE)
-CLEAR_COMMAND = Frame(0x441, ClearCommand, *_BYTE)
+BRAKE_COMMAND = Frame(0x131, ByteCommand, *_BYTE)
+MODE_COMMAND = Frame(0x421, ByteCommand, *_BYTE)
+CLEAR_COMMAND = Frame(0x441, ByteCommand, *_BYTE)
 SYSTEM_STATUS = Frame(0x211, SystemStatus, *_STATUS, 0.1)
 MOTION_STATUS = Frame(0x221, MotionStatus, *_MOTION, 0.02)
 _MOTORS = ("steering", "rear right", "rear left")
-MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST, 0.02) for place in range(len(_MOTORS))]
-MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW, 0.1) for place in range(len(_MOTORS))]
-STEER_MOTOR_FAST, REAR_RIGHT_FAST, REAR_LEFT_FAST = MOTORS_FAST
-STEER_MOTOR_SLOW, REAR_RIGHT_SLOW, REAR_LEFT_SLOW = MOTORS_SLOW
+MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST, 0.02) for place in range(3)]
+MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW, 0.1) for place in range(3)]
 
 COMMANDS: Tuple[Frame, ...] = (MOTION_COMMAND, BRAKE_COMMAND, MODE_COMMAND, CLEAR_COMMAND)
 FEEDBACK: Tuple[Frame, ...] = (SYSTEM_STATUS, MOTION_STATUS, *MOTORS_FAST, *MOTORS_SLOW)
@@ -228,11 +216,6 @@ def status_faults(status: SystemStatus, profile: str) -> List[str]:
         if status.faults & (1 << bit) and 1 << bit not in known:
             words.append(f"unknown to profile {profile}: byte {5 - bit // 8} bit {bit % 8}")
     return words
-
-
-def fault_bits(words: str, profile: str) -> int:
-    """Return the bits of SystemStatus.faults of a fault in words: the mock sends them."""
-    return sum(mask for mask, fault in PROFILES[profile].items() if fault == words)
 
 
 def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:

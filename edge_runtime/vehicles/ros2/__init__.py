@@ -7,9 +7,9 @@ odometry to `hear`.
 
 A message is CDR behind a header of four bytes that says plain CDR (XCDR version 1), little-endian:
 `00 01 00 00`; a big-endian one is read, too. Each field is aligned to its size, counted from behind
-the header. Types and order of fields are those of the packages' .msg files (common_interfaces and
-ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
-the left, positive steering and yaw to the left (REP 103).
+the header. Types and order of fields are those of common_interfaces' .msg files (the same from
+Humble on); units as there: metres, seconds, radians, x forward, y to the left, positive steering
+and yaw to the left (REP 103).
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import math
 import re
 import struct
 import time
-from collections import Counter
-from typing import Any, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type, Union
+from typing import Any, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type
 
 import zenoh
 
@@ -27,19 +26,21 @@ from edge_runtime import log
 from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.core import Speeds, StreamedCore, VehicleEvent, VehicleState
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
-from edge_runtime.vehicles.stream import StreamedVehicle
-from edge_runtime.wire import Reason
+from edge_runtime.vehicles.streamed import (
+    Speeds,
+    StreamedCore,
+    StreamedVehicle,
+    VehicleEvent,
+    VehicleState,
+)
 
 # Beside our own 7447, where a bridge listens by default, too; and of this machine only.
 DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
 YAW_RATE, STEERING = "yaw_rate", "steering"
-_ANGULAR = (YAW_RATE, STEERING)
 _WORD = "[A-Za-z_][A-Za-z0-9_]*"
-_NAME = re.compile(f"/|/?{_WORD}(/{_WORD})*")
-_MAX_CHARS = 200
+_NAME = re.compile(f"/?{_WORD}(/{_WORD})*")
 
 # Below this the path's curvature, yaw rate over speed, is more noise than steering.
 STEERS_FROM_MPS = 0.2
@@ -50,17 +51,11 @@ def topic_key(namespace: str, topic: str) -> str:
 
     Raises UserError for names that ROS would not take.
     """
-    for what, name in (("namespace", namespace), ("topic", topic)):
-        if len(name) > _MAX_CHARS or not _NAME.fullmatch(name):
-            raise UserError(
-                f"{what} {name!r} is not valid: words of A-Z a-z 0-9 _ that begin with no digit,"
-                f" between slashes, {_MAX_CHARS} characters at most, like /hunter01/odom"
-            )
+    for name in (topic, *([] if namespace == "/" else [namespace])):
+        if not _NAME.fullmatch(name):
+            raise UserError(f"ROS name {name!r} is not valid: write it like /hunter01/odom")
     whole = topic if topic.startswith("/") else f"{namespace}/{topic}"
-    joined = "/".join(filter(None, whole.split("/")))
-    if not joined:
-        raise UserError(f"topic {topic!r} names nothing")
-    return joined
+    return whole.strip("/")
 
 
 class Motion(NamedTuple):
@@ -73,10 +68,8 @@ class Motion(NamedTuple):
 PUBLISHER, SUBSCRIBER = "MP", "MS"
 _SLASH = "\u00a7"  # The bridge's replacement for a slash inside one chunk of a token.
 TWIST, ODOMETRY = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"
-DRIVE = "ackermann_msgs/msg/AckermannDriveStamped"
 # The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery.
 TYPES: Dict[str, str] = {
-    DRIVE: "48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf",
     TWIST: "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
     ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
 }
@@ -98,15 +91,11 @@ class Odometry(NamedTuple):
     angular_z: float
 
 
-def read_odometry(payload: bytes) -> Union[Odometry, Reason]:
-    """Return an odometry whose numbers are all finite, or why it is none. Never raises."""
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        return Reason.OVERSIZED
-    if len(payload) < len(_LITTLE_ENDIAN):
-        return Reason.MALFORMED
+def read_odometry(payload: bytes) -> Optional[Odometry]:
+    """Return an odometry whose numbers are all finite; None for anything else. Never raises."""
     order = _ORDERS.get(payload[:2])
     if order is None:
-        return Reason.SCHEMA
+        return None
     try:
         sec, nanosec, length = struct.unpack_from(f"{order}iII", payload, 4)
         child = 16 + _aligned(length, 4)  # behind the name of the frame
@@ -114,12 +103,11 @@ def read_odometry(payload: bytes) -> Union[Odometry, Reason]:
         begin = 4 + _aligned(child + length, 8)  # behind the name of the child frame
         numbers = struct.unpack_from(f"{order}{_DOUBLES}d", payload, begin)
     except struct.error:
-        return Reason.MALFORMED
+        return None
     # The type is not in the payload: what is left over is the mark of another one.
-    if len(payload) - begin - 8 * _DOUBLES >= _ALIGNMENT:
-        return Reason.MALFORMED
-    if not all(map(math.isfinite, numbers)):
-        return Reason.NOT_FINITE
+    is_longer = len(payload) - begin - 8 * _DOUBLES >= _ALIGNMENT
+    if is_longer or not all(map(math.isfinite, numbers)):
+        return None
     return Odometry(sec * 10**9 + nanosec, numbers[_LINEAR_X], numbers[_ANGULAR_Z])
 
 
@@ -136,19 +124,6 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> bytes:
     if angular != STEERING:
         z = motion.speed_mps * math.tan(motion.centre_rad) / wheelbase_m
     return _LITTLE_ENDIAN + struct.pack("<6d", motion.speed_mps, 0.0, 0.0, 0.0, 0.0, z)
-
-
-def drive_of(motion: Motion, time_ns: int) -> bytes:
-    """Return an AckermannDriveStamped of speed (m/s) and centre angle (rad).
-
-    No acceleration (0: as quick as can be): the speed is a ramp already.
-    """
-    frame = b"base_link\0"
-    header = struct.pack("<iII10s2x", *divmod(time_ns, 10**9), len(frame), frame)
-    # Angle, its rate, speed, acceleration, jerk.
-    return _LITTLE_ENDIAN + header + struct.pack(
-        "<5f", motion.centre_rad, 0.0, motion.speed_mps, 0.0, 0.0
-    )  # fmt: skip
 
 
 def member_token(zid: str) -> str:
@@ -171,15 +146,11 @@ def topic_token(zid: str, role: str, key: str, kind: str) -> str:
 
 
 class Ros2Node:
-    """Uses a session that somebody else opens and closes. `close` it before the session.
-
-    `rejected` counts what could not be read, by reason.
-    """
+    """Uses a session that somebody else opens and closes. `close` it before the session."""
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
-        self.rejected: Dict[str, int] = {}
-        self._session = session
-        self._namespace = namespace
+        self.rejected = 0  # messages that are no odometry
+        self._session, self._namespace = session, namespace
         self._zid = str(session.info.zid())
         self._declared: List[Any] = []
         self._announce(member_token(self._zid))
@@ -198,11 +169,11 @@ class Ros2Node:
         key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            read: Union[Odometry, Reason] = Reason.OVERSIZED
+            read = None
             if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
                 read = read_odometry(sample.payload.to_bytes())
-            if isinstance(read, Reason):
-                self.rejected[read.value] = self.rejected.get(read.value, 0) + 1
+            if read is None:
+                self.rejected += 1
             else:
                 take(read)
 
@@ -218,20 +189,19 @@ class Ros2Node:
 
 
 class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
-    """`config.example.toml` documents each key. A topic that is empty is not published."""
+    """`config.example.toml` documents each key."""
 
     listen: Optional[str] = None
     connect: Optional[str] = None
     namespace: str = "/"
     twist_topic: str = "cmd_vel"
     twist_angular: str = YAW_RATE
-    ackermann_topic: str = ""
     odometry_topic: str = "odom"
     odometry_angular: str = YAW_RATE
 
     def __post_init__(self) -> None:
         for name in ("twist_angular", "odometry_angular"):
-            check_choice(f"vehicle.ros2.{name}", getattr(self, name), _ANGULAR)
+            check_choice(f"vehicle.ros2.{name}", getattr(self, name), (YAW_RATE, STEERING))
         if self.listen is not None and self.connect is not None:
             raise UserError("ros2 has both listen and connect: give one of them")
         endpoint = self.listen or self.connect
@@ -240,14 +210,9 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
                 f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
                 " use tcp/ or udp/ on one machine, or inside a tunnel"
             )
-        if not self.twist_topic and not self.ackermann_topic:
-            raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
-        if not self.odometry_topic:
-            raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
-        topics = (self.twist_topic, self.ackermann_topic, self.odometry_topic)
-        keys = [topic_key(self.namespace, topic) for topic in topics if topic]
-        if len(set(keys)) < len(keys):
-            raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
+        topics = (self.twist_topic, self.odometry_topic)
+        if len({topic_key(self.namespace, topic) for topic in topics}) < len(topics):
+            raise UserError(f"ros2 has one topic for both, {self.twist_topic}: give two")
 
 
 class Ros2Core(StreamedCore):
@@ -264,11 +229,10 @@ class Ros2Core(StreamedCore):
         """Drive again as soon as fresh odometry shows that the vehicle is there."""
         self._stamp_ns = 0  # whatever comes next counts: the sender's clock may have been set back
         self._angular = None
-        self._heard.forget()
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
-        self._apply(Finding(VehicleEvent.CLOSE, ""), now_s)
+        self._apply(Finding(VehicleEvent.CLOSE), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
         """Take finite odometry; it counts where it is newer than the last by its own stamp.
@@ -284,7 +248,7 @@ class Ros2Core(StreamedCore):
         self._heard.note(speed_mps, now_s)
         words = impossible(speed_mps, angular if self._is_angle else 0.0, self._spec)
         lie = Finding(Fault.LYING, f"the odometry says {words}") if words else None
-        self._apply(lie or Finding(VehicleEvent.CONFIRMED, ""), now_s)
+        self._apply(lie or Finding(VehicleEvent.CONFIRMED), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
         """Return what to publish now; None while DISABLED."""
@@ -329,24 +293,19 @@ class Ros2Vehicle(StreamedVehicle):
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
-        self._fails = False
+        self._angular, self._fails = settings.twist_angular, False
         # A router (by default on loopback), or a peer that goes on connecting to a bridge.
-        connect, listen = settings.connect, None
-        if connect is None:
-            listen = settings.listen or DEFAULT_ROS2_ENDPOINT
+        connect, listen = settings.connect, settings.listen
+        if connect is None and listen is None:
+            listen = DEFAULT_ROS2_ENDPOINT
         try:
             self._session = open_session(listen, connect, "peer" if connect else "router")
         except UserError as error:
             raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
         try:
-            self._node = node = Ros2Node(self._session, settings.namespace)
-            self._twist = self._drive = None
-            if settings.twist_topic:
-                self._twist = node.publisher(settings.twist_topic, TWIST)
-            if settings.ackermann_topic:
-                self._drive = node.publisher(settings.ackermann_topic, DRIVE)
-            self._angular = settings.twist_angular
-            node.subscribe(settings.odometry_topic, self._hear)
+            self._node = Ros2Node(self._session, settings.namespace)
+            self._publish = self._node.publisher(settings.twist_topic, TWIST)
+            self._node.subscribe(settings.odometry_topic, self._hear)
         except BaseException:
             self._session.close()  # an open session would hang the process at its exit
             raise
@@ -354,9 +313,7 @@ class Ros2Vehicle(StreamedVehicle):
 
     def _leave(self) -> None:
         try:
-            rejected = Counter({**self._node.rejected, "stale": self._core.stale})
-            if rejected := +rejected:
-                log.event("info", "ros2_odometry_rejected", **rejected)
+            log.event("info", "ros2_ended", rejected=self._node.rejected, stale=self._core.stale)
             self._node.close()
         finally:
             with self._lock:
@@ -373,15 +330,11 @@ class Ros2Vehicle(StreamedVehicle):
         if motion is None:
             return False
         try:
-            if self._twist:
-                wheelbase_m = self._core.similarity.spec.wheelbase_m
-                self._twist(twist_of(motion, self._angular, wheelbase_m))
-            if self._drive:
-                self._drive(drive_of(motion, time.time_ns()))
+            self._publish(twist_of(motion, self._angular, self._core.similarity.spec.wheelbase_m))
+            fails = False
         except Exception as error:  # the vehicle stops by its own time-out, and the silence tells
+            fails = True
             if not self._fails:
                 log.event("error", "ros2_not_sent", detail=error)
-            self._fails = True
-            return False
-        self._fails = False
-        return True
+        self._fails = fails
+        return not fails

@@ -2,19 +2,18 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.tests.rigs import CARS, STREAM_S, Rig
-from edge_runtime.vehicles.core import VehicleState
-from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter import HunterCore, protocol
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
-from hil_tests.mock_hunter.chassis import BITS, FAULTS
-from hil_tests.mock_hunter.hunter import MockHunter, make_parameters
+from edge_runtime.vehicles.streamed import VehicleState
+from hil_tests.mock_hunter import BITS, FAULTS, MODELS, MockHunter
 
 WORDS = {
     **dict.fromkeys(("silent", "bus_off", "late"), "sends no 0x2"),
@@ -37,7 +36,7 @@ class Pair(Rig):
 
     def __init__(self, car="left_turn", model="2.0", **changes):
         super().__init__(HunterCore(similarity_to(CARS[car], SPECS[model]), "v2"))
-        parameters = make_parameters(f"hunter-{model}", changes)
+        parameters = replace(MODELS[f"hunter-{model}"], **changes)
         self.mock = MockHunter(parameters, self.now_s - STREAM_S / 2)
         self.moved_s = self.moving_set_point_s = self.now_s
         self.pedal = 1.0
@@ -59,13 +58,13 @@ class Pair(Rig):
         while self.coming and self.coming[0][0] <= self.now_s:  # a bus keeps their order
             _, frame, data = self.coming.pop(0)
             self.core.hear(frame.can_id, data, self.now_s)
-        self.moved_s = self.moved_s if self.mock.body.stands else self.now_s
+        self.moved_s = self.moved_s if self.mock.stands else self.now_s
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_stops_it_is_named_and_only_enabling_moves_it_again(name):
     pair = Pair().enabled().run(1.5)
-    assert pair.mock.body.speed_mps > 0.9
+    assert pair.mock.speed_mps > 0.9
     pair.mock.switch(name, True, pair.now_s)
     pair.pedal = -1.0 if name == "stuck" else 1.0
     fault_s = pair.now_s
@@ -81,7 +80,7 @@ def test_a_fault_stops_it_is_named_and_only_enabling_moves_it_again(name):
     pair.run(1.0)
     assert max(pair.moved_s, pair.moving_set_point_s) <= over_s
     assert pair.core.standing(pair.now_s) == []
-    assert pair.enabled().run(1.0).mock.body.speed_mps > 0.3
+    assert pair.enabled().run(1.0).mock.speed_mps > 0.3
 
 
 unit = st.floats(-1, 1)
@@ -99,8 +98,7 @@ manoeuvre = st.tuples(unit, unit, st.integers(1, 3).map(float) | st.floats(0, 3)
 def test_no_steering_of_a_healthy_chassis_is_accused(pair, delays_s, parked, manoeuvres):
     """Steps, reversals and swings at and above its rate, a bus that is late, any pedal, and wheels
     that stood anywhere when it was switched on."""
-    parked_rad = parked * pair.core.similarity.spec.max_inner_steering_rad
-    pair.mock.body = pair.mock.body._replace(inner_rad=parked_rad)
+    pair.mock.inner_rad = parked * pair.core.similarity.spec.max_inner_steering_rad
     pair.enabled().delays_s = delays_s
     for middle, swing, swings_hz, pedal in manoeuvres:
         for tick in range(50):

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil_tests.mock_hunter import chassis as rules
-from hil_tests.mock_hunter.hunter import MODELS, MockHunter
+from hil_tests.mock_hunter import BITS, FAULTS, MODELS, MockHunter
 
 P = MODELS["hunter-2.0"]
 
@@ -57,7 +56,7 @@ class Bench:
 
     @property
     def stands(self):
-        return self.hunter.body.stands
+        return self.hunter.stands
 
     @property
     def status(self):
@@ -109,13 +108,13 @@ def test_without_commands_it_stands_by_and_drives_on_by_itself_when_they_come_ba
     bench.run(0.15)
     assert (bench.status[1], bench.status[4]) == (0, 1 << 4)
     assert bench.run(1.0).stands
-    assert bench.run(1.0, FAST_AHEAD).hunter.body.speed_mps > 0.8
+    assert bench.run(1.0, FAST_AHEAD).hunter.speed_mps > 0.8
     assert (bench.status[1], bench.status[4:6]) == (1, b"\x00\x00")
 
 
-@pytest.mark.parametrize("name", rules.BITS)
+@pytest.mark.parametrize("name", BITS)
 def test_each_error_by_hand_stops_and_goes_as_its_row_says(name):
-    bench, row = enabled(), rules.BITS[name]
+    bench, row = enabled(), BITS[name]
     bench.switch(name)
     bench.run(1.0, FAST_AHEAD)
     data, (byte, bit) = bench.status, FAULT_BITS[name]
@@ -123,10 +122,10 @@ def test_each_error_by_hand_stops_and_goes_as_its_row_says(name):
     assert data[0] == (2 if row.stops else 0)
     assert bench.stands == row.stops
     bench.send(CLEAR)
-    assert bench.hunter.chassis.errors == {name}  # the cause is still there
+    assert bench.hunter.errors == {name}  # the cause is still there
     bench.switch(name, on=False)
-    assert bench.hunter.chassis.errors == ({name} if row.latches else set())
-    assert rules.obeys(bench.hunter.chassis) == (not (row.latches and row.stops))
+    assert bench.hunter.errors == ({name} if row.latches else set())
+    assert bench.hunter.obeys == (not (row.latches and row.stops))
     bench.send(CLEAR)
     assert not bench.run(1.0, FAST_AHEAD).stands
     assert bench.status[4:6] == b"\x00\x00"
@@ -163,15 +162,15 @@ def test_back_on_the_bus_it_does_not_drive_what_it_last_heard():
     bench.run(1.5, STOP)
     bench.switch("bus_off", on=False)
     bench.send((0x221, bytes(8)), (0x211, bytes(8)))
-    where_m = bench.run(0.01).hunter.body.right_m
-    assert bench.run(0.5, STOP).hunter.body.right_m == where_m
+    where_m = bench.run(0.01).hunter.way_m
+    assert bench.run(0.5, STOP).hunter.way_m == where_m
     assert bench.status[1] == 1  # the trap: it has control again
 
 
 happenings = st.lists(
     st.one_of(
         st.sampled_from([CAN_MODE, STANDBY, RELEASE, LOCK, CLEAR, FAST_AHEAD, TURNED, STOP]),
-        st.tuples(st.sampled_from(sorted(set(rules.FAULTS) - {"stuck"})), st.booleans()),
+        st.tuples(st.sampled_from(sorted(set(FAULTS) - {"stuck"})), st.booleans()),
         st.floats(0.005, 0.3),
     ),
     max_size=30,
@@ -189,7 +188,7 @@ def test_whatever_happens_it_keeps_its_limits_and_brakes_where_it_does_not_obey(
             bench.switch(*one)
         else:
             bench.send(one)
-        assert abs(bench.hunter.body.speed_mps) <= P.max_speed_mps
+        assert abs(bench.hunter.speed_mps) <= P.max_speed_mps
     bench.run(2.0)  # the commands cease
     assert bench.stands
-    assert not rules.obeys(bench.hunter.chassis)
+    assert not bench.hunter.obeys

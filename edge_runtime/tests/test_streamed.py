@@ -1,15 +1,19 @@
-"""What holds for every streamed vehicle, in made-up time: enabling, commands, stops, the table."""
+"""What holds for every streamed vehicle, in made-up time; and the thread that sends, in real."""
 
+import contextlib
 import math
+import time
 
 import pytest
+from hil_tests.processes import wait_until
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
-from edge_runtime.vehicles.core import LEADS_TO, Speeds, VehicleEvent, VehicleState
+from edge_runtime.vehicles import streamed
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import Fault, Finding
+from edge_runtime.vehicles.streamed import LEADS_TO, Speeds, VehicleEvent, VehicleState
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -310,3 +314,49 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     speeds.note(5.0, later_s + 0.05)
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)
+
+
+class Sender(streamed.StreamedVehicle):
+    """Notes when it sends, and pauses at the first; `late_s`: a command becomes too old."""
+
+    def __init__(self, pause_s=0.0, late_s=math.inf):
+        super().__init__(HunterRig().core)
+        self.sent: list = []
+        self.pause_s, self.late_s = pause_s, late_s
+        self._stream.start()
+
+    def _send_due(self):
+        self.sent.append(time.monotonic())
+        time.sleep(0.0 if self.sent[1:] else self.pause_s)
+        return True
+
+    def _late_at_s(self):
+        return self.late_s if time.monotonic() < self.late_s else math.inf
+
+    def _leave(self):
+        self.sent.append("left")
+
+
+def test_it_sends_fifty_times_a_second_and_after_a_pause_once_for_all_missed_periods():
+    with contextlib.closing(Sender(pause_s=0.3)) as vehicle:
+        wait_until(lambda: len(vehicle.sent) > 21, "0.4 s of sending")
+        # A machine that pauses loses periods; nothing may make it send more often than asked.
+        assert vehicle.sent[21] - vehicle.sent[1] > 0.33
+    assert vehicle.sent[-1] == "left"
+
+
+def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(monkeypatch):
+    monkeypatch.setattr(streamed, "PERIOD_S", 60.0)
+    late_s = time.monotonic() + 0.2
+    with contextlib.closing(Sender(late_s=late_s)) as vehicle:
+        wait_until(lambda: len(vehicle.sent) == 2, "one more, at the command's end")
+        assert vehicle.sent[1] >= late_s
+        vehicle.brake(0.0)
+        wait_until(lambda: len(vehicle.sent) == 3, "one more, for the brake")
+
+
+def test_what_was_held_up_is_followed_at_once(monkeypatch):
+    monkeypatch.setattr(streamed, "PERIOD_S", 0.6)
+    with contextlib.closing(Sender(pause_s=0.7)) as vehicle:
+        wait_until(lambda: len(vehicle.sent) >= 2, "the next")
+        assert vehicle.sent[1] - vehicle.sent[0] < 1.1  # its period would have come after 1.2 s

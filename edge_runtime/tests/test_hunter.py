@@ -5,10 +5,9 @@ import math
 import pytest
 
 from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
-from edge_runtime.vehicles.core import VehicleEvent, VehicleState
-from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
+from edge_runtime.vehicles.hunter import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports, protocol
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault
+from edge_runtime.vehicles.streamed import VehicleEvent, VehicleState
 
 TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
 CLEAR, LOCK, GIVE_BACK = (0x441, b"\x00"), (0x131, b"\x01"), (0x421, b"\x00")
@@ -134,7 +133,7 @@ def test_a_status_from_before_confirms_nothing(rig, age_s):
     rig.core.enable(rig.now_s)
     for wait_s in (0.0, 0.05):
         rig.now_s += wait_s
-        rig.tell(protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 30, 0))
+        rig.tell(protocol.MOTORS_SLOW[2], protocol.MotorSlow(24.0, 30, 30, 0))
         assert rig.core.state is VehicleState.ENABLING
     rig.tell(protocol.SYSTEM_STATUS, OK)
     assert rig.core.state is VehicleState.ENABLED
@@ -170,7 +169,7 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
 @pytest.mark.parametrize(
     ("frame", "message", "cause", "words"),
     [
-        (protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 90, 0b10),
+        (protocol.MOTORS_SLOW[2], protocol.MotorSlow(24.0, 30, 90, 0b10),
          VehicleEvent.FAULT, "rear left motor: motor overtemperature"),
         (protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
          VehicleEvent.FOREIGN, "somebody else sends 0x111"),

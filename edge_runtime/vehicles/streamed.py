@@ -1,8 +1,8 @@
-"""The driver of a vehicle that must hear from it 50 times a second: pure, and shared by vehicles.
+"""The driver of a vehicle that must hear from it 50 times a second: what decides, and what sends.
 
-A core is a state machine (LEADS_TO), what was heard of the vehicle, and what is asked of it. It has
-no clock, no thread and no bus: its holder (stream.py, a test) serialises the calls, passes
-monotonic seconds, and sends what `tick` returns. A vehicle adds what it hears and says.
+`StreamedCore` decides: a state machine (LEADS_TO), what was heard of the vehicle, and what is asked
+of it. It is pure: its holder (`StreamedVehicle`, a test) serialises the calls, passes monotonic
+seconds, and sends what `tick` returns. `StreamedVehicle` is the shell: a lock and a thread.
 
 STOPPED is a latch of our own: a chassis takes commands again by itself when they resume after its
 time-out, when the remote control lets go, or when an error passes. Only ENABLE leads out.
@@ -12,16 +12,22 @@ from __future__ import annotations
 
 import abc
 import math
+import threading
+import time
 from collections import deque
 from enum import Enum
-from typing import Deque, Dict, List, Optional, Tuple
+from typing import Any, ClassVar, Deque, Dict, List, Mapping, Optional, Tuple, Type
 
-from edge_runtime.manifest import MIN_PERIOD_S
+from edge_runtime import log
+from edge_runtime.config import convert
+from edge_runtime.controller import Limits
+from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.safety import SILENCE_PERIODS
-from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, clamp, wish_of
+from edge_runtime.vehicles.base import Vehicle, VehicleReport
+from edge_runtime.vehicles.mapping import RobotSettings, SetPoint, Similarity, Wish, clamp, wish_of
 from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, DriveWatch, Fault, Finding
 
+PERIOD_S = 0.02
 # A beat later than the runtime's own silence rule, which then tells the reason.
 BEAT_S = 0.02
 LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
@@ -30,6 +36,7 @@ LEAST_SILENCE_S = 0.06  # three reports of a vehicle that sends fifty a second
 STOP_TAKES_S = 1.0
 STANDS_MPS = 0.02
 _WINDOW_S = 0.11
+_JOIN_S = 0.5
 
 
 class VehicleState(str, Enum):
@@ -42,7 +49,7 @@ class VehicleState(str, Enum):
 
 
 class VehicleEvent(str, Enum):
-    """What can happen, besides a `Fault`. After CLOSE: what the vehicle, the bus or time do."""
+    """What can happen, besides a `Fault`."""
 
     ENABLE = "enable"
     BRAKE = "brake"
@@ -84,27 +91,24 @@ LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
 
 
 class Speeds:
-    """The speeds that a vehicle reported in the last 0.1 s, and what follows from them.
+    """The speeds that a vehicle reported in the last 0.1 s.
 
-    It counts as silent after `silence_s` without feedback.
+    The vehicle counts as silent after `silence_s` without feedback.
     """
 
     def __init__(self) -> None:
         self.silence_s = 0.2
-        self._noted: Deque[Tuple[float, float]] = deque()
+        self._noted: Deque[Tuple[float, float]] = deque([(-math.inf, 0.0)])
 
     def note(self, speed_mps: float, now_s: float) -> None:
         self._noted.append((now_s, speed_mps))
         while self._noted[0][0] < now_s - _WINDOW_S:
             self._noted.popleft()
 
-    def forget(self) -> None:
-        self._noted.clear()
-
     @property
     def speed_mps(self) -> float:
         """The newest speed, 0 before the first."""
-        return self._noted[-1][1] if self._noted else 0.0
+        return self._noted[-1][1]
 
     @property
     def stands(self) -> bool:
@@ -113,8 +117,6 @@ class Speeds:
 
     def acceleration_mps2(self) -> float:
         """Return the mean of the last 0.1 s; 0 while there is too little to tell."""
-        if len(self._noted) < 2:
-            return 0.0
         (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
         return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
 
@@ -128,7 +130,7 @@ class StreamedCore(abc.ABC):
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
-        self._reach = similarity.reach  # worked out once: reports come with every frame
+        self._reach = similarity.reach
         self.follow_period(MIN_PERIOD_S)
         self._drive_watch = DriveWatch(self._spec, heard.silence_s)
         self._wish: Optional[Wish] = None  # None: stand
@@ -142,7 +144,7 @@ class StreamedCore(abc.ABC):
 
     def enable(self, now_s: float) -> None:
         self._drive_watch = DriveWatch(self._spec, self._heard.silence_s)  # a new chance to follow
-        self._apply(Finding(VehicleEvent.ENABLE, ""), now_s)
+        self._apply(Finding(VehicleEvent.ENABLE), now_s)
         self._since_s = now_s
 
     def command(
@@ -158,7 +160,7 @@ class StreamedCore(abc.ABC):
         self._wish = None
         self.set_point.speed_mps = 0.0
         if latch:
-            self._apply(Finding(VehicleEvent.BRAKE, ""), now_s)
+            self._apply(Finding(VehicleEvent.BRAKE), now_s)
 
     @property
     def late_at_s(self) -> float:
@@ -166,20 +168,22 @@ class StreamedCore(abc.ABC):
         return math.inf if self._wish is None else self._wished_s + self.command_timeout_s
 
     def report(self, now_s: float) -> VehicleReport:
-        speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
+        heard, asked_mps, standing = self._heard, self.set_point.speed_mps, self.standing(now_s)
+        brakes = heard.stands and asked_mps == 0.0
+        pedal = -1.0 if brakes else self.similarity.pedal(heard.acceleration_mps2())
         centre_rad = self._centre_rad()
         steering = self.similarity.steering(self._asked_rad() if centre_rad is None else centre_rad)
         words = [self.words] if self.words else []
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
             # A milliradian beyond its reach would count as a lie.
-            action={"pedal": self._pedal(), "steering": clamp(steering, self._reach)},
-            speed_mps=speed_mps,
+            action={"pedal": pedal, "steering": clamp(steering, self._reach)},
+            speed_mps=heard.speed_mps,
             self_braking=self.state is not VehicleState.ENABLED,
             faults=faults if self.state is VehicleState.STOPPED else [],
             standing=standing,
-            scenario_speed_mps=speed_mps / self.similarity.scale,
-            commanded_speed_mps=self.set_point.speed_mps,
+            scenario_speed_mps=heard.speed_mps / self.similarity.scale,
+            commanded_speed_mps=asked_mps,
         )
 
     def standing(self, now_s: float) -> List[str]:
@@ -236,13 +240,10 @@ class StreamedCore(abc.ABC):
             (heard.speed_mps, self._centre_rad() if drives else None),
             now_s,
         )
-        found = self._silence(self._since_s, now_s) or self._late(now_s) or stuck
-        if found is not None:
-            self._apply(found, now_s)
-
-    def _late(self, now_s: float) -> Optional[Finding]:
         words = f"no command for {self.command_timeout_s:.2f} s"
-        return Finding(VehicleEvent.COMMAND_LATE, words) if now_s > self.late_at_s else None
+        late = Finding(VehicleEvent.COMMAND_LATE, words) if now_s > self.late_at_s else None
+        if found := self._silence(self._since_s, now_s) or late or stuck:
+            self._apply(found, now_s)
 
     def _step(self, now_s: float) -> None:
         """Move the set-point by the time since the last tick."""
@@ -252,8 +253,109 @@ class StreamedCore(abc.ABC):
         else:
             self.set_point.speed_mps = 0.0
 
-    def _pedal(self) -> float:
-        """Return the pedal of the measured acceleration; the brake of a stand that was asked."""
-        if self._heard.stands and self.set_point.speed_mps == 0.0:
-            return -1.0
-        return self.similarity.pedal(self._heard.acceleration_mps2())
+
+class StreamedVehicle(Vehicle):
+    """A lock around every call of a core, and a thread that sends what the core asks for.
+
+    A driver is made of its settings and the similarity of its robot to the policy's car, and starts
+    `_stream` at the end of `__init__`. Bus and network are called outside of the lock, so that no
+    caller waits for them.
+    """
+
+    settings_type: ClassVar[Type[RobotSettings]]
+
+    def __init__(self, core: StreamedCore) -> None:
+        self._core = core
+        self.limits = core.similarity.limits()
+        self._lock = threading.Lock()
+        self._closed = self._ending = False
+        self._logged = ("", "")
+        self._wake = threading.Event()  # send now
+        self._stream = threading.Thread(target=self._run, name=f"{self.name}-stream", daemon=True)
+
+    @classmethod
+    def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
+        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        make: Any = cls  # of each driver's own settings
+        made: Vehicle = make(given, given.similarity(cls.name, manifest))
+        return made
+
+    @classmethod
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
+        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        return given.similarity(cls.name, manifest).limits()
+
+    def enable(self, now_s: float) -> None:
+        """Ask for control; `feedback` tells whether it came. Does nothing once closed."""
+        if self._closed:
+            return
+        with self._lock:
+            self._core.follow_period(self.control_period_s)
+            self._core.enable(now_s)
+        self._wake.set()
+
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        with self._lock:
+            self._core.command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Send speed 0 at once, not with the next period."""
+        with self._lock:
+            self._core.brake(now_s, latch)
+        self._wake.set()
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        with self._lock:
+            self._core.follow_period(self.control_period_s)  # it listens before it is enabled
+            report = self._core.report(now_s)
+            state, words = self._core.state.value, self._core.words
+        if (state, words) != self._logged:  # here, because the stream's thread must not wait
+            self._logged = (state, words)
+            log.event("warning" if words else "info", self.name, state=state, why=words)
+        return report
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        self.brake(time.monotonic())
+        end_s = time.monotonic() + STOP_TAKES_S
+        while (now_s := time.monotonic()) < end_s:
+            with self._lock:
+                if self._core.is_at_rest(now_s):
+                    break
+            time.sleep(PERIOD_S)
+        self._ending = True
+        self._wake.set()
+        self._stream.join(_JOIN_S)  # one that hangs in a bus is left alone
+        self._leave()
+
+    @abc.abstractmethod
+    def _send_due(self) -> bool:
+        """Send what the core's `tick` gives; return whether anything was. Never raises."""
+
+    @abc.abstractmethod
+    def _leave(self) -> None:
+        """Give control back, and free what is held; the stream has ended."""
+
+    def _late_at_s(self) -> float:
+        with self._lock:
+            return self._core.late_at_s
+
+    def _run(self) -> None:
+        next_s = time.monotonic()  # deadlines are absolute: a chassis takes a pause for a lost link
+        while not self._ending:
+            self._wake.clear()
+            began_s = time.monotonic()
+            sent = self._send_due()
+            now_s = time.monotonic()
+            if sent and now_s - began_s > PERIOD_S:
+                # A process that was stopped in between has sent what was asked for before.
+                # The vehicle cannot tell, and may have control again: the next does not wait.
+                self._wake.set()
+            if now_s >= next_s:
+                # After a pause one sending, not one for each missed period.
+                next_s += (int((now_s - next_s) / PERIOD_S) + 1) * PERIOD_S
+            self._wake.wait(max(0.0, min(next_s, self._late_at_s()) - time.monotonic()))
