@@ -9,11 +9,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import queue
-import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from edge_runtime import log
@@ -22,15 +19,13 @@ from edge_runtime.config import NONE, load_config
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S, Action, Car, Entry, Manifest
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
-from edge_runtime.vehicles.base import Vehicle, VehicleReport
+from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
 
-BROKEN = 1
 LATE_S = 0.05  # what a driver may be late, besides a fifth of T
 CALL_S = 0.05  # a call that takes longer holds back the runtime's feedback
 MOVES_MPS, STANDS_MPS = 0.1, 0.05
 ROUNDING = 1e-3
 PATIENCE_S = 10.0  # until it moves, or stands
-HANG_S = 10.0  # A call that takes so long does not come back
 CAR = Car(
     throttle_mps2=3.0, brake_mps2=4.0, max_speed_mps=6.0, full_steering_rad=0.5, wheelbase_m=5.0
 )
@@ -62,86 +57,47 @@ def run(arguments: argparse.Namespace) -> int:
         control_period_s=arguments.period_s, algorithm="", training={}, created="",
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
-    bench = Bench(vehicle, arguments.period_s)
     try:
-        verdicts = judge(bench)
+        kept = judge(Bench(vehicle, arguments.period_s))
     finally:
-        with contextlib.suppress(Exception):  # The last rule closes it, where it came so far.
-            bench.call("close")
+        close_in_time(vehicle)  # the last rule does, where it came so far
         log.close()
-    kept, untried = sum(verdicts), len(RULES) - len(verdicts)
-    rest = f", {untried} not tried" if untried else ""
-    print(f"{vehicle.name}: {kept} rules kept, {len(verdicts) - kept} broken{rest}")
-    return 0 if kept == len(RULES) else BROKEN
+    print(f"{vehicle.name}: {kept} rules kept, {len(RULES) - kept} broken")
+    return 0 if kept == len(RULES) else 1
 
 
-def judge(bench: Bench) -> list[bool]:
-    """Try the rules in their order until a call hangs; return of each whether it is kept."""
-    verdicts: list[bool] = []
+def judge(bench: Bench) -> int:
+    """Try the rules in their order; return how many are kept."""
+    kept = 0
     for rule, is_kept in RULES.items():
         try:
-            wrong = "" if is_kept(bench) else _in_words(bench.last)
+            wrong = "" if is_kept(bench) else f"last report: {bench.last}"
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
-            wrong = str(error) if bench.hangs else f"{type(error).__name__}: {error}"
+            wrong = f"{type(error).__name__}: {error}"
         print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
-        verdicts.append(not wrong)
-        if bench.hangs:
-            break
-    return verdicts
-
-
-def _in_words(report: VehicleReport | None) -> str:
-    if report is None:
-        return "it has not reported yet"
-    values = {**report.action, "speed_mps": report.speed_mps}
-    told = [f"{name} {value}" for name, value in values.items()]
-    told += ["braking by itself"] * bool(report.self_braking)
-    return f"last report: {', '.join(told)}; faults: {', '.join(report.faults) or 'none'}"
+        kept += not wrong
+    return kept
 
 
 class Bench:
-    """Calls a driver from one thread, as the runtime does, times the calls and keeps its reports.
-
-    A call that takes HANG_S is a TimeoutError, and so is every call after it.
-    """
+    """Calls a driver as the runtime does, times the calls and keeps the last report."""
 
     def __init__(self, vehicle: Vehicle, period_s: float) -> None:
         self.vehicle, self.period_s, self.pause_s = vehicle, period_s, min(period_s / 4, 0.02)
         vehicle.control_period_s = period_s
         self.go = {name: limit.high for name, limit in vehicle.limits.items()}
-        self.longest_s, self.well_formed, self.hangs = 0.0, True, False
+        self.longest_s, self.well_formed = 0.0, True
         self.last: VehicleReport | None = None
-        self._asked: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
-        threading.Thread(target=self._work, daemon=True).start()
 
     def call(self, name: str, *arguments: Any, **options: Any) -> Any:
         """Call the driver with the time, and with a command's speed."""
-        if self.hangs:
-            raise TimeoutError
         now_s = time.monotonic()
         more = {"command": (now_s, None), "close": ()}.get(name, (now_s,))
-        self._asked.put(partial(getattr(self.vehicle, name), *arguments, *more, **options))
         try:
-            answer, error = self._answers.get(timeout=HANG_S)
-        except queue.Empty:
-            self.hangs = True
-            raise TimeoutError(f"{name}() has not come back after {HANG_S:g} s") from None
-        if error is not None:
-            raise error
-        return answer
-
-    def _work(self) -> None:
-        while True:
-            do, answer, failure = self._asked.get(), None, None
-            begun_s = time.monotonic()
-            try:
-                answer = do()
-            except BaseException as error:
-                failure = error
-            self.longest_s = max(self.longest_s, time.monotonic() - begun_s)
-            self._answers.put((answer, failure))
+            return getattr(self.vehicle, name)(*arguments, *more, **options)
+        finally:
+            self.longest_s = max(self.longest_s, time.monotonic() - now_s)
 
     def report(self, after_s: float = 0.0) -> VehicleReport:
         """Return its report, after a time in which it is asked for nothing else."""
@@ -151,14 +107,13 @@ class Bench:
             time.sleep(self.pause_s)
         self.last = report = self.call("feedback")
         numbers = (*report.action.values(), report.speed_mps)
-        has_all = report.action.keys() == self.vehicle.limits.keys() and type(report.faults) is list
+        has_all = report.action.keys() == self.go.keys() and type(report.faults) is list
         self.well_formed = self.well_formed and has_all and all(map(math.isfinite, numbers))
         return report
 
-    def until(self, moves: bool, limit_s: float | None = None, commands: bool = False) -> bool:
+    def until(self, moves: bool, limit_s: float = PATIENCE_S, commands: bool = False) -> bool:
         """Return whether it comes to move, or to stand; ``commands``: told to go each T."""
-        end_s = time.monotonic() + (PATIENCE_S if limit_s is None else limit_s)
-        next_s = -math.inf
+        end_s, next_s = time.monotonic() + limit_s, -math.inf
         while True:
             now_s = time.monotonic()
             if commands and now_s >= next_s:
@@ -171,17 +126,22 @@ class Bench:
                 return False
             time.sleep(self.pause_s)
 
-    def goes(self, enables: bool = False, limit_s: float | None = None) -> bool:
+    def goes(self, limit_s: float = PATIENCE_S, enables: bool = False) -> bool:
         """Return whether commands move it; ``enables``: after `enable` from a stand."""
         if enables:
             self.call("enable")
             self.until(moves=False)
         return self.until(moves=True, limit_s=limit_s, commands=True)
 
-    def after(self, periods: float) -> VehicleReport:
-        """Return its report so many T after a last command."""
+    def waits(self) -> bool:
+        """Return whether it stands after `enable`, until a command comes."""
+        self.call("enable")
+        return not self.until(moves=True, limit_s=0.5)
+
+    def brakes_alone(self, periods: float) -> bool:
+        """Return whether it says that it brakes by itself, so many T after a last command."""
         self.call("command", self.go)
-        return self.report(periods * self.period_s)
+        return bool(self.report(periods * self.period_s).self_braking)
 
     def brakes(self) -> bool:
         """Return whether it gets slower within 2 T of a stop, and then stands."""
@@ -191,6 +151,11 @@ class Bench:
             return True
         before_mps, after_mps = (abs(self.report(LATE_S).speed_mps) for _ in range(2))
         return after_mps < before_mps and self.until(moves=False)
+
+    def stands_for_now(self) -> bool:
+        """Return whether it stands after a stop that is not latched."""
+        self.call("brake", latch=False)
+        return self.until(moves=False)
 
     def refuses(self, *actions: dict[str, float]) -> bool:
         """Return whether each of these is a ValueError."""
@@ -212,46 +177,41 @@ class Bench:
 
     def closes(self) -> bool:
         """Return whether it may be closed twice, and nothing moves it then."""
-        self.call("brake", latch=False)
-        self.until(moves=False)
+        self.stands_for_now()
         self.call("close")
         self.call("close")
-        try:
+        with contextlib.suppress(Exception):  # what is closed may say so
             return not self.goes(limit_s=1.0)
-        except Exception:  # what is closed may say so
-            return True
+        return True
 
 
+NO_NUMBERS = (math.nan, math.inf, -math.inf)
 # In this order, because one begins where another ends.
 RULES: dict[str, Callable[[Bench], bool]] = {
     "each action has a range": lambda it: (
         bool(it.go) and all(one.low < one.high for one in it.vehicle.limits.values())
     ),
-    "no command moves it before `enable`": lambda it: not it.goes(limit_s=5 * it.period_s),
-    "enabled, it stands until the first command": lambda it: (
-        it.call("enable") is None and not it.until(moves=True, limit_s=0.5)
-    ),
+    "no command moves it before `enable`": lambda it: not it.goes(5 * it.period_s),
+    "enabled, it stands until the first command": Bench.waits,
     "commands move it, and it tells of no fault": lambda it: it.goes() and not it.report().faults,
-    "a command holds for 1.5 T": lambda it: it.goes() and not it.after(1.5).self_braking,
+    "a command holds for 1.5 T": lambda it: it.goes() and not it.brakes_alone(1.5),
     "it brakes by itself after 2 T without a command": lambda it: (
         it.goes(enables=True)
-        and it.after(2.2 + LATE_S / it.period_s).self_braking
+        and it.brakes_alone(2.2 + LATE_S / it.period_s)
         and it.until(moves=False)
     ),
     "it brakes within 2 T of a stop": lambda it: it.goes(enables=True) and it.brakes(),
-    "a stop is latched: no command moves it": lambda it: not it.goes(limit_s=10 * it.period_s),
-    "`enable` after a stop: it stands, then commands move it": lambda it: (
-        it.call("enable") is None and not it.until(moves=True, limit_s=0.5) and it.goes()
-    ),
+    "a stop is latched: no command moves it": lambda it: not it.goes(10 * it.period_s),
+    "`enable` after a stop: it stands, then commands move it": lambda it: it.waits() and it.goes(),
     "a stop without a latch ends with the next command": lambda it: (
-        it.call("brake", latch=False) is None and it.until(moves=False) and it.goes()
+        it.stands_for_now() and it.goes()
     ),
     "NaN and infinity are a ValueError": lambda it: it.refuses(
-        *({**it.go, name: value} for name in it.go for value in (math.nan, math.inf, -math.inf))
+        *({**it.go, name: value} for name in it.go for value in NO_NUMBERS)
     ),
     "a command that lacks its actions is a ValueError": lambda it: it.refuses({}, {"": 0.5}),
-    "far beyond its limits it stays within them": lambda it: it.stays_within(),
+    "far beyond its limits it stays within them": Bench.stays_within,
     "each report has its actions, finite numbers, a list of faults": lambda it: it.well_formed,
     f"no call takes longer than {CALL_S * 1e3:.0f} ms": lambda it: it.longest_s <= CALL_S,
-    "it closes twice, and nothing moves it then": lambda it: it.closes(),
+    "it closes twice, and nothing moves it then": Bench.closes,
 }

@@ -21,37 +21,28 @@ from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import MotionCommand, Sent
 from edge_runtime.vehicles.mapping import clamp
 
-STEERING, REAR_RIGHT, REAR_LEFT = range(3)
-_LOW_SUPPLY, _MOTOR_HOT, _OVERCURRENT = 1 << 0, 1 << 1, 1 << 2
-_DRIVER_HOT, _SENSOR, _DRIVER, _ENABLED = 1 << 3, 1 << 4, 1 << 5, 1 << 6
-
 
 class Bit(NamedTuple):
     """An error that the chassis shows in 0x211, by the driver's words for it.
 
     ``stops``: it then lets nobody drive. ``latches``: it stays until 0x441 clears it. Which do
-    so the manual leaves open: assumed. ``motors`` show ``motor_bits`` in 0x261 to 0x263.
+    so the manual leaves open: assumed.
     """
 
     words: str
     stops: bool = True
     latches: bool = False
-    motors: tuple[int, ...] = ()
-    motor_bits: int = 0
 
 
-_ALL, _REAR = (STEERING, REAR_RIGHT, REAR_LEFT), (REAR_RIGHT, REAR_LEFT)
 BITS: dict[str, Bit] = {
-    "steering_encoder": Bit(protocol.STEER_ENCODER, True, True, (STEERING,), _SENSOR),
-    "driver": Bit(protocol.DRIVER, True, True, (REAR_RIGHT,), _DRIVER),
-    "undervoltage": Bit(protocol.UNDERVOLTAGE, motors=_ALL, motor_bits=_LOW_SUPPLY),
+    "steering_encoder": Bit(protocol.STEER_ENCODER, latches=True),
+    "driver": Bit(protocol.DRIVER, latches=True),
+    "undervoltage": Bit(protocol.UNDERVOLTAGE),
     "link_steer": Bit(protocol.LINK_STEER),
     "link_rear_right": Bit(protocol.LINK_REAR_RIGHT),
     "link_rear_left": Bit(protocol.LINK_REAR_LEFT),
-    "overtemperature": Bit(
-        protocol.OVERTEMPERATURE, motors=_REAR, motor_bits=_DRIVER_HOT | _MOTOR_HOT
-    ),
-    "overcurrent": Bit(protocol.OVERCURRENT, True, True, (REAR_RIGHT,), _OVERCURRENT),
+    "overtemperature": Bit(protocol.OVERTEMPERATURE),
+    "overcurrent": Bit(protocol.OVERCURRENT, latches=True),
     "remote_lost": Bit(protocol.REMOTE_LOST, stops=False),
 }
 FAULTS: dict[str, str] = {
@@ -98,8 +89,8 @@ FAST_S = 0.02
 SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
 STEP_S = 0.005
 _LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
-_COOL_C, _HOT_C = 35, 105
-_BATTERY_V, _LOW_V, _IDLE_A = 27.9, 21.0, 1.0
+_BATTERY_V, _IDLE_A, _COOL_C = 27.9, 1.0, 35
+_ENABLED = 1 << 6  # The motors are well, whatever 0x211 shows
 _TURNS = 20.0  # Of a motor, for each metre of path or radian of the inner wheel
 _PULSES = 100.0  # Of its encoder, for each turn
 _FAULT_BITS = {words: mask for mask, words in protocol.PROFILES["v2"].items()}
@@ -282,14 +273,12 @@ class MockHunter:
         """Make 0x221 and 0x251 to 0x253: every 20 ms."""
         speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
         motion = protocol.MotionStatus(speed_mps, self.inner_rad)
-        rear = (self.speed_mps, self.way_m)
-        motors = zip(
-            protocol.MOTORS_FAST, ((self._turning_radps, self.inner_rad), rear, rear), strict=True
-        )
-        return [protocol.MOTION_STATUS.sent(motion)] + [
-            row.sent((rate * _TURNS * 60, _IDLE_A, way * _TURNS * _PULSES))
-            for row, (rate, way) in motors
-        ]
+        steers, drives = (self._turning_radps, self.inner_rad), (self.speed_mps, self.way_m)
+        found = [protocol.MOTION_STATUS.sent(motion)]
+        for row, (rate, way) in zip(protocol.MOTORS_FAST, (steers, drives, drives), strict=True):
+            turning = protocol.MotorFast(rate * _TURNS * 60, _IDLE_A, way * _TURNS * _PULSES)
+            found.append(row.sent(turning))
+        return found
 
     def _slow_frames(self) -> list[Sent]:
         """Make 0x211 and 0x261 to 0x263: every 100 ms."""
@@ -298,14 +287,8 @@ class MockHunter:
         mode = protocol.CAN_CONTROL if self.control is Control.CAN else protocol.STANDBY
         if self.control in (Control.REMOTE, Control.REMOTE_OVER_CAN):
             mode = protocol.REMOTE_CONTROL
-        volts = _LOW_V if "undervoltage" in self.errors else _BATTERY_V
         faults, counter = sum(_FAULT_BITS[each] for each in words), self._tick // SLOW_EVERY % 256
-        status = (self.state, mode, volts, faults, int(self.brake_locked), counter)
-        found = [protocol.SYSTEM_STATUS.sent(status)]
-        for motor, row in enumerate(protocol.MOTORS_SLOW):
-            errors = [BITS[error] for error in self.errors if motor in BITS[error].motors]
-            hot = "overtemperature" in self.errors and motor != STEERING
-            celsius = _HOT_C if hot else _COOL_C
-            bits = _ENABLED | sum(error.motor_bits for error in errors)
-            found.append(row.sent((volts, celsius, celsius, bits)))
-        return found
+        status = (self.state, mode, _BATTERY_V, faults, int(self.brake_locked), counter)
+        motor = (_BATTERY_V, _COOL_C, _COOL_C, _ENABLED)
+        motors = [row.sent(motor) for row in protocol.MOTORS_SLOW]
+        return [protocol.SYSTEM_STATUS.sent(status), *motors]

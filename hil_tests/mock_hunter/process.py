@@ -12,14 +12,14 @@ import time
 
 import can
 
-from edge_runtime.cli import examples, seconds
+from edge_runtime.cli import examples
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus
 from hil_tests.mock_hunter import FAULTS, MODELS, TUNABLE, MockHunter, make_parameters
 
 EXAMPLE = examples(
     "python -m hil_tests mock_hunter",
-    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer@20",
+    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --set dead_time_s=0.1",
 )
 Orders = queue.SimpleQueue[tuple[str, bool]]  # a fault's name, and whether it is switched on
 
@@ -35,8 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--model", default="hunter-2.0", choices=list(MODELS), help="which Hunter")
     text = "a parameter's value"
     add("--set", type=setting, action="append", default=[], metavar="NAME=VALUE", help=text)
-    text = "from the start, or later"
-    add("--fault", type=_fault, action="append", default=[], metavar="NAME[@S]", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -47,10 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"a virtual bus ends with its process: use {MULTICAST_BUS}")
     ending, orders = threading.Event(), Orders()
     with open_bus(name) as bus:
-        for after_s, fault in arguments.fault:
-            timer = threading.Timer(after_s, orders.put, ((fault, True),))
-            timer.daemon = True
-            timer.start()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: ending.set())
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
@@ -115,10 +109,3 @@ def _tell(words: str) -> None:
 def setting(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     return name, float(value)
-
-
-def _fault(text: str) -> tuple[float, str]:
-    name, at, after_s = text.partition("@")
-    if name not in FAULTS:
-        raise argparse.ArgumentTypeError(f"no fault {name!r}; choose from {', '.join(FAULTS)}")
-    return seconds(after_s) if at else 0.0, name

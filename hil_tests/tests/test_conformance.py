@@ -1,5 +1,4 @@
 import math
-import threading
 from types import SimpleNamespace
 
 import pytest
@@ -118,18 +117,6 @@ def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys,
     assert len(lines) == len(RULES) + 1
     broken = [line for line in lines if line.startswith("broken")]
     assert any(rule in line for line in broken) if flaw else not broken, lines
-
-
-def test_a_driver_that_hangs_is_named_and_not_waited_for(monkeypatch, capsys):
-    hanging = type("Hanging", (MockVehicle,), {"command": lambda *_: threading.Event().wait()})
-    monkeypatch.setattr(f"{__name__}.Driver", hanging, raising=False)
-    monkeypatch.setattr("hil_tests.conformance.HANG_S", 0.5)
-    words = ["conformance", "--vehicle", f"{__name__}:Driver", "--period-s", "0.02"]
-    assert exit_status(main, words) == 1
-    *_, broken, last = capsys.readouterr().out.splitlines()
-    assert broken.startswith("broken")
-    assert "command()" in broken
-    assert "1 broken, 14 not tried" in last
 
 
 def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):

@@ -122,7 +122,6 @@ def test_ratios_have_an_interval_that_widens_where_blocks_differ():
         *("demo --out {tmp}/file", "demo --out {tmp}", "conformance", "conformance --vehicle tank"),
         "envelope --out {tmp}/r.json --promise 0.4",
         *("mock_hunter --bus can0", "mock_hunter --bus virtual:here", "mock_hunter --set wings=2"),
-        "mock_hunter --fault silent@-1",
     ],
 )
 def test_a_mistake_is_one_line_before_anything_is_done(words, tmp_path, capsys):

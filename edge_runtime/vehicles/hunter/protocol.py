@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Type
+from typing import Any, Dict, List, NamedTuple, Tuple, Type
 
 from edge_runtime.vehicles.mapping import HunterSpec, clamp
 
@@ -60,9 +60,9 @@ class MotionStatus(NamedTuple):
 class MotorFast(NamedTuple):
     """0x251 to 0x253 (steering, rear right, rear left): how it turns."""
 
-    speed_rpm: int
+    speed_rpm: float
     current_a: float
-    pulses: int
+    pulses: float
 
 
 class MotorSlow(NamedTuple):
@@ -85,7 +85,6 @@ class Frame(NamedTuple):
     message: Type[Any]
     layout: str
     worth: Tuple[float, ...]
-    period_s: Optional[float] = None  # None: sent when something happens
 
     @property
     def length(self) -> int:
@@ -108,15 +107,15 @@ _FAST = (">hhi", (1, _TENTH, 1))
 _SLOW = (">HhbB2x", (_TENTH, 1, 1, 1))
 _STATUS = (">BBHHBB", (1, 1, _TENTH, 1, 1, 1))
 
-MOTION_COMMAND = Frame(0x111, MotionCommand, *_MOTION, 0.02)
+MOTION_COMMAND = Frame(0x111, MotionCommand, *_MOTION)
 BRAKE_COMMAND = Frame(0x131, ByteCommand, *_BYTE)
 MODE_COMMAND = Frame(0x421, ByteCommand, *_BYTE)
 CLEAR_COMMAND = Frame(0x441, ByteCommand, *_BYTE)
-SYSTEM_STATUS = Frame(0x211, SystemStatus, *_STATUS, 0.1)
-MOTION_STATUS = Frame(0x221, MotionStatus, *_MOTION, 0.02)
+SYSTEM_STATUS = Frame(0x211, SystemStatus, *_STATUS)
+MOTION_STATUS = Frame(0x221, MotionStatus, *_MOTION)
 _MOTORS = ("steering", "rear right", "rear left")
-MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST, 0.02) for place in range(3)]
-MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW, 0.1) for place in range(3)]
+MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST) for place in range(3)]
+MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW) for place in range(3)]
 
 COMMANDS: Tuple[Frame, ...] = (MOTION_COMMAND, BRAKE_COMMAND, MODE_COMMAND, CLEAR_COMMAND)
 FEEDBACK: Tuple[Frame, ...] = (SYSTEM_STATUS, MOTION_STATUS, *MOTORS_FAST, *MOTORS_SLOW)

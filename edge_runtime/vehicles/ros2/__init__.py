@@ -149,7 +149,6 @@ class Ros2Node:
     """Uses a session that somebody else opens and closes. `close` it before the session."""
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
-        self.rejected = 0  # messages that are no odometry
         self._session, self._namespace = session, namespace
         self._zid = str(session.info.zid())
         self._declared: List[Any] = []
@@ -165,17 +164,14 @@ class Ros2Node:
         return publisher.put
 
     def subscribe(self, topic: str, take: Callable[[Odometry], None]) -> None:
-        """Call `take` with each odometry, in Zenoh's thread; what cannot be read is counted."""
+        """Call `take` with each odometry that can be read, in Zenoh's thread."""
         key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            read = None
             if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
                 read = read_odometry(sample.payload.to_bytes())
-            if read is None:
-                self.rejected += 1
-            else:
-                take(read)
+                if read is not None:
+                    take(read)
 
         self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
         self._announce(topic_token(self._zid, SUBSCRIBER, key, ODOMETRY))
@@ -218,7 +214,6 @@ class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
 class Ros2Core(StreamedCore):
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         super().__init__(similarity, Speeds())
-        self.stale = 0  # odometry that was repeated or came late: it shows nobody alive
         self._stamp_ns = 0  # of the newest, by its sender's clock
         self._angular: Optional[float] = None  # of the newest, as the settings say
         self._newest_s = -math.inf
@@ -239,11 +234,10 @@ class Ros2Core(StreamedCore):
 
         A sender that leaves its stamps at 0 is believed by the time of arrival alone.
         """
-        if 0 < stamp_ns <= self._stamp_ns:
-            self.stale += 1
-            # While nothing is driven, a clock set back is believed; a repetition is not.
-            if self._has_asked or stamp_ns == self._stamp_ns:
-                return
+        # While nothing is driven, a clock set back is believed; a repetition is not.
+        is_older = stamp_ns < self._stamp_ns and self._has_asked
+        if stamp_ns > 0 and (is_older or stamp_ns == self._stamp_ns):
+            return
         self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
         self._heard.note(speed_mps, now_s)
         words = impossible(speed_mps, angular if self._is_angle else 0.0, self._spec)
@@ -313,7 +307,6 @@ class Ros2Vehicle(StreamedVehicle):
 
     def _leave(self) -> None:
         try:
-            log.event("info", "ros2_ended", rejected=self._node.rejected, stale=self._core.stale)
             self._node.close()
         finally:
             with self._lock:

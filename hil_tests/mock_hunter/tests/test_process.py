@@ -21,9 +21,10 @@ def shows(bus, byte, value, patience_s=5.0):
 def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "utf-8:strict")  # as in a desktop's locale
     name = free_bus()
-    chassis = ChassisProcess(name, "--fault", "estop@0.3")
+    chassis = ChassisProcess(name)
     with chassis.process, open_bus(parse_bus(name)) as bus:
-        assert shows(bus, 0, 1)  # the fault of the command line
+        chassis.switch("estop", True)
+        assert shows(bus, 0, 1)
         chassis.switch("estop", False)
         assert shows(bus, 0, 0)
         chassis.process.tell("\udcff")  # no UTF-8
