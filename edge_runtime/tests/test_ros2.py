@@ -85,7 +85,7 @@ def test_a_key_is_the_name_without_the_first_slash(namespace, topic, key):
 @pytest.mark.parametrize("kind", [TWIST, ODOMETRY])
 @pytest.mark.parametrize(("role", "reliable"), [(ros2.PUBLISHER, 1), (ros2.SUBSCRIBER, 0)])
 def test_tokens_are_the_bridges_with_the_second_librarys_hash(role, reliable, kind):
-    token = ros2.topic_token("a1b2", role, "hunter01/cmd_vel", kind)
+    token = ros2.topic_token("@/a1b2/@ros2_lv", role, "hunter01/cmd_vel", kind)
     zenoh.KeyExpr(token)  # raises for what Zenoh would not declare
     assert token == (
         f"@/a1b2/@ros2_lv/{role}/hunter01§cmd_vel/{kind.replace('/', '§')}"
@@ -144,7 +144,8 @@ def test_only_odometry_confirms_it_and_without_any_it_stops_and_says_so():
     rig.step(55, PEDAL)
     assert {motion for _, motion in rig.sent} == {Motion(0.0, 0.0)}
     assert rig.core.state is VehicleState.STOPPED
-    assert rig.words == ["no odometry on odom within 1 s", "no fresh odometry on odom"]
+    silence = "no fresh odometry on odom"
+    assert rig.words == [f"not enabled within 1 s: {silence}", silence]
     assert rig.report.standing == ["no fresh odometry on odom"]
 
 

@@ -140,16 +140,17 @@ class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         car = self.car or manifest.car
         if car is None:
             raise UserError(
-                f"the {vehicle} cannot follow a policy of the task {manifest.task!r}: its manifest"
-                f" does not say which car it was trained on; set car in {table} of --config"
+                f"the manifest of {manifest.task!r} does not say which car it was trained on: set"
+                f" car in {table} of --config"
             )
         found = similarity_to(car, SPECS[self.model], self.scale)
-        # Of the car's steering, below 0 where it turns to the right, tan must be finite.
         numbers = {**msgspec.structs.asdict(car), "scale": found.scale}
-        numbers["full_steering_rad"] = abs(car.full_steering_rad)
-        for name, value in numbers.items():
-            if not 0.0 < value < (1.5 if name == "full_steering_rad" else math.inf):
-                raise UserError(f"{table}: {name} {value} is not valid: it must be above 0")
+        full_rad = numbers.pop("full_steering_rad")  # below 0 where it turns to the right
+        if not (0.0 < abs(full_rad) < 1.5 and all(0.0 < n < math.inf for n in numbers.values())):
+            raise UserError(
+                f"{table}: scale or car is not valid: numbers above 0, and full_steering_rad below"
+                f" 1.5 to either side, not {numbers} and {full_rad}"
+            )
         return found
 
 
@@ -188,7 +189,12 @@ class SetPoint:
         similarity, spec = self._similarity, self._similarity.spec
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:
-            speed_mps = self._driven_mps(wish.pedal, step_s, measured_mps)
+            lead_mps = similarity.acceleration_mps2(1.0) * LEAD_S
+            speed_mps = self.speed_mps + similarity.acceleration_mps2(wish.pedal) * step_s
+            speed_mps = min(speed_mps, measured_mps + lead_mps)
+            if wish.pedal > 0:  # a brake that does not bite is asked for all the more
+                behind_mps = max(lead_mps, RUNAWAY * spec.max_speed_mps)
+                speed_mps = max(speed_mps, measured_mps - behind_mps)
         else:  # the scenario has the pedals
             gap_mps = (wish.scenario_speed_mps or 0.0) * similarity.scale - self.speed_mps
             least_mps, most_mps = (similarity.acceleration_mps2(p) * step_s for p in (-1.0, 1.0))
@@ -198,13 +204,3 @@ class SetPoint:
             wanted_rad = spec.inner_rad(similarity.centre_rad(wish.steering))
             most_rad = spec.max_steering_rate_radps * step_s
             self.inner_rad += clamp(wanted_rad - self.inner_rad, most_rad)
-
-    def _driven_mps(self, pedal: float, step_s: float, measured_mps: float) -> float:
-        similarity = self._similarity
-        lead_mps = similarity.acceleration_mps2(1.0) * LEAD_S
-        speed_mps = self.speed_mps + similarity.acceleration_mps2(pedal) * step_s
-        speed_mps = min(speed_mps, measured_mps + lead_mps)
-        if pedal > 0:  # a brake that does not bite is asked for all the more
-            least_mps = RUNAWAY * similarity.spec.max_speed_mps
-            speed_mps = max(speed_mps, measured_mps - max(lead_mps, least_mps))
-        return speed_mps

@@ -199,10 +199,6 @@ class StreamedCore(abc.ABC):
         """Return SILENT where feedback is missing that was due since `since_s`."""
 
     @abc.abstractmethod
-    def _why_not_confirmed(self, now_s: float) -> str:
-        """Return in words why the vehicle did not confirm an `enable` in time."""
-
-    @abc.abstractmethod
     def _centre_rad(self) -> Optional[float]:
         """Return the steering angle that the vehicle reports; None where it is not known."""
 
@@ -218,6 +214,10 @@ class StreamedCore(abc.ABC):
         silence = self._silence(-math.inf, now_s)
         return [silence.words] if silence else []
 
+    def _hindrance(self, now_s: float) -> Optional[Finding]:
+        """Return why the vehicle did not confirm an `enable`, where that is known."""
+        return self._silence(self._since_s, now_s)
+
     def _apply(self, finding: Finding, now_s: float) -> None:
         after = LEADS_TO[finding.event].get(self.state, self.state)
         if after is self.state:
@@ -229,8 +229,10 @@ class StreamedCore(abc.ABC):
     def _look(self, now_s: float) -> None:
         """Find what time alone tells."""
         if self.state is VehicleState.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
-            why = self._why_not_confirmed(now_s)
-            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, why), now_s)
+            words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
+            if why := self._hindrance(now_s):
+                words += f": {why.words}"
+            self._apply(Finding(VehicleEvent.NOT_CONFIRMED, words), now_s)
         if self.state is not VehicleState.ENABLED:
             return
         asked_mps, heard = self.set_point.speed_mps, self._heard

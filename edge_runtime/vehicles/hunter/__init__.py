@@ -3,7 +3,7 @@
 `HunterCore` is pure: it hears every frame of the bus, and its `tick` gives the frames to send;
 `Reports` holds what was heard of the chassis. `HunterVehicle` puts two threads around it: the
 stream's sends what `tick` gives, and is the only one that sends until `close` has joined it; the
-listener's hands every frame to `hear`. `Gate` lets our own frames out only.
+listener's hands every frame to `hear`.
 
 python-can is imported here and nowhere else in the runtime, and only when a bus is opened: a board
 without a CAN vehicle need not have it.
@@ -11,12 +11,8 @@ without a CAN vehicle need not have it.
 
 from __future__ import annotations
 
-import errno
 import logging
 import math
-import os
-import socket
-import struct
 import threading
 import time
 from typing import Any, ClassVar, Dict, List, NamedTuple, Optional, Type
@@ -27,9 +23,9 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import plausibility, streamed
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.protocol import Frame, MotionStatus, MotorSlow, Sent, SystemStatus
+from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, RobotSettings, Similarity
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding
+from edge_runtime.vehicles.plausibility import Fault, Finding
 from edge_runtime.vehicles.streamed import STOP_TAKES_S, VehicleEvent, VehicleState
 
 STATUS_SILENCE_S = 0.3  # three frames of 0x211; 0x221 comes five times as often
@@ -224,10 +220,8 @@ class HunterCore(streamed.StreamedCore):
         words = [outranked.words] if outranked else []
         return words + super()._obstacles(now_s) + ([self._bus_words] if self._bus_words else [])
 
-    def _why_not_confirmed(self, now_s: float) -> str:
-        why = self._silence(self._since_s, now_s) or self.reports.finding()
-        words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
-        return f"{words}: {why.words}" if why else words
+    def _hindrance(self, now_s: float) -> Optional[Finding]:
+        return super()._hindrance(now_s) or self.reports.finding()
 
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         return self.reports.silence(since_s, now_s)
@@ -254,7 +248,6 @@ UDP = "udp_multicast"
 MULTICAST_GROUP = "239.74.163.2"  # python-can's own
 # Two buses need two ports: Linux hands what comes for any group to every socket of its port.
 MULTICAST_BUS = f"{UDP}:{MULTICAST_GROUP}:43113"
-_LOOPBACK = "lo"
 _LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 _ADVICE = {
@@ -276,7 +269,7 @@ def parse_bus(text: str) -> BusName:
     interface, _, channel = text.partition(":")
     group, _, port = channel.partition(":")
     if interface == UDP and port.isdecimal():
-        # Pinned to the loopback device as well: no neighbour hears it.
+        # No hop: no frame leaves the machine.
         return BusName(interface, group, {"port": int(port), "hop_limit": 0, "fd": False})
     if interface not in ("", UDP) and channel:
         sets_bitrate = interface not in ("socketcan", "virtual")
@@ -293,61 +286,12 @@ def open_bus(name: BusName) -> Any:
     except ImportError:
         words = "the hunter needs python-can, which is not installed: pip install python-can"
         raise UserError(words) from None
-    bus: Any = None
     try:
-        bus = can.Bus(interface=name.interface, channel=name.channel, **name.options)
-        if name.interface == UDP:
-            _pin_to_loopback(bus, name.channel)
+        return can.Bus(interface=name.interface, channel=name.channel, **name.options)
     except Exception as error:  # each backend raises what its library raises, NameError included
-        if bus is not None:
-            bus.shutdown()
         where, cause = f"{name.interface}:{name.channel}", str(error) or type(error).__name__
         advice = _ADVICE.get(name.interface, "see python-can's manual for what it needs")
         raise UserError(f"the CAN bus {where} cannot be opened: {cause}; {advice}") from None
-    return bus
-
-
-def _pin_to_loopback(bus: Any, group: str) -> None:
-    """Let the python-can bus speak and hear on the loopback device only. Raises OSError.
-
-    It sends to whatever network the machine has. Pinned, no frame leaves the machine and none comes
-    in from outside, whoever sends it to the group or to the port; that needs no privilege (Linux
-    5.7 or newer), only a route for multicast, which any machine with a network has.
-    """
-    device = socket.if_nametoindex(_LOOPBACK)
-    member = struct.pack("=4s4xi", socket.inet_aton(group), device)  # struct ip_mreqn
-    sender = struct.pack("=8xi", device)
-    with socket.socket(fileno=os.dup(bus.fileno())) as same:
-        same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
-        try:
-            same.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
-                raise
-        same.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, sender)
-    while bus.recv(0.0) is not None:
-        pass  # from before
-
-
-class Gate:
-    """The only way out to the bus: for our commands alone."""
-
-    def __init__(self, bus: Any) -> None:
-        import can
-
-        self._bus, self._message = bus, can.Message
-
-    def send(self, frame: Frame, data: bytes) -> None:
-        """Put a frame on the bus without waiting.
-
-        Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
-        anything is sent, for a frame that must not leave.
-        """
-        if frame not in protocol.COMMANDS or len(data) != frame.length:
-            raise RuntimeError(f"0x{frame.can_id:x} with {len(data)} bytes is no command of ours")
-        message = self._message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
-        # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
-        self._bus.send(message, timeout=0.0)
 
 
 class HunterSettings(RobotSettings, frozen=True, kw_only=True):
@@ -370,7 +314,6 @@ class HunterVehicle(streamed.StreamedVehicle):
     def __init__(self, settings: HunterSettings, similarity: Similarity) -> None:
         bus = parse_bus(settings.bus)
         self._bus: Any = open_bus(bus)
-        self._gate = Gate(self._bus)
         # Our own frames come back there: a command need not be somebody else's.
         self._ignores_commands = bus.interface == UDP
         self._core: HunterCore
@@ -398,9 +341,15 @@ class HunterVehicle(streamed.StreamedVehicle):
         return True
 
     def _send(self, parts: List[Sent]) -> bool:
+        import can
+
         try:
-            for part in parts:
-                self._gate.send(*part)
+            for frame, data in parts:
+                if frame not in protocol.COMMANDS:
+                    raise RuntimeError(f"0x{frame.can_id:x} is no command of ours")
+                message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
+                # Not None: the virtual bus would wait for ever where a receiver's queue is full.
+                self._bus.send(message, timeout=0.0)
         except Exception as error:  # CanError, OSError, or what else a backend raises
             self._note_bus(error)
             return False

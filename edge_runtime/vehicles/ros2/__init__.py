@@ -1,9 +1,8 @@
 """A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
 
-First the messages and a node without ROS 2; then what decides, pure: odometry in, motion out; then
-the session and two threads around it. The stream's thread publishes what `tick` gives: the ROS
-driver makes a frame of each message, and has no stream of its own. Zenoh's thread hands every
-odometry to `hear`.
+First the messages without ROS 2; then what decides, pure: odometry in, motion out; then the session
+and two threads around it. The stream's thread publishes what `tick` gives: the ROS driver makes a
+frame of each message, and has no stream of its own. Zenoh's thread hands every odometry to `hear`.
 
 A message is CDR behind a header of four bytes that says plain CDR (XCDR version 1), little-endian:
 `00 01 00 00`; a big-endian one is read, too. Each field is aligned to its size, counted from behind
@@ -18,7 +17,7 @@ import math
 import re
 import struct
 import time
-from typing import Any, Callable, ClassVar, Dict, List, NamedTuple, Optional, Type
+from typing import Any, ClassVar, Dict, NamedTuple, Optional, Tuple, Type
 
 import zenoh
 
@@ -27,7 +26,7 @@ from edge_runtime.config import check_choice
 from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import RobotSettings, Similarity
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault, Finding, impossible
+from edge_runtime.vehicles.plausibility import Fault, Finding, impossible
 from edge_runtime.vehicles.streamed import (
     Speeds,
     StreamedCore,
@@ -126,12 +125,8 @@ def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> bytes:
     return _LITTLE_ENDIAN + struct.pack("<6d", motion.speed_mps, 0.0, 0.0, 0.0, 0.0, z)
 
 
-def member_token(zid: str) -> str:
-    return f"@/{zid}/@ros2_lv"
-
-
-def topic_token(zid: str, role: str, key: str, kind: str) -> str:
-    """Return the token of a PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
+def topic_token(member: str, role: str, key: str, kind: str) -> str:
+    """Return the token of a member's PUBLISHER or SUBSCRIBER, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
     bridge would carry only what a ROS node beside it already wants. Its last part is
@@ -142,46 +137,7 @@ def topic_token(zid: str, role: str, key: str, kind: str) -> str:
     """
     names = (name.replace("/", _SLASH) for name in (key, kind))
     qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind]};"
-    return "/".join((member_token(zid), role, *names, qos))
-
-
-class Ros2Node:
-    """Uses a session that somebody else opens and closes. `close` it before the session."""
-
-    def __init__(self, session: zenoh.Session, namespace: str) -> None:
-        self._session, self._namespace = session, namespace
-        self._zid = str(session.info.zid())
-        self._declared: List[Any] = []
-        self._announce(member_token(self._zid))
-
-    def publisher(self, topic: str, kind: str) -> Callable[[bytes], None]:
-        """Return what publishes on a topic. It never waits for a subscriber."""
-        key = topic_key(self._namespace, topic)
-        drop = zenoh.CongestionControl.DROP
-        publisher = self._session.declare_publisher(key, congestion_control=drop)
-        self._declared.append(publisher)
-        self._announce(topic_token(self._zid, PUBLISHER, key, kind))
-        return publisher.put
-
-    def subscribe(self, topic: str, take: Callable[[Odometry], None]) -> None:
-        """Call `take` with each odometry that can be read, in Zenoh's thread."""
-        key = topic_key(self._namespace, topic)
-
-        def hear(sample: zenoh.Sample) -> None:
-            if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
-                read = read_odometry(sample.payload.to_bytes())
-                if read is not None:
-                    take(read)
-
-        self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
-        self._announce(topic_token(self._zid, SUBSCRIBER, key, ODOMETRY))
-
-    def close(self) -> None:
-        while self._declared:
-            self._declared.pop().undeclare()
-
-    def _announce(self, token: str) -> None:
-        self._declared.append(self._session.liveliness().declare_token(token))
+    return "/".join((member, role, *names, qos))
 
 
 class Ros2Settings(RobotSettings, frozen=True, kw_only=True):
@@ -257,9 +213,6 @@ class Ros2Core(StreamedCore):
         is_fresh = self._silence(-math.inf, now_s) is None
         return self.state is VehicleState.DISABLED or (is_fresh and self._heard.stands)
 
-    def _why_not_confirmed(self, now_s: float) -> str:
-        return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"
-
     def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         if now_s - max(self._newest_s, since_s) <= self._heard.silence_s:
             return None
@@ -297,25 +250,41 @@ class Ros2Vehicle(StreamedVehicle):
         except UserError as error:
             raise UserError(str(error).replace("--listen", "[vehicle.ros2] listen")) from None
         try:
-            self._node = Ros2Node(self._session, settings.namespace)
-            self._publish = self._node.publisher(settings.twist_topic, TWIST)
-            self._node.subscribe(settings.odometry_topic, self._hear)
+            self._declared = self._declare(settings)
         except BaseException:
             self._session.close()  # an open session would hang the process at its exit
             raise
         self._stream.start()
 
-    def _leave(self) -> None:
-        try:
-            self._node.close()
-        finally:
-            with self._lock:
-                self._core.close(time.monotonic())
-            self._session.close()
+    def _declare(self, settings: Ros2Settings) -> Tuple[Any, ...]:
+        """Publish, subscribe and announce both; return what must live as long as the session."""
+        session, member = self._session, f"@/{self._session.info.zid()}/@ros2_lv"
+        twist = topic_key(settings.namespace, settings.twist_topic)
+        odometry = topic_key(settings.namespace, settings.odometry_topic)
+        # It never waits for a subscriber.
+        drop = zenoh.CongestionControl.DROP
+        publisher = session.declare_publisher(twist, congestion_control=drop)
+        self._publish = publisher.put
+        tokens = (
+            member,
+            topic_token(member, PUBLISHER, twist, TWIST),
+            topic_token(member, SUBSCRIBER, odometry, ODOMETRY),
+        )
+        subscriber = session.declare_subscriber(odometry, only_own(odometry, self._hear))
+        return publisher, subscriber, *map(session.liveliness().declare_token, tokens)
 
-    def _hear(self, odometry: Odometry) -> None:
+    def _leave(self) -> None:
+        self._session.close()
         with self._lock:
-            self._core.hear(*odometry, time.monotonic())
+            self._core.close(time.monotonic())
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_PAYLOAD_BYTES:
+            return  # something huge is not even copied
+        odometry = read_odometry(sample.payload.to_bytes())
+        if odometry is not None:
+            with self._lock:
+                self._core.hear(*odometry, time.monotonic())
 
     def _send_due(self) -> bool:
         with self._lock:
