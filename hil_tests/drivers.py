@@ -33,16 +33,13 @@ class Drivers(ProcessPoolExecutor):
 
     def __init__(self, policy: str, env: str, condition: str, public_key: str | None, jobs: int):
         policy = located(policy)
-        period_s = trained_in(policy, public_key)[1]
-        environment = make_environment(env, condition, period_s=period_s)
-        self.policy_id = load_driver(policy, environment, public_key)[1]
+        task = (policy, env, condition, public_key, trained_in(policy, public_key)[1])
+        environment, _, self.policy_id = _load(*task)
         self.control_period_s: float = environment.control_period_s
         self.jobs = jobs or cores()
         self.driven = 0
         self._ends = {TRUNCATED}  # How any drive has ended
-        made = (policy, env, condition, public_key, period_s)
-        begin: Any = _begin
-        super().__init__(self.jobs, get_context("spawn"), begin, made)
+        super().__init__(self.jobs, get_context("spawn"), partial(_begin, *task))
 
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
@@ -57,10 +54,7 @@ class Drivers(ProcessPoolExecutor):
         self._ends.update(result.outcome for result in results)
         # A step limit is a timeout as soon as the end of any other drive was reported.
         if UNKNOWN in self._ends or len(self._ends) == 1:
-            raise UserError(
-                "the environment says of no episode whether it succeeded: it needs outcome or"
-                " is_success in its info"
-            )
+            raise UserError("the environment has neither outcome nor is_success in its info")
         return [
             replace(result, outcome=TIMEOUT) if result.outcome == TRUNCATED else result
             for result in results
@@ -70,14 +64,18 @@ class Drivers(ProcessPoolExecutor):
 _mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
 
 
-def _begin(
-    policy: str, env: str, condition: str, public_key: str | None, period_s: float | None
-) -> None:
+def _load(policy: str, env: str, condition: str, key: str | None, period_s: float | None) -> Any:
+    """Return the environment, the policy as its driver, and the policy's id."""
+    environment = make_environment(env, condition, period_s=period_s)
+    return environment, *load_driver(policy, environment, key)
+
+
+def _begin(*task: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=die_with_parent, daemon=True).start()
     set_threads(1)
-    environment = make_environment(env, condition, period_s=period_s)
-    _mine[:] = environment, load_driver(policy, environment, public_key)[0], condition
+    environment, driver, _ = _load(*task)
+    _mine[:] = environment, driver, task[2]
 
 
 def _drive(spec: LatencySpec, seed: int) -> EpisodeResult:

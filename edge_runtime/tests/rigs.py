@@ -163,14 +163,14 @@ class HunterRig(Rig):
         for frame, data in parts:
             self.sent.append((self.now_s, frame.can_id, data))
             message = protocol.decode(frame.can_id, data)
-            if isinstance(message, protocol.MotionCommand):
+            if isinstance(message, protocol.WheelMotion):
                 self.asked.append((self.now_s, message.speed_mps))
                 if self.obeys:
                     self.speed_mps, self.inner_rad = message
         if self.jammed_rad is not None:
             self.inner_rad = self.jammed_rad
         if self.talks:
-            motion = protocol.MotionStatus(self.speed_mps, self.inner_rad)
+            motion = protocol.WheelMotion(self.speed_mps, self.inner_rad)
             self.tell(protocol.MOTION_STATUS, motion)
             if self.ticks % 5 == 0:
                 self.tell(protocol.SYSTEM_STATUS, self.status)

@@ -171,11 +171,11 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
     [
         (protocol.MOTORS_SLOW[2], protocol.MotorSlow(24.0, 30, 90, 0b10),
          VehicleEvent.FAULT, "rear left motor: motor overtemperature"),
-        (protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
+        (protocol.MOTION_COMMAND, protocol.WheelMotion(0.0, 0.0),
          VehicleEvent.FOREIGN, "somebody else sends 0x111"),
-        (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0),
+        (protocol.MOTION_STATUS, protocol.WheelMotion(3.0, 0.0),
          Fault.LYING, "the chassis reports 3.0 m/s"),
-        (protocol.MOTION_STATUS, protocol.MotionStatus(0.0, 1.0),
+        (protocol.MOTION_STATUS, protocol.WheelMotion(0.0, 1.0),
          Fault.LYING, "a steering angle of 1.00 rad"),
         (None, "bus-off", VehicleEvent.BUS, "the CAN bus fails: bus-off"),
     ],
@@ -191,7 +191,7 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
 
 def test_no_more_steering_is_reported_than_the_wheels_reach():
     rig = HunterRig("congestion", scale=0.02)
-    rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(0.1, -0.7))
+    rig.tell(protocol.MOTION_STATUS, protocol.WheelMotion(0.1, -0.7))
     assert rig.report.action["steering"] == rig.core.similarity.limits()["steering"].high < 0.6
 
 
@@ -247,7 +247,7 @@ def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked(driving, mi
             assert LOCK not in driving.frames(-10)
         driving.step(1, PEDAL)
         if missing == "0x211":  # the status; not the motion
-            motion = protocol.MotionStatus(driving.speed_mps or 0.1, 0.0)
+            motion = protocol.WheelMotion(driving.speed_mps or 0.1, 0.0)
             driving.tell(protocol.MOTION_STATUS, motion)
     assert LOCK in driving.frames(-10)
 
@@ -270,7 +270,7 @@ def test_frames_that_repeat_themselves_are_silence_after_three_of_them(driving):
 
 @pytest.mark.parametrize("before", [False, True])
 def test_feedback_that_could_not_be_confirms_nothing(rig, before):
-    lie = (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))
+    lie = (protocol.MOTION_STATUS, protocol.WheelMotion(3.0, 0.0))
     rig.talks = False
     if before:
         rig.tell(*lie)

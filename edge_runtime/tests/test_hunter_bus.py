@@ -45,7 +45,7 @@ class ObedientChassis:
         elif can_id == 0x131:
             self.status = self.status._replace(brake=told.value)
         elif can_id == 0x111:
-            self.send(protocol.MOTION_STATUS, protocol.MotionStatus(*told))
+            self.send(protocol.MOTION_STATUS, protocol.WheelMotion(*told))
             self.status = self.status._replace(counter=(self.status.counter + 1) % 256)
             self.send(protocol.SYSTEM_STATUS, self.status)
 

@@ -51,12 +51,12 @@ def test_no_command_leaves_the_models_limits(spec, speed, angle):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_is_never_a_count_and_what_is_too_much_is_clamped(value):
-    for message in (protocol.MotionCommand(value, 0.0), protocol.MotionCommand(0.0, value)):
+    for message in (protocol.WheelMotion(value, 0.0), protocol.WheelMotion(0.0, value)):
         with pytest.raises(ValueError, match="no number for the bus"):
             encode(protocol.MOTION_COMMAND, message)
     with pytest.raises(ValueError, match="no number for the bus"):
         protocol.motion(math.nan, 0.0, HUNTER_2)
-    data = protocol.encode(protocol.MOTION_COMMAND, protocol.MotionCommand(1e6, -1e6))
+    data = protocol.encode(protocol.MOTION_COMMAND, protocol.WheelMotion(1e6, -1e6))
     assert struct.unpack(">h4xh", data) == (2**15 - 1, -(2**15))
 
 

@@ -91,13 +91,8 @@ _LEAVE_S = 3.0  # a Hunter that is to stand and give control back takes half of 
 
 def close_in_time(vehicle: Vehicle) -> None:
     """Close a driver that was never enabled; one that hangs is left alone."""
-    _note_end(vehicle, ends_within(_LEAVE_S, partial(_end, vehicle, vehicle.close)))
-
-
-def _note_end(vehicle: Vehicle, ended: bool) -> bool:
-    if not ended:
-        log.event("error", "driver_hangs", vehicle=vehicle.name, waited_s=_LEAVE_S)
-    return ended
+    if not ends_within(_LEAVE_S, partial(_end, vehicle, vehicle.close)):
+        log.event("error", "driver_hangs", vehicle=vehicle.name)
 
 
 def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
@@ -109,8 +104,6 @@ def _end(vehicle: Vehicle, *calls: Callable[[], None]) -> None:
 
 
 class _Order(NamedTuple):
-    """A command, and what the vehicle needs besides."""
-
     command: Command
     scenario_speed_mps: Optional[float]
     latch: bool
@@ -118,10 +111,9 @@ class _Order(NamedTuple):
 
 
 class VehicleRunner:
-    """Owns the vehicle: once started, its own thread alone calls it until `close`.
+    """Owns the vehicle: its own thread alone calls it. Only `start` and `close` wait for that.
 
-    `action_names` are the policy's, in the order of a command's action. No method but `start` and
-    `close` waits.
+    `action_names` are the policy's, in the order of a command's action.
     """
 
     def __init__(
@@ -208,7 +200,9 @@ class VehicleRunner:
         if self._thread.ident is None:  # it was never started, and is closed all the same
             self._thread.start()
         self._thread.join(_LEAVE_S)
-        return _note_end(self._vehicle, not self._thread.is_alive())
+        if hangs := self._thread.is_alive():
+            log.event("error", "driver_hangs", vehicle=self.name)
+        return not hangs
 
     def _run(self) -> None:
         next_s, vehicle = time.monotonic(), self._vehicle  # of the next report
@@ -235,20 +229,19 @@ class VehicleRunner:
         return self._next is not None or self._enable_due or self._stopping
 
     def _enable(self) -> None:
-        failure, now_s = "", time.monotonic()
+        now_s = time.monotonic()
         self._watch.enable(now_s)
         try:
             self._vehicle.enable(now_s)
-        except BaseException as error:
-            failure = printable(str(error) or type(error).__name__)
-            log.event("error", "not_enabled", detail=failure)
-        self._not_enabled = failure
-        if not failure:
+            self._not_enabled = ""
             self._ask()  # before its faults count again
+        except BaseException as error:
+            self._not_enabled = printable(str(error) or type(error).__name__)
+            log.event("error", "not_enabled", detail=self._not_enabled)
         with self._due:
             self._enable_due = False
             self._due.notify()
-        if failure:
+        if self._not_enabled:
             self.on_fault()
 
     def _obey(self, order: _Order) -> None:

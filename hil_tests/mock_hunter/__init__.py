@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.protocol import MotionCommand, Sent
+from edge_runtime.vehicles.hunter.protocol import Sent, WheelMotion
 from edge_runtime.vehicles.mapping import clamp
 
 
@@ -144,8 +144,8 @@ class MockHunter:
         self.next_s = now_s
         self._parameters, self._now_s = parameters, now_s
         self._commanded_s = -math.inf  # when the newest 0x111 came, or CAN control was taken
-        self._under_way: deque[tuple[float, MotionCommand]] = deque()
-        self._setpoint = MotionCommand(0.0, 0.0)
+        self._under_way: deque[tuple[float, WheelMotion]] = deque()
+        self._setpoint = WheelMotion(0.0, 0.0)
         self._tick = 0
         self._fast: list[Sent] = []
         self._slow: list[Sent] = []
@@ -243,7 +243,7 @@ class MockHunter:
         p, before_rad = self._parameters, self.inner_rad
         if not self.obeys:
             # Where control comes back, it does so from a stand, not with what was asked before.
-            self._setpoint = MotionCommand(0.0, self.inner_rad)
+            self._setpoint = WheelMotion(0.0, self.inner_rad)
             self.speed_mps -= clamp(self.speed_mps, p.braking_mps2 * step_s)
         elif "stuck" not in self.faults:
             gap_mps = clamp(self._setpoint.speed_mps, p.max_speed_mps) - self.speed_mps
@@ -272,7 +272,7 @@ class MockHunter:
     def _fast_frames(self) -> list[Sent]:
         """Make 0x221 and 0x251 to 0x253: every 20 ms."""
         speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        motion = protocol.MotionStatus(speed_mps, self.inner_rad)
+        motion = protocol.WheelMotion(speed_mps, self.inner_rad)
         steers, drives = (self._turning_radps, self.inner_rad), (self.speed_mps, self.way_m)
         found = [protocol.MOTION_STATUS.sent(motion)]
         for row, (rate, way) in zip(protocol.MOTORS_FAST, (steers, drives, drives), strict=True):

@@ -23,7 +23,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import plausibility, streamed
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
+from edge_runtime.vehicles.hunter.protocol import MotorSlow, Sent, SystemStatus, WheelMotion
 from edge_runtime.vehicles.mapping import HunterSpec, RobotSettings, Similarity
 from edge_runtime.vehicles.plausibility import Fault, Finding
 from edge_runtime.vehicles.streamed import STOP_TAKES_S, VehicleEvent, VehicleState
@@ -46,7 +46,7 @@ class Reports(streamed.Speeds):
     def __init__(self, spec: HunterSpec, profile: str) -> None:
         super().__init__()
         self.status: Optional[SystemStatus] = None
-        self.motion: Optional[MotionStatus] = None
+        self.motion: Optional[WheelMotion] = None
         self.status_s = self.motion_s = -math.inf  # of 0x211: when its counter last went on
         self._counter, self._last_status_s = 0, -math.inf
         self._spec, self._profile = spec, profile
@@ -58,7 +58,7 @@ class Reports(streamed.Speeds):
         if isinstance(message, SystemStatus):
             self.status = message
             self._count(message.counter, now_s)
-        elif isinstance(message, MotionStatus):
+        elif isinstance(message, WheelMotion):
             self.motion, self.motion_s = message, now_s
             self.note(message.speed_mps, now_s)
         elif isinstance(message, MotorSlow):

@@ -26,8 +26,8 @@ CLEAR_ALL = 0
 STATE_OK, STATE_ESTOP, STATE_EXCEPTION = 0, 1, 2
 
 
-class MotionCommand(NamedTuple):
-    """0x111: what is asked for, every 20 ms; the chassis waits 500 ms for the next one."""
+class WheelMotion(NamedTuple):
+    """0x111: what is asked, every 20 ms; the chassis waits 500 ms for the next. 0x221: what is."""
 
     speed_mps: float
     inner_steering_rad: float
@@ -48,13 +48,6 @@ class SystemStatus(NamedTuple):
     faults: int
     brake: int
     counter: int
-
-
-class MotionStatus(NamedTuple):
-    """0x221: what the wheels do."""
-
-    speed_mps: float
-    inner_steering_rad: float
 
 
 class MotorFast(NamedTuple):
@@ -107,12 +100,12 @@ _FAST = (">hhi", (1, _TENTH, 1))
 _SLOW = (">HhbB2x", (_TENTH, 1, 1, 1))
 _STATUS = (">BBHHBB", (1, 1, _TENTH, 1, 1, 1))
 
-MOTION_COMMAND = Frame(0x111, MotionCommand, *_MOTION)
+MOTION_COMMAND = Frame(0x111, WheelMotion, *_MOTION)
 BRAKE_COMMAND = Frame(0x131, ByteCommand, *_BYTE)
 MODE_COMMAND = Frame(0x421, ByteCommand, *_BYTE)
 CLEAR_COMMAND = Frame(0x441, ByteCommand, *_BYTE)
 SYSTEM_STATUS = Frame(0x211, SystemStatus, *_STATUS)
-MOTION_STATUS = Frame(0x221, MotionStatus, *_MOTION)
+MOTION_STATUS = Frame(0x221, WheelMotion, *_MOTION)
 _MOTORS = ("steering", "rear right", "rear left")
 MOTORS_FAST = [Frame(0x251 + place, MotorFast, *_FAST) for place in range(3)]
 MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, *_SLOW) for place in range(3)]
@@ -144,7 +137,7 @@ def motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> Sen
     """Return 0x111 within the limits of the model. Raises ValueError for what is not finite."""
     speed_mps = clamp(speed_mps, spec.max_speed_mps)  # NaN passes, and encode refuses it
     inner_rad = clamp(inner_steering_rad, spec.max_inner_steering_rad)
-    return MOTION_COMMAND.sent(MotionCommand(speed_mps, inner_rad))
+    return MOTION_COMMAND.sent(WheelMotion(speed_mps, inner_rad))
 
 
 def decode(can_id: int, data: bytes) -> Any:
