@@ -44,12 +44,12 @@ def test_the_enable_sequence_and_its_confirmation(rig):
 CHASSIS_SAYS = [
     ({"mode": protocol.REMOTE_CONTROL}, "the remote control drives", True),
     ({"state": protocol.STATE_ESTOP}, "the emergency stop is pressed", True),
-    ({"mode": protocol.STANDBY}, "the chassis is in standby, not under CAN control", False),
+    ({"mode": protocol.STANDBY}, "the chassis is in mode 0, not under CAN control", False),
     ({"mode": 7}, "the chassis is in mode 7, not under CAN control", False),
     ({"brake": 1}, "the chassis has locked its brake", False),
     ({"faults": 0x1000}, "link to the upper computer lost", False),
     ({"faults": 0x0241}, "steering encoder, battery undervoltage, overtemperature", False),
-    ({"state": protocol.STATE_EXCEPTION}, "the chassis is in state 2 (exception)", False),
+    ({"state": protocol.STATE_EXCEPTION}, "the chassis is in state 2", False),
 ]
 
 

@@ -15,10 +15,10 @@ from edge_runtime.tests.rigs import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import base
 from edge_runtime.vehicles.base import VehicleRunner
-from edge_runtime.vehicles.plausibility import DEVIATES_S, LAG_S, REASONS, Fault
+from edge_runtime.vehicles.plausibility import DEVIATES_S, LAG_S, Fault
 from edge_runtime.wire import SAFE_STOP, encode
 
-SILENT = REASONS[Fault.SILENT]
+SILENT = Fault.SILENT.value
 BUS_OFF = OSError("bus off")
 RAISED = [BUS_OFF, SystemExit(3), KeyboardInterrupt(), GeneratorExit()]
 

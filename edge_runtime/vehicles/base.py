@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.controller import Limits
 from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.util import UserError, ends_within, printable
-from edge_runtime.vehicles.plausibility import PEDAL, REASONS, Fault, VehicleReport, VehicleWatch
+from edge_runtime.vehicles.plausibility import PEDAL, Fault, VehicleReport, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 
@@ -297,7 +297,7 @@ class VehicleRunner:
 
     def _seen_fault(self, now_s: float) -> str:
         fault = Fault.SILENT if self._refuses else self._watch.fault(now_s)
-        return REASONS[fault] if fault else ""
+        return fault.value if fault else ""
 
     def _ask(self) -> Optional[VehicleReport]:
         """Return the vehicle's report; None where the driver fails: silence like any other."""

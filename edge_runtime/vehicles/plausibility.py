@@ -55,20 +55,13 @@ class VehicleReport(NamedTuple):
 
 
 class Fault(str, Enum):
-    SILENT = "feedback_silent"  # feedback that was due is missing, or repeats itself
-    LYING = "feedback_impossible"
-    STUCK = "speed_stuck"  # or an action of any driver
+    """The values are what feedback and health say where `VehicleWatch` finds the fault."""
+
+    SILENT = "vehicle_silent"  # feedback that was due is missing, or repeats itself
+    LYING = "vehicle_lying"  # it reports the impossible
+    STUCK = "vehicle_stuck"  # its speed, or an action of any driver
     STEERING_STUCK = "steering_stuck"
     SELF_BRAKING = "vehicle_self_braking"  # though it is to drive
-
-
-REASONS: Dict[Fault, str] = {
-    Fault.SILENT: "vehicle_silent",
-    Fault.LYING: "vehicle_lying",
-    Fault.STUCK: "vehicle_stuck",
-    Fault.SELF_BRAKING: "vehicle_self_braking",
-}
-"""What feedback and health say where `VehicleWatch` finds the fault."""
 
 
 class Finding(NamedTuple):

@@ -91,13 +91,10 @@ LEADS_TO: Dict[Enum, Dict[VehicleState, VehicleState]] = {
 
 
 class Speeds:
-    """The speeds that a vehicle reported in the last 0.1 s.
-
-    The vehicle counts as silent after `silence_s` without feedback.
-    """
+    """The speeds that a vehicle reported in the last 0.1 s."""
 
     def __init__(self) -> None:
-        self.silence_s = 0.2
+        self.silence_s = 0.2  # without feedback for so long the vehicle is silent
         self._noted: Deque[Tuple[float, float]] = deque([(-math.inf, 0.0)])
 
     def note(self, speed_mps: float, now_s: float) -> None:
@@ -130,7 +127,6 @@ class StreamedCore(abc.ABC):
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
         self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
-        self._reach = similarity.reach
         self.follow_period(MIN_PERIOD_S)
         self._drive_watch = DriveWatch(self._spec, heard.silence_s)
         self._wish: Optional[Wish] = None  # None: stand
@@ -177,7 +173,7 @@ class StreamedCore(abc.ABC):
         faults = words + [more for more in standing if more not in words]
         return VehicleReport(
             # A milliradian beyond its reach would count as a lie.
-            action={"pedal": pedal, "steering": clamp(steering, self._reach)},
+            action={"pedal": pedal, "steering": clamp(steering, self.similarity.reach)},
             speed_mps=heard.speed_mps,
             self_braking=self.state is not VehicleState.ENABLED,
             faults=faults if self.state is VehicleState.STOPPED else [],
@@ -188,7 +184,8 @@ class StreamedCore(abc.ABC):
 
     def standing(self, now_s: float) -> List[str]:
         """Return in words what would make an `enable` now be in vain."""
-        return [] if self._has_asked else self._obstacles(now_s)
+        silence = None if self._has_asked else self._silence(-math.inf, now_s)
+        return [silence.words] if silence else []
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
@@ -208,11 +205,6 @@ class StreamedCore(abc.ABC):
 
     def _asked_rad(self) -> float:
         return self._spec.centre_rad(self.set_point.inner_rad)
-
-    def _obstacles(self, now_s: float) -> List[str]:
-        """Return in words what stands between the vehicle and our commands."""
-        silence = self._silence(-math.inf, now_s)
-        return [silence.words] if silence else []
 
     def _hindrance(self, now_s: float) -> Optional[Finding]:
         """Return why the vehicle did not confirm an `enable`, where that is known."""

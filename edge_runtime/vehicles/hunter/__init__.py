@@ -80,9 +80,8 @@ class Reports(streamed.Speeds):
     @property
     def needs_clearing(self) -> bool:
         """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
-        if self.status is not None and self.status.state == protocol.STATE_EXCEPTION:
-            return True
-        return bool(set(self._errors()) - {protocol.LINK_LOST})
+        is_exception = self.status is not None and self.status.state == protocol.STATE_EXCEPTION
+        return is_exception or bool({*self._errors()} - {protocol.LINK_LOST})
 
     @property
     def remote_drives(self) -> bool:
@@ -103,29 +102,21 @@ class Reports(streamed.Speeds):
             return Finding(Fault.SILENT, f"the chassis {words if repeats else 'sends no 0x211'}")
         return None
 
-    def commander(self) -> Optional[Finding]:
-        """Return what outranks us: the remote control, or the emergency stop."""
-        if self.remote_drives:
-            return Finding(VehicleEvent.REMOTE, "the remote control drives")
-        if self.status is not None and self.status.state == protocol.STATE_ESTOP:
-            return Finding(VehicleEvent.ESTOP, "the emergency stop is pressed")
-        return None
-
     def finding(self) -> Optional[Finding]:
         """Return the gravest that stands between the chassis and our commands now."""
         status = self.status
         if status is None:
             return Finding(Fault.SILENT, "the chassis sends no 0x211")
-        if outranked := self.commander():
-            return outranked
+        if status.mode == protocol.REMOTE_CONTROL:
+            return Finding(VehicleEvent.REMOTE, "the remote control drives")
+        if status.state == protocol.STATE_ESTOP:
+            return Finding(VehicleEvent.ESTOP, "the emergency stop is pressed")
         if errors := self._errors():
             return Finding(VehicleEvent.FAULT, ", ".join(errors))
         if status.state != protocol.STATE_OK:
-            words = f"the chassis is in state {status.state} (exception)"
-            return Finding(VehicleEvent.FAULT, words)
+            return Finding(VehicleEvent.FAULT, f"the chassis is in state {status.state}")
         if status.mode != protocol.CAN_CONTROL:
-            name = "standby" if status.mode == protocol.STANDBY else f"mode {status.mode}"
-            words = f"the chassis is in {name}, not under CAN control"
+            words = f"the chassis is in mode {status.mode}, not under CAN control"
             return Finding(VehicleEvent.STANDBY, words)
         if status.brake:
             return Finding(VehicleEvent.LOCKED, "the chassis has locked its brake")
@@ -215,10 +206,13 @@ class HunterCore(streamed.StreamedCore):
         elif self.state is VehicleState.ENABLED:
             self._ask_s = math.inf
 
-    def _obstacles(self, now_s: float) -> List[str]:
-        outranked = self.reports.commander()
-        words = [outranked.words] if outranked else []
-        return words + super()._obstacles(now_s) + ([self._bus_words] if self._bus_words else [])
+    def standing(self, now_s: float) -> List[str]:
+        if self._has_asked:
+            return []
+        found = self.reports.finding()
+        outranks = found is not None and found.event in (VehicleEvent.REMOTE, VehicleEvent.ESTOP)
+        words = [found.words] if found and outranks else []
+        return words + super().standing(now_s) + ([self._bus_words] if self._bus_words else [])
 
     def _hindrance(self, now_s: float) -> Optional[Finding]:
         return super()._hindrance(now_s) or self.reports.finding()
@@ -250,10 +244,10 @@ MULTICAST_GROUP = "239.74.163.2"  # python-can's own
 MULTICAST_BUS = f"{UDP}:{MULTICAST_GROUP}:43113"
 _LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
-_ADVICE = {
-    "socketcan": "bring it up with `ip link set CHANNEL up type can bitrate 500000`",
-    UDP: "it needs msgpack, and a route for multicast (`ip route`)",
-}
+_ADVICE = (
+    "socketcan wants `ip link set CHANNEL up type can bitrate 500000`, udp_multicast needs msgpack"
+    " and a route (`ip route`)"
+)
 
 
 class BusName(NamedTuple):
@@ -289,9 +283,8 @@ def open_bus(name: BusName) -> Any:
     try:
         return can.Bus(interface=name.interface, channel=name.channel, **name.options)
     except Exception as error:  # each backend raises what its library raises, NameError included
-        where, cause = f"{name.interface}:{name.channel}", str(error) or type(error).__name__
-        advice = _ADVICE.get(name.interface, "see python-can's manual for what it needs")
-        raise UserError(f"the CAN bus {where} cannot be opened: {cause}; {advice}") from None
+        words = f"{name.interface}:{name.channel} cannot be opened: {error!r}"
+        raise UserError(f"the CAN bus {words}; {_ADVICE}") from None
 
 
 class HunterSettings(RobotSettings, frozen=True, kw_only=True):
