@@ -5,8 +5,8 @@ import math
 import pytest
 
 from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
-from edge_runtime.vehicles.hunter import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports, protocol
-from edge_runtime.vehicles.plausibility import ENABLE_TIMEOUT_S, Fault
+from edge_runtime.vehicles.hunter import STATUS_SILENCE_S, Reports, protocol
+from edge_runtime.vehicles.plausibility import Fault
 from edge_runtime.vehicles.streamed import VehicleEvent, VehicleState
 
 TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
@@ -82,24 +82,6 @@ def test_errors_are_cleared_before_control_is_asked_for_but_a_lost_link_is_not(r
     assert rig.frames() == [*([CLEAR] if clears else []), TAKE, RELEASE, STAND]
     rig.step(11)
     assert (0x441 in rig.ids()) == clears
-
-
-def test_time_limits_to_the_instant(driving):
-    core = driving.core
-    core._wished_s, core._since_s = 0.0, -1.0
-
-    def holds_until(limit_s, state, event):
-        for at_s, then in ((limit_s, state), (limit_s + 1e-9, VehicleState.STOPPED)):
-            core.reports.motion_s = core.reports.status_s = at_s
-            event(at_s)
-            assert core.state is then
-
-    holds_until(core.command_timeout_s, VehicleState.ENABLED, core.tick)
-    core.state = VehicleState.ENABLED
-    core.bus_failed("full", 0.0)
-    holds_until(BUS_PATIENCE_S, VehicleState.ENABLED, lambda at_s: core.bus_failed("full", at_s))
-    core.state, core._since_s = VehicleState.ENABLING, 0.0
-    holds_until(ENABLE_TIMEOUT_S, VehicleState.ENABLING, core.tick)
 
 
 def test_what_is_at_rest(rig):
@@ -228,14 +210,6 @@ def test_how_long_feedback_may_be_silent():
     ):
         reports.motion_s = now_s
         assert words in str(reports.silence(-math.inf, now_s))
-
-
-def test_the_brake_is_locked_though_the_fault_goes_on(driving):
-    driving.status, driving.obeys = OK._replace(faults=0x1000), False
-    driving.step(50, PEDAL)
-    assert LOCK not in driving.frames()
-    driving.step(6, PEDAL)
-    assert LOCK in driving.frames()
 
 
 @pytest.mark.parametrize(("missing", "after_ticks"), [("0x221", 12), ("0x211", 20)])

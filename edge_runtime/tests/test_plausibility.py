@@ -97,12 +97,9 @@ def test_silence_after_two_periods_also_before_the_first_report():
 FOLLOWING = [  # time, asked from then on, reported pedal, whether it brakes by itself, fault
     (0.0, 1.0, -1.0, False, None),  # it has had no time to follow
     (0.25, 1.0, -1.0, False, None),
-    (0.5, 1.0, 1.0, False, None),
     (1.0, 0.0, 1.0, False, None),
-    (1.25, 0.0, 1.0, False, None),
     (1.296875, 0.0, 1.0, False, None),  # 1.0 was still in force 0.3 s ago
     (1.3125, 0.0, 1.0, False, None),  # no more
-    (1.40625, 0.0, 1.0, False, None),
     (1.421875, 0.0, 1.0, False, Fault.STUCK),
     (1.4375, 0.0, 1.0, True, None),  # it obeys no command: that is another fault, later
     (1.453125, 0.0, 1.0, False, None),
@@ -160,7 +157,6 @@ def test_the_mock_stays_within_its_limits_and_is_never_accused(pedals):
 
 SPEED = [
     (-3.0, 9.0, 0.0, False),  # it has had no time to follow
-    (-2.0625, 9.0, 0.0, False),
     (-2.0, 9.0, 0.0, False),
     (-1.9375, 9.0, 0.0, False),
     (-1.875, 9.0, 0.0, True),
@@ -180,7 +176,6 @@ WHEEL = [  # 0.1 rad to each side, 0.5 s to follow, 1 rad/s
     (0.4375, 0.0, 1.0, False),
     (0.5, 0.0, 1.0, False),  # it may begin to turn now
     (0.5, 0.0, 1.0, False),  # twice in one moment
-    (0.75, 0.0, 0.78, False),
     (1.0, 0.0, 0.53, False),
     (1.25, 0.0, 0.29, False),  # too slow, but only just now
     (1.3125, 0.0, 0.29, False),
@@ -188,20 +183,15 @@ WHEEL = [  # 0.1 rad to each side, 0.5 s to follow, 1 rad/s
     (1.5, 0.0, 0.09, False),
     (1.625, 1.0, -0.09, False),
     (2.0, 1.0, -0.09, False),
-    (2.0625, 1.0, 0.0, False),  # it has stuck
     (2.125, 1.0, 0.0, False),  # 0.0 was asked for 0.625 s ago, and still 0.5 s ago
     (2.1875, 1.0, 0.0, False),  # no more: now it turns by 1 rad/s
     (2.25, 1.0, 0.0, False),
     (2.375, 1.0, 0.0, True),
     (2.625, 1.0, None, False),  # nothing is asked of it, or known
     (2.75, 0.0, 1.0, False),  # anew
-    (3.1875, 0.0, 1.0, False),
     (3.25, 0.0, 1.2, False),
-    (3.3125, 0.0, 1.0, False),
     (3.375, 0.0, 1.0, True),
 ]
-
-
 STORIES: dict = {"speed": ((1.0, FOLLOWS_S), SPEED), "wheel": ((0.1, 0.5, 1.0), WHEEL)}
 
 

@@ -36,8 +36,6 @@ def flawed(flaw, clock):
         def command(self, action, now_s, *speed_mps):
             if flaw == "exits":
                 raise SystemExit
-            if flaw == "takes no speed" and speed_mps:
-                raise TypeError
             if flaw == "takes nan":
                 action = {name: 0.0 if value != value else value for name, value in action.items()}
             if flaw == "takes anything":
@@ -92,7 +90,6 @@ def clock(monkeypatch):
         ("frozen", "each action has a range"),
         ("dead", "commands move it"),
         ("complains", "commands move it, and it tells of no fault"),
-        ("takes no speed", "commands move it"),
         ("exits", "commands move it"),
         ("never again", "`enable` after a stop"),
         ("moves disabled", "no command moves it before"),
