@@ -106,20 +106,6 @@ def test_a_wheel_need_not_turn_where_it_stands_nor_where_it_is_to_stand(rig, spe
     assert rig.core.cause is (Fault.STUCK if pedal > 0 else None)
 
 
-@pytest.mark.parametrize(("period_s", "lag_s"), [(0.1, 0.36), (0.5, 1.16)])
-def test_a_wheel_may_lag_behind_all_the_time(rig, period_s, lag_s):
-    """By 0.2 s and by 2 T, for what is heard of it may be as old."""
-    rig.core.follow_period(period_s)
-    rig.enabled()
-    asked_rad = [0.0] * round(lag_s / STREAM_S)
-    for tick in range(600):
-        asked_rad.append(rig.core.set_point.inner_rad)
-        rig.jammed_rad = asked_rad.pop(0)
-        rig.step(1, {**PEDAL, "steering": 1.0 if tick // 75 % 2 else -1.0})
-        assert rig.core.state is VehicleState.ENABLED, rig.words
-    assert max(asked_rad) > 0.5
-
-
 @pytest.mark.parametrize("pedal", [0.05, 1.0])
 @pytest.mark.parametrize("scale", [0.02, 0.05, 0.1, 0.25])
 def test_a_runaway_is_found_at_any_scale_and_throttle(make, scale, pedal):
