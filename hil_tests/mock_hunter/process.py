@@ -49,11 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
             signal.signal(number, lambda *_: ending.set())
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
         _tell(f"ready bus={arguments.bus} model={arguments.model}")
-        _serve(MockHunter(parameters, time.monotonic()), bus, orders, ending)
+        serve(MockHunter(parameters, time.monotonic()), bus, orders, ending)
     return 0
 
 
-def _serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading.Event) -> None:
+def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading.Event) -> None:
     """Run a mock on a bus; print every change as one line with its time (monotonic)."""
     said, works = "", True
     while not ending.is_set():
