@@ -46,7 +46,7 @@ CHASSIS_SAYS = [
     ({"mode": 7}, "the chassis is in mode 7, not under CAN control", False),
     ({"brake": 1}, "the chassis has locked its brake", False),
     ({"faults": 0x1000}, "link to the upper computer lost", False),
-    ({"faults": 0x0241}, "steering encoder, battery undervoltage, overtemperature", False),
+    ({"faults": 0x0241}, "battery undervoltage, overtemperature, steering encoder", False),
     ({"state": protocol.STATE_EXCEPTION}, "the chassis is in state 2", False),
 ]
 

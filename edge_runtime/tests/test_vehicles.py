@@ -70,7 +70,7 @@ WHOLE = msgspec.structs.asdict(CAR)
         ("tank", {}, "'tank' is not known; choose from none, mock, hunter, ros2, milk_cart"),
         ("broken_cart:Cart", {}, "nowhere_to_be_found"),
         ("carts:Wagon", {}, "Wagon"),
-        ("carts:Half", {}, "lacks brake, close, command, feedback"),
+        ("carts:Half", {}, "brake'?, '?close'?, '?command'?, '?feedback"),
         ("carts:Exits", {}, "SystemExit"),
         ("carts:Raises", {}, "not connected"),
         ("milk_cart", {"speed": 3}, "'speed'"),

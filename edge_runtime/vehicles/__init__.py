@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import inspect
 import math
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -96,9 +95,6 @@ def find_vehicle(name: str) -> Type[Vehicle]:
     kind = _call(name, lambda: getattr(import_module(module), member))
     if not (isinstance(kind, type) and issubclass(kind, Vehicle)):
         raise UserError(f"vehicle {name!r}: {place} is no edge_runtime.vehicles.base.Vehicle")
-    if inspect.isabstract(kind):
-        lacking = ", ".join(sorted(kind.__abstractmethods__))
-        raise UserError(f"vehicle {name!r}: {place} is no whole Vehicle: it lacks {lacking}")
     return kind
 
 

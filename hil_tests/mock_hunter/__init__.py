@@ -89,10 +89,10 @@ FAST_S = 0.02
 SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
 STEP_S = 0.005
 _LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
-_BATTERY_V, _IDLE_A, _COOL_C = 27.9, 1.0, 35
-_ENABLED = 1 << 6  # The motors are well, whatever 0x211 shows
-_TURNS = 20.0  # Of a motor, for each metre of path or radian of the inner wheel
-_PULSES = 100.0  # Of its encoder, for each turn
+_BATTERY_V = 27.9
+# The motors stand and are well, whatever 0x211 and 0x221 show.
+_MOTOR_FAST = protocol.MotorFast(speed_rpm=0, current_a=1.0, pulses=0)
+_MOTOR_SLOW = protocol.MotorSlow(_BATTERY_V, driver_c=35, motor_c=35, status=1 << 6)
 _FAULT_BITS = {words: mask for mask, words in protocol.PROFILES["v2"].items()}
 
 
@@ -140,7 +140,7 @@ class MockHunter:
     def __init__(self, parameters: Parameters, now_s: float) -> None:
         self.control, self.brake_locked, self.faults = Control.STANDBY, True, set[str]()
         self.errors: set[str] = set()  # of BITS, as it shows them
-        self.speed_mps = self.inner_rad = self.way_m = self._turning_radps = 0.0
+        self.speed_mps = self.inner_rad = 0.0
         self.next_s = now_s
         self._parameters, self._now_s = parameters, now_s
         self._commanded_s = -math.inf  # when the newest 0x111 came, or CAN control was taken
@@ -240,7 +240,7 @@ class MockHunter:
 
     def _move(self, step_s: float) -> None:
         """Integrate one step towards the set-point, or brake with the steering held."""
-        p, before_rad = self._parameters, self.inner_rad
+        p = self._parameters
         if not self.obeys:
             # Where control comes back, it does so from a stand, not with what was asked before.
             self._setpoint = WheelMotion(0.0, self.inner_rad)
@@ -253,8 +253,6 @@ class MockHunter:
             self.speed_mps += clamp(change_mps, rate_mps2 * step_s)
             turn_rad = clamp(self._setpoint.inner_steering_rad, p.max_inner_rad) - self.inner_rad
             self.inner_rad += clamp(turn_rad, p.steering_rate_radps * step_s)
-        self._turning_radps = (self.inner_rad - before_rad) / step_s
-        self.way_m += self.speed_mps * step_s
 
     def _report(self, now_s: float) -> None:
         with_slow = self._tick % SLOW_EVERY == 0
@@ -272,13 +270,8 @@ class MockHunter:
     def _fast_frames(self) -> list[Sent]:
         """Make 0x221 and 0x251 to 0x253: every 20 ms."""
         speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        motion = protocol.WheelMotion(speed_mps, self.inner_rad)
-        steers, drives = (self._turning_radps, self.inner_rad), (self.speed_mps, self.way_m)
-        found = [protocol.MOTION_STATUS.sent(motion)]
-        for row, (rate, way) in zip(protocol.MOTORS_FAST, (steers, drives, drives), strict=True):
-            turning = protocol.MotorFast(rate * _TURNS * 60, _IDLE_A, way * _TURNS * _PULSES)
-            found.append(row.sent(turning))
-        return found
+        motion = protocol.MOTION_STATUS.sent(protocol.WheelMotion(speed_mps, self.inner_rad))
+        return [motion, *(row.sent(_MOTOR_FAST) for row in protocol.MOTORS_FAST)]
 
     def _slow_frames(self) -> list[Sent]:
         """Make 0x211 and 0x261 to 0x263: every 100 ms."""
@@ -289,6 +282,5 @@ class MockHunter:
             mode = protocol.REMOTE_CONTROL
         faults, counter = sum(_FAULT_BITS[each] for each in words), self._tick // SLOW_EVERY % 256
         status = (self.state, mode, _BATTERY_V, faults, int(self.brake_locked), counter)
-        motor = (_BATTERY_V, _COOL_C, _COOL_C, _ENABLED)
-        motors = [row.sent(motor) for row in protocol.MOTORS_SLOW]
+        motors = [row.sent(_MOTOR_SLOW) for row in protocol.MOTORS_SLOW]
         return [protocol.SYSTEM_STATUS.sent(status), *motors]

@@ -56,23 +56,17 @@ class Reports(streamed.Speeds):
         """Note a frame, unless it is not in the table or of a wrong length."""
         message = protocol.decode(can_id, data)
         if isinstance(message, SystemStatus):
-            self.status = message
-            self._count(message.counter, now_s)
+            was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
+            self.status, self._last_status_s = message, now_s
+            # Up to 127 ahead is newer: frames that are replayed lie behind, and show nobody alive.
+            ahead = (message.counter - self._counter) % COUNTERS
+            if was_silent or 0 < ahead < COUNTERS // 2:
+                self._counter, self.status_s = message.counter, now_s
         elif isinstance(message, WheelMotion):
             self.motion, self.motion_s = message, now_s
             self.note(message.speed_mps, now_s)
         elif isinstance(message, MotorSlow):
             self._motor_faults[can_id] = protocol.motor_faults(can_id, message)
-
-    def _count(self, counter: int, now_s: float) -> None:
-        """Take a status for a sign of life if its counter is ahead of all before, or after silence.
-
-        Up to 127 ahead is newer: frames that are replayed lie behind, and do not count.
-        """
-        was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
-        if was_silent or 0 < (counter - self._counter) % COUNTERS < COUNTERS // 2:
-            self._counter, self.status_s = counter, now_s
-        self._last_status_s = now_s
 
     def is_known_to_stand(self, now_s: float) -> bool:
         return self.stands and now_s - self.motion_s <= self.silence_s
@@ -244,10 +238,6 @@ MULTICAST_GROUP = "239.74.163.2"  # python-can's own
 MULTICAST_BUS = f"{UDP}:{MULTICAST_GROUP}:43113"
 _LISTEN_S, _JOIN_S = 0.1, 0.5
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
-_ADVICE = (
-    "socketcan wants `ip link set CHANNEL up type can bitrate 500000`, udp_multicast needs msgpack"
-    " and a route (`ip route`)"
-)
 
 
 class BusName(NamedTuple):
@@ -283,8 +273,8 @@ def open_bus(name: BusName) -> Any:
     try:
         return can.Bus(interface=name.interface, channel=name.channel, **name.options)
     except Exception as error:  # each backend raises what its library raises, NameError included
-        words = f"{name.interface}:{name.channel} cannot be opened: {error!r}"
-        raise UserError(f"the CAN bus {words}; {_ADVICE}") from None
+        words = f"the CAN bus {name.interface}:{name.channel} cannot be opened: {error!r}"
+        raise UserError(f"{words}; is it up (`ip link set ... up type can`)?") from None
 
 
 class HunterSettings(RobotSettings, frozen=True, kw_only=True):

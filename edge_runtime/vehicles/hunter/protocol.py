@@ -53,9 +53,9 @@ class SystemStatus(NamedTuple):
 class MotorFast(NamedTuple):
     """0x251 to 0x253 (steering, rear right, rear left): how it turns."""
 
-    speed_rpm: float
+    speed_rpm: int
     current_a: float
-    pulses: float
+    pulses: int
 
 
 class MotorSlow(NamedTuple):
@@ -202,12 +202,11 @@ DRIVER_FAULTS = {
 
 def status_faults(status: SystemStatus, profile: str) -> List[str]:
     """Return the faults that 0x211 names, in words."""
-    known = PROFILES[profile]
-    words = [fault for mask, fault in known.items() if status.faults & mask]
-    for bit in range(16):
-        if status.faults & (1 << bit) and 1 << bit not in known:
-            words.append(f"unknown to profile {profile}: byte {5 - bit // 8} bit {bit % 8}")
-    return words
+    return [
+        PROFILES[profile].get(1 << bit, f"unknown to {profile}: byte {5 - bit // 8} bit {bit % 8}")
+        for bit in range(16)
+        if status.faults & (1 << bit)
+    ]
 
 
 def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:
