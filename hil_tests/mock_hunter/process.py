@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from functools import partial
 
 import can
 
@@ -21,6 +22,7 @@ EXAMPLE = examples(
     "python -m hil_tests mock_hunter",
     "python -m hil_tests mock_hunter --bus socketcan:vcan0 --set dead_time_s=0.1",
 )
+_tell = partial(print, flush=True)
 Orders = queue.SimpleQueue[tuple[str, bool]]  # a fault's name, and whether it is switched on
 
 
@@ -95,10 +97,6 @@ def _read_orders(orders: Orders) -> None:
             else:
                 message = f"error: {line.strip()!r} is no order: use NAME on, or NAME off"
                 print(message, file=sys.stderr, flush=True)
-
-
-def _tell(words: str) -> None:
-    print(words, flush=True)
 
 
 def setting(text: str) -> tuple[str, float]:

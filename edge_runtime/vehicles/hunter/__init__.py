@@ -187,9 +187,8 @@ class HunterCore(streamed.StreamedCore):
 
     def is_at_rest(self, now_s: float) -> bool:
         """Return whether it is known to stand, or the bus is dead or the remote control drives."""
-        is_blind = bool(self._bus_words) or self.reports.remote_drives
-        is_off = self.state is VehicleState.DISABLED
-        return is_off or is_blind or self.reports.is_known_to_stand(now_s)
+        is_out = self.state is VehicleState.DISABLED or bool(self._bus_words)
+        return is_out or self.reports.remote_drives or self.reports.is_known_to_stand(now_s)
 
     def _apply(self, finding: Finding, now_s: float) -> None:
         before = self.state
@@ -354,10 +353,9 @@ class HunterVehicle(streamed.StreamedVehicle):
             if message.arbitration_id & _ERROR_BUS_OFF:
                 self._note_bus("bus-off", fatal=True)
             return
-        if message.is_extended_id or message.is_remote_frame or message.is_fd:
-            return  # no frame of this protocol
-        if self._ignores_commands and message.arbitration_id in protocol.COMMAND_IDS:
-            return
+        echoes = self._ignores_commands and message.arbitration_id in protocol.COMMAND_IDS
+        if message.is_extended_id or message.is_remote_frame or message.is_fd or echoes:
+            return  # no frame of this protocol, or our own
         with self._lock:
             was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
@@ -366,6 +364,5 @@ class HunterVehicle(streamed.StreamedVehicle):
             self._wake.set()
 
     def _note_bus(self, error: object, fatal: bool = False) -> None:
-        words = str(error) or type(error).__name__
         with self._lock:
-            self._core.bus_failed(words, time.monotonic(), fatal)
+            self._core.bus_failed(str(error), time.monotonic(), fatal)

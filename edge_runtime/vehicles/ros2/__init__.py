@@ -5,10 +5,9 @@ and two threads around it. The stream's thread publishes what `tick` gives: the 
 frame of each message, and has no stream of its own. Zenoh's thread hands every odometry to `hear`.
 
 A message is CDR behind a header of four bytes that says plain CDR (XCDR version 1), little-endian:
-`00 01 00 00`; a big-endian one is read, too. Each field is aligned to its size, counted from behind
-the header. Types and order of fields are those of common_interfaces' .msg files (the same from
-Humble on); units as there: metres, seconds, radians, x forward, y to the left, positive steering
-and yaw to the left (REP 103).
+`00 01 00 00`. Each field is aligned to its size, counted from behind the header. Types and order of
+fields are those of common_interfaces' .msg files (the same from Humble on); units as there: metres,
+seconds, radians, x forward, y to the left, positive steering and yaw to the left (REP 103).
 """
 
 from __future__ import annotations
@@ -74,7 +73,6 @@ TYPES: Dict[str, str] = {
 }
 
 MAX_PAYLOAD_BYTES = 1024 * 1024
-_ORDERS = {b"\0\0": ">", b"\0\1": "<"}  # the header's first two bytes: the order of bytes
 _LITTLE_ENDIAN = b"\0\1\0\0"
 _ALIGNMENT = 4  # DDS fills a message up to this.
 # Of an odometry: a position, a quaternion, their covariance; two vectors of speed, theirs.
@@ -92,15 +90,14 @@ class Odometry(NamedTuple):
 
 def read_odometry(payload: bytes) -> Optional[Odometry]:
     """Return an odometry whose numbers are all finite; None for anything else. Never raises."""
-    order = _ORDERS.get(payload[:2])
-    if order is None:
+    if payload[:2] != _LITTLE_ENDIAN[:2]:
         return None
     try:
-        sec, nanosec, length = struct.unpack_from(f"{order}iII", payload, 4)
+        sec, nanosec, length = struct.unpack_from("<iII", payload, 4)
         child = 16 + _aligned(length, 4)  # behind the name of the frame
-        (length,) = struct.unpack_from(f"{order}I", payload, child)
+        (length,) = struct.unpack_from("<I", payload, child)
         begin = 4 + _aligned(child + length, 8)  # behind the name of the child frame
-        numbers = struct.unpack_from(f"{order}{_DOUBLES}d", payload, begin)
+        numbers = struct.unpack_from(f"<{_DOUBLES}d", payload, begin)
     except struct.error:
         return None
     # The type is not in the payload: what is left over is the mark of another one.
