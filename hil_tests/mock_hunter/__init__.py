@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -124,11 +124,9 @@ def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
     """Return a model's row with some numbers replaced. Raises UserError for bad numbers."""
     if unknown := changes.keys() - TUNABLE:
         raise UserError(f"no parameter {min(unknown)!r}; choose from {', '.join(TUNABLE)}")
-    made = replace(MODELS[model], **changes)
-    for name, value in asdict(made).items():
-        if not 0.0 < value < math.inf:
-            raise UserError(f"parameter {name} must be above 0 and finite, not {value}")
-    return made
+    if not all(0.0 < value < math.inf for value in changes.values()):
+        raise UserError(f"parameters must be above 0 and finite, not {dict(changes)}")
+    return replace(MODELS[model], **changes)
 
 
 class MockHunter:

@@ -70,21 +70,12 @@ def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading
         if (words := hunter.describe()) != said:
             said = words
             _tell(f"chassis t={time.monotonic():.6f} {words}")
-        _listen(hunter, bus)
-
-
-def _listen(hunter: MockHunter, bus: can.BusABC) -> None:
-    """Take what comes until the next report is due: one frame, or none."""
-    with contextlib.suppress(can.CanError):  # what a socket cannot unpack is no frame
-        message = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
-        # The chassis has data frames with an 11-bit identifier only.
-        if message and not (
-            message.is_extended_id
-            or message.is_remote_frame
-            or message.is_error_frame
-            or message.is_fd
-        ):
-            hunter.receive(message.arbitration_id, bytes(message.data), time.monotonic())
+        with contextlib.suppress(can.CanError):  # what a socket cannot unpack is no frame
+            heard = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
+            if heard is None or heard.is_extended_id or heard.is_remote_frame or heard.is_fd:
+                continue  # the chassis has data frames with an 11-bit identifier only
+            if not heard.is_error_frame:
+                hunter.receive(heard.arbitration_id, bytes(heard.data), time.monotonic())
 
 
 def _read_orders(orders: Orders) -> None:
