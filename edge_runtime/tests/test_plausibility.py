@@ -4,12 +4,10 @@ import math
 
 import pytest
 from hil_tests.testing.policies import T
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.mock import MockParameters, MockVehicle
+from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.plausibility import (
     DEVIATES_S,
     FOLLOWS_S,
@@ -132,25 +130,6 @@ def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     for after_s, fault in ((0.2, Fault.LYING), (0.4, Fault.LYING), (0.55, None)):
         watch.report(report(speed_mps=9.0), now_s + after_s)
         assert watch.fault(now_s + after_s) is fault
-
-
-@given(st.lists(st.floats(-1, 1), min_size=1, max_size=30))
-def test_the_mock_stays_within_its_limits_and_is_never_accused(pedals):
-    """Whatever a policy asks at the control rate, reported at the feedback's."""
-    vehicle, watch = MockVehicle(), VehicleWatch(T, MockVehicle.limits)
-    vehicle.control_period_s = T
-    vehicle.enable(0.0)
-    watch.begin(0.0)
-    for step, pedal in enumerate(pedals):
-        for now_s in (step * T, step * T + TICK_S):
-            if now_s == step * T:
-                for asked in (vehicle, watch):
-                    asked.command({"pedal": pedal, "steering": 0.0}, now_s)
-            said = vehicle.feedback(now_s)
-            assert -1.0 - 1e-9 <= said.action["pedal"] <= 1.0 + 1e-9
-            assert 0.0 <= said.speed_mps <= MockParameters().max_speed_mps
-            watch.report(said, now_s)
-            assert watch.fault(now_s) is None
 
 
 SPEED = [
