@@ -54,7 +54,7 @@ class Drivers(ProcessPoolExecutor):
         self._ends.update(result.outcome for result in results)
         # A step limit is a timeout as soon as the end of any other drive was reported.
         if UNKNOWN in self._ends or len(self._ends) == 1:
-            raise UserError("the environment has neither outcome nor is_success in its info")
+            raise UserError("no outcome or is_success in info tells whether it succeeded")
         return [
             replace(result, outcome=TIMEOUT) if result.outcome == TRUNCATED else result
             for result in results
