@@ -86,17 +86,6 @@ class TestRos2(VehicleConformance):
 class TestMock(VehicleConformance):
     latches_silence = False
 
-    def test_lag_by_hand(self):
-        """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
-        rig = MockRig(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9).enabled()
-        rig.core.command({"pedal": 1.0, "steering": 1.0}, rig.now_s)
-        after = rig.step(5).report
-        assert after.action["pedal"] == pytest.approx(1 - 2 * math.exp(-1))
-        assert after.action["steering"] == pytest.approx(1 - math.exp(-1))
-        pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
-        speed_mps = sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005
-        assert after.speed_mps == pytest.approx(speed_mps)
-
     def test_it_is_no_quicker_than_the_policys_car_or_that_of_the_settings(self):
         fast = {"max_speed_mps": 8.0, "throttle_mps2": 2.0}
         for car, ours, most in ((CAR, {}, 5.0), (None, {}, 6.0), (CAR, fast, 8.0)):

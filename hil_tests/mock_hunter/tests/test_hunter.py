@@ -2,6 +2,7 @@
 
 import pytest
 
+from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter import BITS, MODELS, MockHunter
 
 P = MODELS["hunter-2.0"]
@@ -139,12 +140,12 @@ def test_a_person_and_the_brake_outrank_the_bus_and_give_control_back(name, byte
     assert not bench.run(0.5, FAST_AHEAD).stands
 
 
-def test_back_on_the_bus_it_does_not_drive_what_it_last_heard():
-    """A multicast bus brings its own reports back to it, before the first new command."""
-    bench = enabled()
-    bench.switch("bus_off")
-    bench.run(1.5, STOP)
-    bench.switch("bus_off", on=False)
-    bench.send((0x221, bytes(8)), (0x211, bytes(8)))
-    assert all(bench.run(0.01, STOP).stands for _ in range(50))
-    assert bench.status[1] == 1  # the trap: it has control again
+def test_as_a_process_it_obeys_orders_and_ends_on_a_signal():
+    chassis = ChassisProcess(free_bus())
+    with chassis.process:
+        for words in ("meteor on", "\udcff"):  # the second is no UTF-8
+            chassis.process.tell(words)
+            chassis.process.wait_for_line("is no order")
+        chassis.switch("remote", True)
+        chassis.process.wait_for_line("control=remote ")
+    assert chassis.process.end() == 0
