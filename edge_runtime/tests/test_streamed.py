@@ -52,17 +52,6 @@ def test_two_periods_of_the_policy_hold_a_command_and_miss_feedback(
     assert rig.core._heard.silence_s == pytest.approx(silence_s)
 
 
-def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
-    rig.enabled()
-    assert rig.report.action["pedal"] == -1.0
-    rig.obeys = False
-    rig.step(20, PEDAL)
-    assert rig.report.action["pedal"] == 0.0
-    rig.core.brake(rig.now_s, latch=False)
-    assert rig.report.commanded_speed_mps == 0.0
-    assert rig.step().report.action["pedal"] == -1.0
-
-
 def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig):
     rig.driving().talks = False
     count = len(rig.asked)

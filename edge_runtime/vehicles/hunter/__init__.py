@@ -273,7 +273,7 @@ def open_bus(name: BusName) -> Any:
         return can.Bus(interface=name.interface, channel=name.channel, **name.options)
     except Exception as error:  # each backend raises what its library raises, NameError included
         words = f"the CAN bus {name.interface}:{name.channel} cannot be opened: {error!r}"
-        raise UserError(f"{words}; is it up (`ip link set ... up type can`)?") from None
+        raise UserError(f"{words}; is it up, with a route (`ip link`, `ip route`)?") from None
 
 
 class HunterSettings(RobotSettings, frozen=True, kw_only=True):
