@@ -125,6 +125,10 @@ class ControlLoop:
             self._send(self._controller.farewell())
         return not self._worker.is_alive()
 
+    def has_heard(self) -> bool:
+        """Return whether any state has come, also one that was rejected."""
+        return bool(self._latest.accepted or self._latest.rejected)
+
     def health(self) -> Health:
         """Make the message of the health topic and of the status query."""
         with self._lock:

@@ -1,7 +1,11 @@
-"""The far end's certificate, and ports to listen at, with Python's own socket and ssl."""
+"""Why there is no link, the far end's certificate, and ports to listen at.
+
+All of it with Python's own socket and ssl.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import ssl
@@ -12,8 +16,42 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import Reason, Rejection
 
 _LOOK_S = 1.0
+# A server that refuses a client's certificate says so after the handshake (TLS 1.3).
+_ALERT_S = 0.3
 _KEPT: List[socket.socket] = []
 _MOST_KEPT = 100
+
+
+def why_no_link(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
+    """Return whether anybody answers at `endpoint`, and the error of a link; "" if there is none.
+
+    Zenoh says "Unable to connect" for every cause. Of udp this knows nothing.
+    """
+    protocol, host, port = _parts(endpoint)
+    answers = False
+    try:
+        if protocol != "udp":
+            with socket.create_connection((host, port), timeout=_LOOK_S) as plain:
+                answers = True
+                if files is not None:
+                    _shake_hands(plain, host, files)
+    except (OSError, UnicodeError) as error:  # UnicodeError: no host can have such a name
+        return answers, str(error)
+    return answers, ""
+
+
+def _shake_hands(plain: socket.socket, host: str, files: TlsFiles) -> None:
+    with _context(files).wrap_socket(plain, server_hostname=host) as link:
+        link.settimeout(_ALERT_S)
+        with contextlib.suppress(socket.timeout):  # it is silent: we are let in
+            link.recv(1)
+
+
+def _context(files: TlsFiles) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies, no more strictly than Zenoh does
+    context.load_verify_locations(files.ca)
+    context.load_cert_chain(files.certificate, files.key)
+    return context
 
 
 class Listener:
@@ -39,12 +77,9 @@ class Listener:
     def look(self) -> None:
         """Read the certificate that the listener shows now; one that shows none keeps its last."""
         _, host, port = _parts(self._endpoint)
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # no more strictly than Zenoh does
-        context.load_verify_locations(self._files.ca)
-        context.load_cert_chain(self._files.certificate, self._files.key)
         try:
             plain = socket.create_connection((host, port), timeout=_LOOK_S)
-            with plain, context.wrap_socket(plain, server_hostname=host) as link:
+            with plain, _context(self._files).wrap_socket(plain, server_hostname=host) as link:
                 shown: Any = link.getpeercert()
         except ssl.SSLCertVerificationError as error:
             self._until_s, self._why = -math.inf, f"is not believed here: {error.verify_message}"

@@ -17,7 +17,7 @@ from edge_runtime.controller import Controller, ControllerConfig, shared_limits
 from edge_runtime.link import Link, link_words, require_free, taken
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
-from edge_runtime.reach import Listener
+from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
 from edge_runtime.transport import is_tls, open_session
 from edge_runtime.util import PathLike, ends_within, printable
@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # Loaded only where there is a vehicle.
 
 
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
+_WAITING_PERIOD_S = 10.0
 
 EXAMPLE = r"""examples:
   python -m edge_runtime run --policy my.onnx --public-key keys/policy.pub
@@ -149,6 +150,7 @@ class _Runtime:
             hold=hold,
             rearm_command=rearm_command(config.connect, config.vehicle_id),
         )
+        self._over = threading.Event()
         self._failures: List[BaseException] = []
 
     def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
@@ -182,7 +184,7 @@ class _Runtime:
         self._loop.stop()
 
     def _announce(self) -> None:
-        """Show that it is there, and print "ready"."""
+        """Show that it is there, print "ready", and log what keeps states away."""
         config, policy = self._config, self._policy
         try:
             self._link.appear(self._open_client, self._loop.stop)
@@ -196,12 +198,17 @@ class _Runtime:
                 flush=True,
             )
             self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
+            while not self._over.wait(_WAITING_PERIOD_S) and not self._loop.has_heard():
+                answers, why = why_no_link(config.connect, self._tls)
+                state = f"answers, and sends no state for {config.vehicle_id}" if answers else why
+                log.event("warning", "waiting", why=f"{config.connect}: {state}")
         except BaseException as error:  # the main thread raises it
             self._failures.append(error)
             self._loop.stop()
 
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
+        self._over.set()
         self._notifier.tell("STOPPING=1")
         ended = self._loop.close()
         if self._vehicle is not None:

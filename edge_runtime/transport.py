@@ -13,7 +13,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.reach import check_port_is_free
+from edge_runtime.reach import check_port_is_free, why_no_link
 from edge_runtime.tls import TlsFiles, load_tls
 from edge_runtime.util import PathLike, UserError
 
@@ -79,14 +79,21 @@ def open_session(
     config = zenoh.Config()
     for name, value in session_rows(listens, connect, mode, tls, access).items():
         config.insert_json5(name, json.dumps(value))
+    link = f"link to {connect}" if tls is None else f"TLS link to {connect} as {tls.name}"
     try:
-        return zenoh.open(config)
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         if connect is None or listens:
             raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
-    link = "link" if tls is None else f"TLS link as {tls.name}"
-    first = "start the simulator or router there first, or name another address with --connect"
-    raise UserError(f"nobody answers at {connect} for a {link}; {first}")
+        why = why_no_link(connect, tls)[1]
+        first = "start the simulator or router there first, or name another address with --connect"
+        raise UserError(f"no {link}{why and f' ({why})'}; {first}") from None
+    if connect is not None and tls is not None and not listens:
+        answers, why = why_no_link(connect, tls)  # A peer would go on trying for ever.
+        if answers and why:
+            session.close()
+            raise UserError(f"no {link}: {why}")
+    return session
 
 
 def session_rows(

@@ -17,7 +17,7 @@ ROWS = [
     ("simulate --env ::", "module:id"),
     ("simulate --env TOY --vehicle-id a/b", "vehicle id"),
     ("simulate --env TOY --connect here", "endpoint"),
-    ("simulate --env TOY --connect FREE --wait-edge-s 0", "nobody answers"),
+    ("simulate --env TOY --connect FREE --wait-edge-s 0", "no link"),
     ("simulate --env TOY --listen FREE --wait-edge-s 0", "python -m edge_runtime run"),
     ("simulate --env TOY --listen BUSY --out r.json", "in use"),
     ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),

@@ -3,9 +3,11 @@
 import contextlib
 import fcntl
 import itertools
+import os
 import re
 import signal
 import time
+from typing import Any
 
 import pytest
 from hil_tests.processes import Process, wait_until
@@ -106,6 +108,68 @@ def test_a_runtime_without_a_vehicle_from_its_first_state_to_its_end(
     assert time.monotonic() - begun_s < 5.0
     assert "Traceback" not in edge.errors
     wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
+
+
+def test_a_reader_that_stands_still_holds_neither_the_watchdog_nor_the_end(make_policy):
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while os.write(writer, bytes(4096)):
+            pass
+    os.set_blocking(writer, True)
+    endpoint = free_endpoint()
+    run = ["run", *make_policy("constant").flags, "--connect", endpoint, "--vehicle", "mock"]
+    options: Any = {"stdout": writer, "stderr": writer}
+    with Simulator(endpoint) as simulator, Process("edge_runtime", *run, **options) as edge:
+        simulator.wait_for_edge()
+        assert drive(simulator, range(15))[0].mode == "drive"
+        assert command_of_reason(simulator, "no_fresh_state").mode == "safe_stop"
+        assert simulator.query("status")["mode"] == "safe_stop"
+        assert edge.end() == 0
+    os.close(reader)
+    os.close(writer)
+
+
+BUSY = """
+import os, time
+from edge_runtime.vehicles.mock import MockVehicle
+
+class Busy(MockVehicle):
+    def feedback(self, now_s):
+        if os.path.exists("busy"):
+            os.remove("busy")
+            time.sleep(0.8)
+        return super().feedback(now_s)
+    def brake(self, now_s, latch=True):
+        self.note("brake")
+        super().brake(now_s, latch)
+    def close(self):
+        self.note("close")
+        while os.path.exists("hangs"):
+            time.sleep(0.01)
+    def note(self, word):
+        with open("calls", "a") as calls:
+            calls.write(word + chr(10))
+"""
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_vehicle_is_left_braked_and_closed_or_the_log_says_that_it_hangs(
+    make_policy, tmp_path, hangs
+):
+    (tmp_path / "busy_vehicle.py").write_text(BUSY)
+    flags, endpoint = make_policy("constant").flags, free_endpoint()
+    arguments = [*flags, "--connect", endpoint, "--vehicle", "busy_vehicle:Busy"]
+    with Simulator(endpoint) as simulator, run_edge(*arguments, cwd=tmp_path) as edge:
+        simulator.wait_for_edge()
+        drive(simulator, range(5))
+        (tmp_path / "busy").touch()
+        if hangs:
+            (tmp_path / "hangs").touch()
+        wait_until(lambda: not (tmp_path / "busy").exists(), "the driver to be busy")
+        assert edge.end() == 0
+        assert (tmp_path / "calls").read_text().split()[-2:] == ["brake", "close"]
+        assert (" driver_hangs " in edge.errors) == hangs
 
 
 HELD = """
