@@ -9,7 +9,7 @@ from edge_runtime.cli import program, run_cli
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
-    "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
+    "record": ("bridge.ports:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
     "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and drive on in another way"),
     "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),

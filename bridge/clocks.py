@@ -1,8 +1,8 @@
 """The clocks: each carries one tick's state out and brings the vehicle's decision back.
 
-In lock-step latency passes in virtual time (`virtual_link.py`): states are published in their
-virtual order of arrival, and each real answer is awaited before it goes its virtual way back.
-Computing takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
+In lock-step latency passes in virtual time (`VirtualLink`): states are published in their virtual
+order of arrival, and each real answer is awaited before it goes its virtual way back. Computing
+takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
 
 Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
 after the episode's start; its state goes out through the delay line, and the vehicle acts at the
@@ -20,21 +20,25 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import msgspec
 
-from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.network import LatencyModel, LatencySpec, make_network
-from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
-from bridge.virtual_link import (
+from bridge.inbound import (
     BRAKE_PERIODS,
-    COMMAND_WINDOW,
-    Arrival,
+    CommandCheck,
     CommandHold,
     Decision,
-    VirtualLink,
+    FeedbackCheck,
 )
+from bridge.network import (
+    COMMAND_WINDOW,
+    Arrival,
+    LatencyModel,
+    LatencySpec,
+    VirtualLink,
+    make_network,
+)
+from bridge.report import STANDSTILL_MPS, VehicleLog
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
@@ -43,6 +47,9 @@ from edge_runtime.wire import SAFE_STOP, Command, Feedback, Reason, State, encod
 Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must not block
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Stop reasons of wall time. In lock-step they mean that the machine stalled."""
+POLL_S = 0.02
+STANDSTILL_WAIT_S = 5.0
+"""Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
 
 
 @dataclass(eq=False)
@@ -58,10 +65,8 @@ class _Clock:
     task: Task
     latencies_ms: list[float] = field(default_factory=list)
     """From state sent to command received, injected delays included; one per answered state."""
-    tick_overruns: int = 0
-    """Ticks that began so late that the simulation slipped behind the wall clock."""
     missed_ticks: int = 0
-    """Whole ticks of the wall clock that went by without a state because of it."""
+    """Whole ticks of the wall clock that went by without a state because the machine was late."""
     wall_clock_stalls: int = 0
     """States of lock-step that the edge runtime answered too late in wall time, not at all, or with
     a stop for that: it was gone or starved. Always 0 in real time."""
@@ -103,7 +108,7 @@ class LockStepClock(_Clock):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def begin(self, episode: int, seed: int) -> None:
         self.check.begin(episode)
@@ -120,7 +125,7 @@ class LockStepClock(_Clock):
         self._edge_silent = False
 
     def receive(self, payload: bytes) -> None:
-        self._inbox.put((payload, time.monotonic()))
+        self._inbox.put(payload)
 
     def exchange(self, state: State) -> Decision:
         """Let virtual time run from this tick to the end of its command window."""
@@ -128,24 +133,23 @@ class LockStepClock(_Clock):
         self._link.send_state(state.step, state)
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
-        return self._link.decide(time.monotonic() - self._heard_s if self._edge_silent else None)
+        return self._link.decide(self._edge_silent)
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = self._stamped(arrival.message)
         # What came between two ticks is read all the same, so that faults are counted.
         while not self._inbox.empty():
-            self.check.read(self._inbox.get()[0], time.time_ns())
+            self.check.read(self._inbox.get(), time.time_ns())
         published_s = time.monotonic()
         self.publish(payload)
         if arrival.overtaken:
             return  # The edge runtime rejects it as stale, as it should, and does not answer.
-        if (answer := self._await_answer(arrival.step, published_s)) is not None:
-            command, received_s = answer
-            self._link.answer(arrival, command, computing_s=received_s - published_s)
+        if (command := self._await_answer(arrival.step, published_s)) is not None:
+            self._link.answer(arrival, command, computing_s=self._heard_s - published_s)
 
-    def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
-        """Wait in wall time for the answer to exactly this state; return it with its arrival.
+    def _await_answer(self, step: int, published_s: float) -> Command | None:
+        """Wait in wall time for the answer to exactly this state.
 
         At most until 2 T after the last answer, and T after this state at least. Once the edge
         runtime is silent, T for each state is also the pace of the braking steps.
@@ -156,15 +160,15 @@ class LockStepClock(_Clock):
             deadline_s = max(deadline_s, self._heard_s + self._silence_s)
         while (wait_s := deadline_s - time.monotonic()) > 0:
             try:
-                payload, received_s = self._inbox.get(timeout=wait_s)
+                payload = self._inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
             if (command := self.check.read(payload, time.time_ns())) is None:
                 continue
             if command.step == step:
-                self._heard_s, self._edge_silent = received_s, False
+                self._heard_s, self._edge_silent = time.monotonic(), False
                 self.wall_clock_stalls += command.reason in WALL_CLOCK_REASONS
-                return command, received_s
+                return command
             if command.mode != SAFE_STOP:  # In safe stop the edge repeats its last answer.
                 self.check.reject(Reason.STALE.value)
         self._edge_silent = True
@@ -236,7 +240,6 @@ class RealTimeClock(_Clock):
         tick_s = self._start_s + step * self._period_s
         late_s = time.monotonic() - tick_s
         if late_s > self._window_s:
-            self.tick_overruns += 1
             self.missed_ticks += int(late_s / self._period_s)
             self._start_s += late_s
             return tick_s + late_s
@@ -248,47 +251,31 @@ class RealTimeClock(_Clock):
         with self._arrived:
             if (command := self.check.read(payload, time.time_ns())) is None:
                 return
-            answered_step, sent_s = self._hold.newest_step, self._sent_s[command.step]
-            if not self._hold.admit(command, now_s, sent_s):
+            answered_step = self._hold.newest_step
+            if not self._hold.admit(command, now_s):
                 self.check.reject(Reason.STALE.value)
                 return
             if command.step > answered_step:
-                self.latencies_ms.append((now_s - sent_s) * 1e3)
-            self._admitted(command)
+                self.latencies_ms.append((now_s - self._sent_s[command.step]) * 1e3)
             self._arrived.notify()
-
-    def _admitted(self, command: Command) -> None:
-        pass  # The caller holds the condition.
-
-
-POLL_S = 0.02
-STANDSTILL_WAIT_S = 5.0
-"""Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
 
 
 class VehicleClock(RealTimeClock):
-    """The clock of ``--loop vehicle``. ``tracking`` keeps what was asked, and what became of it."""
+    """The clock of ``--loop vehicle``; ``log`` keeps what the vehicle said of itself."""
 
     def __post_init__(self) -> None:
-        self.tracking = TrackingLog()
-        self.feedback_ages_ms: list[float] = []
-        """At each tick's end, of the feedback that moved the car."""
-        self.moving_starts = 0
+        self.log = VehicleLog()
         self.feedback_check = FeedbackCheck(self.check)
         super().__post_init__()
-        self.tracking.end()  # No episode has begun.
 
     def begin(self, episode: int, seed: int) -> None:
         super().begin(episode, seed)
         with self._arrived:
             # Its own stream, so that commands meet the same luck as without it.
             self._feedback_way = make_network(self.spec, seed + 1).down
-            self.tracking.begin()
 
     def receive_feedback(self, payload: bytes) -> None:
-        received_s = time.monotonic()
-        arrive = partial(self._feedback_arrives, received_s=received_s)
-        self._send(self._feedback_way, payload, arrive)
+        self._send(self._feedback_way, payload, self._feedback_arrives)
 
     def wait_for_vehicle(self, limit_s: float, vehicle_id: str) -> None:
         """Wait until the vehicle reports; UserError after ``limit_s``."""
@@ -299,21 +286,12 @@ class VehicleClock(RealTimeClock):
             )
 
     def wait_for_standstill(self) -> None:
-        """Wait until the vehicle stands; where it does not, count that and go on."""
-        self.moving_starts += not self._wait_until(
-            lambda feedback: abs(feedback.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S
-        )
+        """Wait until the vehicle stands, or STANDSTILL_WAIT_S are over."""
+        self._wait_until(lambda told: abs(told.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S)
 
     def rejected(self) -> Counter[str]:
         feedback = dict(self.feedback_check.rejected).items()
         return super().rejected() + Counter({f"feedback_{name}": n for name, n in feedback})
-
-    def report(self) -> dict[str, Any]:
-        return {
-            **self.tracking.report([row.name for row in self.task.action]),
-            "feedback_age_ms": quantiles(self.feedback_ages_ms),
-            "moving_starts": self.moving_starts,
-        }
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and at the next tick say what the vehicle has done."""
@@ -321,26 +299,13 @@ class VehicleClock(RealTimeClock):
         time.sleep(max(0.0, end_s - time.monotonic()))
         with self._arrived:
             now_s = time.monotonic()
-            heard = self._hold.decide(now_s)
-            decision = self.feedback_check.decide(heard, state.episode, now_s)
-        if decision.feedback_age_s is not None:
-            self.feedback_ages_ms.append(decision.feedback_age_s * 1e3)
-        return decision
+            return self.feedback_check.decide(self._hold.decide(now_s), state.episode, now_s)
 
-    def finish(self, state: State) -> None:
+    def _feedback_arrives(self, payload: bytes) -> None:
         with self._arrived:
-            self.tracking.end()
-        super().finish(state)
-
-    def _admitted(self, command: Command) -> None:
-        self.tracking.command(command)
-
-    def _feedback_arrives(self, payload: bytes, received_s: float) -> None:
-        now_s = time.monotonic()
-        with self._arrived:
-            feedback = self.feedback_check.read(payload, now_s, received_s)
+            feedback = self.feedback_check.read(payload, time.monotonic())
             if feedback is not None:
-                self.tracking.feedback(feedback)
+                self.log.observe(feedback)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Return whether a feedback, of any session, satisfies ``holds`` before ``limit_s``."""

@@ -1,9 +1,8 @@
 """``python -m bridge fork``: rebuild a recorded drive up to a moment, and drive on in another way.
 
-The scene is rebuilt from its seed and from the action of every step; each step is compared with the
-recorded one, to the bit. From the fork on it is an ordinary drive in lock-step: a policy inside the
-edge runtime's decision logic, behind a network that has carried the recorded commands until then.
-So the same policy behind the same network repeats a drive of lock-step.
+The scene is rebuilt from its seed and from the action of every step; each observation is compared
+with the recorded one, to the bit. From there it is an ordinary drive in lock-step, with a policy
+inside the edge runtime's decision logic in this process.
 
 A person forks a drive in the trainer: the bridge imports nothing of it, and runs its command.
 """
@@ -13,7 +12,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import tempfile
 from argparse import Namespace
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
@@ -25,25 +23,29 @@ import msgspec
 import numpy as np
 
 from bridge.clocks import LockStepClock
-from bridge.environments import Adapter, Environment, describe, make_environment, scene_of
-from bridge.episode import EpisodeRunner, policy_action
-from bridge.inbound import CommandCheck
-from bridge.messages import ENCODER, STAMPS, Heard, Origin, Scene
+from bridge.environments import Adapter, Environment, describe, make_environment
+from bridge.inbound import CommandCheck, Decision
+from bridge.messages import Heard, Origin, Scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
-from bridge.record import RecordingWriter, new_recording
-from bridge.recording import Recording, choose_vehicle, valid_messages
+from bridge.recording import (
+    Recording,
+    RecordingWriter,
+    choose_vehicle,
+    valid_messages,
+    whole_recording,
+)
 from bridge.replay import controller_of
 from bridge.report import EpisodeResult
-from bridge.virtual_link import Arrival, Decision
+from bridge.simulate import EpisodeRunner, policy_action
 from edge_runtime import cli
 from edge_runtime.config import add_trust
 from edge_runtime.controller import Received, shared_limits
-from edge_runtime.files import write_atomic, write_json_out
+from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.util import UserError, counted, name_in_file, printable
-from edge_runtime.wire import DRIVE, Command, State, encode
+from edge_runtime.wire import Command, State, decode_state, encode
 
 
 @dataclass
@@ -57,35 +59,15 @@ class RecordedEpisode:
     episode: int
     task: Task
     began_ns: int
-    scenes: dict[int, bytes] = field(default_factory=dict)  # As `_own_scene` returns them
-    states: dict[int, list[State]] = field(default_factory=dict)  # A network loses and repeats
+    states: dict[int, State] = field(default_factory=dict)
     commands: dict[int, Command] = field(default_factory=dict)  # First answer to each state
     applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
     """Of each step: the action, and whether the brake was pressed."""
-
-    def take(self, payload: bytes, message: Any) -> None:
-        origin = message.origin if isinstance(message, Scene) else message
-        key = getattr(origin, "session", None), getattr(message, "episode", None)
-        if key != (self.origin.session, self.episode):
-            return
-        if isinstance(message, State):
-            self.states.setdefault(message.step, []).append(message)
-        elif isinstance(message, Command):
-            self.commands.setdefault(message.step, message)
-        elif isinstance(message, Scene):
-            self.scenes[message.step] = _own_scene(payload)
-            action = message.applied or []
-            if len(action) == len(self.task.action) and np.isfinite(action).all():
-                self.applied[message.step - 1] = action, message.braked
 
     @property
     def steps(self) -> int:
         """How many steps from the first on have a recorded action."""
         return next(n for n in range(len(self.applied) + 1) if n not in self.applied)
-
-    @property
-    def ended(self) -> bool:
-        return any(state.final for state in self.states.get(self.steps, ()))
 
     def step_at(self, at_s: float) -> int:
         """Return the first step from that time on; UserError where it is not recorded."""
@@ -107,52 +89,33 @@ class RecordedEpisode:
             raise UserError(f"{self.path} was driven in {self.task.text!r}, and {name} is {now!r}")
         return made
 
-    def check(self, step: int, observation: dict[str, bytes], environment: Any) -> None:
-        differs = {
-            f"the observation {name!r}"
-            for state in self.states.get(step, ())
-            for name, data in observation.items()
-            if state.observation.get(name) != data
-        }
-        known, scene = self.scenes.get(step), scene_of(environment)
-        if known is not None and scene is not None and _own_scene(ENCODER.encode(scene)) != known:
-            differs.add("the scene")
-        if differs:
-            where = f"at step {step} ({step * self.task.control_period_s:g} s)"
-            why = f"{where} {min(differs)} is another than recorded"
-            raise UserError(f"{self.path}: the drive cannot be rebuilt: {why}")
-
-    def redo(self, step: int, adapter: Adapter) -> np.ndarray:
-        action, braked = self.applied[step]
-        adapter.press_brake(braked)
-        return adapter.within(action)
-
-
-def _own_scene(payload: bytes) -> bytes:
-    fields = msgspec.msgpack.decode(payload)
-    return msgspec.msgpack.encode({n: v for n, v in fields.items() if n not in STAMPS})
-
 
 def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
     """Read an episode; ``number`` None: the only one."""
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
-    begun: dict[tuple[str, int], tuple[Origin, int, Task, int]] = {}
+    drives: dict[tuple[str, int], RecordedEpisode] = {}
     for heard, message in valid_messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:
-            about = message.origin, message.episode, message.task, heard.arrived_ns
-            begun.setdefault((message.origin.session, message.episode), about)
+            origin, episode = message.origin, message.episode
+            about = origin, episode, message.task, heard.arrived_ns
+            begun = RecordedEpisode(path, vehicle_id, len(drives), *about)
+            begun = drives.setdefault((origin.session, episode), begun)
+            if len(message.applied or ()) == len(begun.task.action):
+                begun.applied[message.step - 1] = list(message.applied or ()), message.braked
+        elif isinstance(message, State | Command):
+            drive = drives.get((message.session, message.episode))
+            if drive is not None and number in (None, drive.number):
+                kept: dict[int, Any] = drive.states
+                if isinstance(message, Command):
+                    kept = drive.commands
+                kept.setdefault(message.step, message)
     recording.say_missing()
-    if not begun:
-        raise UserError(f"{path} does not say how its drives were begun: it holds no scenes")
-    number = 0 if number is None and len(begun) == 1 else number
-    if number is None or number >= len(begun):
-        which = f"--episode says which, 0 to {len(begun) - 1}"
-        raise UserError(f"{path} holds {counted(len(begun), 'drive')}; {which}")
-    drive = RecordedEpisode(path, vehicle_id, number, *list(begun.values())[number])
-    for heard, message in valid_messages(recording, vehicle_id):
-        drive.take(heard.payload, message)
-    return drive
+    number = 0 if number is None and len(drives) == 1 else number
+    if number is None or number >= len(drives):
+        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
+        raise UserError(f"{path} holds {which}")
+    return list(drives.values())[number]
 
 
 class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -166,22 +129,29 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
         return getattr(self.env, name)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Rebuild the drive; UserError where an observation is another than the recorded one."""
         drive, adapter = self._drive, Adapter(self.env, self._drive.task)
         options = {"standing": True} if drive.origin.standing else None
         seen, info = self.env.reset(seed=drive.origin.seed, options=options)
-        for step in range(self._fork):
-            drive.check(step, adapter.pack(seen), self.env)
-            seen, *_, info = self.env.step(drive.redo(step, adapter))
-        drive.check(self._fork, adapter.pack(seen), self.env)
+        for step in range(self._fork + 1):
+            known = drive.states.get(step)
+            if known is not None and known.observation != adapter.pack(seen):
+                at = f"at step {step} ({step * drive.task.control_period_s:g} s)"
+                why = f"{at} the observation is another than recorded"
+                raise UserError(f"{drive.path}: the drive cannot be rebuilt: {why}")
+            if step < self._fork:
+                action, braked = drive.applied[step]
+                adapter.press_brake(braked)
+                seen, *_, info = self.env.step(adapter.within(action))
         adapter.press_brake(False)
         return seen, info
 
 
 class ForkedDrive(LockStepClock):
-    """A recorded drive in virtual time: as recorded before step ``fork``, then by ``policy``.
+    """A drive in lock-step from step ``fork`` of a recorded one, with a policy in this process.
 
-    It publishes nothing. ``network`` carries what is sent from the fork on (None: the recorded
-    network); ``out`` records the drive. Without a policy, ``fork`` must be the drive's end.
+    ``network`` None: as recorded. ``out`` records the drive. Until its first command arrives the
+    vehicle goes on with the last recorded action.
     """
 
     def __init__(
@@ -189,111 +159,65 @@ class ForkedDrive(LockStepClock):
         drive: RecordedEpisode,
         environment: Environment,
         fork: int,
-        policy: Policy | None = None,
+        policy: Policy,
         network: LatencySpec | None = None,
         out: RecordingWriter | None = None,
     ) -> None:
-        self._drive, self._environment, self._fork, self._out = drive, environment, fork, out
-        self._recorded, task, self._step = parse_spec(drive.origin.latency), drive.task, 0
-        self.network, self._policy, self._now_s = network or self._recorded, policy, 0.0
-        self.first_difference: int | None = None
-        """The first step whose action or brake is not as recorded."""
-        if policy is not None:
-            if policy.manifest.text != task.text:
-                theirs = policy.manifest.text
-                raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {task.text!r}")
-            task = msgspec.structs.replace(task, action=policy.manifest.action)
-            plans = max((len(command.plan or ()) for command in drive.commands.values()), default=0)
-            limits = shared_limits(policy.manifest.action, {})
-            self._controller = controller_of(policy, limits, plans, needs_rearm=False)
-        super().__init__(lambda payload: None, CommandCheck("", task), self._recorded, task)
+        if policy.manifest.text != drive.task.text:
+            theirs = policy.manifest.text
+            raise UserError(f"the policy is for {theirs!r}, {drive.path} is of {drive.task.text!r}")
+        self._drive, self._fork, self._policy, self._out = drive, fork, policy, out
+        self._environment = ForkedEnvironment(environment, drive, fork)
+        limits = shared_limits(policy.manifest.action, {})
+        self._controller = controller_of(policy, limits, drive.commands.values())
+        self._newest, self._now_ns = -1, drive.began_ns
+        task = msgspec.structs.replace(drive.task, action=policy.manifest.action)
+        network = network or parse_spec(drive.origin.latency)
+        super().__init__(self._answer, CommandCheck("fork", task), network, task)
 
     def run(self) -> EpisodeResult:
-        """Drive to the end. UserError where the drive cannot be rebuilt until the fork."""
-        changed = {"session": "fork", "latency": str(self.network)}
+        """Drive to the end; UserError where the drive cannot be rebuilt until the fork."""
+        changed = {"session": "fork", "latency": str(self.spec)}
         origin = msgspec.structs.replace(self._drive.origin, **changed)
-        shown = self._show, lambda *_: None
-        runner = EpisodeRunner(self._environment, self, *shown, self.task, origin, self._apply)
-        result = runner.run(0, origin.seed)
-        if result.steps <= self._fork:
-            self._drive.check(result.steps, self._last.observation, self._environment)
-        if result.steps < self._fork or (self._policy is None and result.steps > self._fork):
-            raise UserError(f"{self._drive.path}: the drive cannot be rebuilt: it ends elsewhere")
-        return result
-
-    def exchange(self, state: State) -> Decision:
-        """Compare the state with the recorded one until the fork, and go on as in lock-step."""
-        self._step = state.step
-        if state.step <= self._fork:
-            self._drive.check(state.step, state.observation, self._environment)
-        if state.step == self._fork and self.network != self._recorded:
-            self._link.change(self.network, self._drive.origin.seed)
-        return super().exchange(state)
-
-    def finish(self, state: State) -> None:
-        self._last = state
-        self._write("state", state, state.sim_time_s)
+        about = self.task, origin, self._apply
+        runner = EpisodeRunner(self._environment, self, self._show, *about)
+        return runner.run(0, origin.seed)
 
     def _apply(self, adapter: Adapter, decision: Decision) -> np.ndarray:
-        if self._step < self._fork:
-            return self._drive.redo(self._step, adapter)
-        action = policy_action(adapter, decision)
-        done = [float(value) for value in action.ravel()], bool(decision.brake_reason)
-        if self.first_difference is None and self._drive.applied.get(self._step) != done:
-            self.first_difference = self._step
-        return action
+        if decision.command is None and not decision.brake_reason and self._fork:
+            return adapter.within(self._drive.applied[self._fork - 1][0])
+        return policy_action(adapter, decision)
 
-    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
-        # Before the fork as the edge runtime did, then as the policy does
-        if arrival.overtaken:
+    def _answer(self, payload: bytes) -> None:
+        """Answer a state as an edge runtime would to which no state comes late."""
+        state = decode_state(payload)
+        assert isinstance(state, State)
+        if state.step <= self._newest:
             return
-        sent_ns = self._at_ns(arrival.arrived_s)
-        state = msgspec.structs.replace(arrival.message, sent_ns=sent_ns)
-        command, given = self._drive.commands.get(arrival.step), self._step < self._fork
-        if self._policy is not None:
-            answer = self._answer(self._policy, state, command if given else None)
-            command = command if given else answer
-        self._write("state", state, arrival.arrived_s)
-        if command is not None:
-            stamps: dict[str, Any] = {"received_ns": sent_ns, "sent_ns": sent_ns, "inference_ns": 0}
-            stamps |= {"session": state.session, "episode": state.episode}
-            told = msgspec.structs.replace(command, **stamps)
-            self._write("command", told, arrival.arrived_s)
-            self._link.answer(arrival, command)
-
-    def _answer(self, policy: Policy, state: State, known: Command | None) -> Command | None:
-        """Return the policy's command, from decision logic to which no state comes late.
-
-        ``known`` is the recorded answer before the fork: limits and stops go on from there.
-        """
-        self._now_s += policy.manifest.control_period_s
-        self._controller.begin(Received(state, self._now_s, state.sent_ns), self._now_s)
-        if known is not None and known.mode == DRIVE:
-            output: np.ndarray | None = np.array(known.action, np.float32)
-        else:
-            output, _ = infer(policy, policy.layout.arrays(state.observation))
-        order = self._controller.finish(output, 0, self._now_s)
-        return order and order.command(policy.policy_id, state.sent_ns)
+        self._newest = state.step
+        self._now_ns += round(self.task.control_period_s * 1e9)
+        now_s, state = self._now_ns * 1e-9, msgspec.structs.replace(state, sent_ns=self._now_ns)
+        self._controller.begin(Received(state, now_s, self._now_ns), now_s)
+        output, inference_ns = infer(self._policy, self._policy.layout.arrays(state.observation))
+        order = self._controller.finish(output, inference_ns, now_s)
+        self._record("state", encode(state))
+        if order is not None:
+            command = encode(order.command(self._policy.policy_id, self._now_ns))
+            self._record("command", command)
+            self.receive(command)
 
     def _show(self, environment: Environment, stamps: Scene) -> None:
         if self._out is not None:
-            self._write("scene", scene_payload(environment, stamps), stamps.sim_time_s)
+            self._record("scene", scene_payload(environment, stamps))
 
-    def _write(self, topic: str, message: State | Command | bytes, at_s: float) -> None:
+    def _record(self, topic: str, payload: bytes) -> None:
         if self._out is not None:
-            payload = message if isinstance(message, bytes) else encode(message)
             key = f"phil/{self._drive.vehicle_id}/{topic}"
-            self._out.write(Heard(key, topic, payload, self._at_ns(at_s), len(payload)))
-
-    def _at_ns(self, at_s: float) -> int:
-        return self._drive.began_ns + round(at_s * 1e9)
-
-
-def _seconds(text: str) -> float:
-    return cli.seconds(text.removesuffix("s"))
+            self._out.write(Heard(key, topic, payload, self._now_ns, len(payload)))
 
 
 def add_place(parser: Any) -> None:
+    """Declare the options that say where a drive is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
     parser.add_argument("--at", metavar="T", type=_seconds, default=0.0, help=at)
     parser.add_argument("--episode", metavar="K", type=cli.not_negative, help=which)
@@ -301,7 +225,12 @@ def add_place(parser: Any) -> None:
     add_options(parser, "--vehicle-id", default=None, help=several)
 
 
+def _seconds(text: str) -> float:
+    return cli.seconds(text.removesuffix("s"))
+
+
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
+    """Return the drive that the options name, and the step of the fork."""
     drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
     return drive, drive.step_at(asked.at)
 
@@ -312,65 +241,50 @@ def _add_fork_arguments(parser: Any) -> None:
     add_place(parser)
     module = "the environment, if it is in a module: no file decides what is imported"
     add("--env", metavar="ENV", help=module)
-    add_options(parser, "--out")
     policy = "the policy that drives on (default: the drive is rebuilt to its end)"
-    human = "you drive on: `python -m trainer drive --from`, which has more options"
-    record = "record the fork, as `bridge record` does; with --human a directory"
     add("--policy", metavar="POLICY.onnx", type="path", help=policy)
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
+    human = "you drive on: `python -m trainer drive --from`, which has more options"
     add("--human", metavar="web", help=human)
+    record = "record the fork, as `bridge record` does; with --human a directory"
     add("--record", metavar="G.mcap", help=record)
+    add_options(parser, "--out")
 
 
 def _run_fork(asked: Namespace) -> int:
     """Fork the drive, and print and write what came of it."""
     if asked.human is not None:
-        return _hand_over(asked)
-    record = asked.record and new_recording(asked.record)
+        _hand_over(asked)
     drive, fork = find_fork(asked.recording, asked)
-    trust = asked.public_key, asked.allow_unsigned
-    policy = None if asked.policy is None else load_policy(asked.policy, *trust)
-    if policy is None and (asked.latency is not None or not drive.ended):
-        why = "another network" if asked.latency is not None else "a drive not recorded to its end"
-        raise UserError(f"{why} needs a policy that drives on: --policy POLICY.onnx")
+    period_s, found, policy_id = drive.task.control_period_s, None, ""
     with ExitStack() as stack:
         environment = stack.enter_context(closing(drive.environment(asked.env)))
-        recorded = ForkedDrive(drive, environment, drive.steps).run() if drive.ended else None
-        out, made = None, Path(stack.enter_context(tempfile.TemporaryDirectory()), "fork.mcap")
-        if record:
-            out = stack.enter_context(closing(RecordingWriter(made)))
-        begun = drive.steps if policy is None else fork
-        forked = ForkedDrive(drive, environment, begun, policy, asked.latency, out)
-        found = forked.run()
-        if out:
-            out.finish(dropped=0)
-            write_atomic(record, made.read_bytes())
-    first, period_s = forked.first_difference, drive.task.control_period_s
+        if asked.policy is None:
+            fork = drive.steps
+            ForkedEnvironment(environment, drive, fork).reset()
+        else:
+            policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
+            out = asked.record and stack.enter_context(whole_recording(asked.record))
+            policy_id = policy.policy_id
+            found = ForkedDrive(drive, environment, fork, policy, asked.latency, out or None).run()
     report = {
         "recording": asked.recording,
         "episode": drive.number,
         "origin": msgspec.structs.asdict(drive.origin),
         "at_s": round(fork * period_s, 6),
-        "latency_spec": str(forked.network),
-        "policy_id": "" if policy is None else policy.policy_id,
+        "latency_spec": drive.origin.latency if asked.latency is None else str(asked.latency),
+        "policy_id": policy_id,
         "recorded_policy_ids": sorted({each.policy_id for each in drive.commands.values()}),
-        "recorded": None if recorded is None else asdict(recorded),
-        "fork": asdict(found),
-        "differs_from_s": None if first is None else round(first * period_s, 6),
+        "fork": None if found is None else asdict(found),
     }
     write_json_out(asked.out, report)
-    how = "the same to the bit" if first is None else f"another from {first * period_s:g} s on"
-    ends = [
-        f"{end.outcome} after {end.time_s:g} s, {end.distance_m:.2f} m" if end else "not to its end"
-        for end in (recorded, found)
-    ]
-    at = f"forked at {fork * period_s:g} s"
-    print(printable(f"recorded: {ends[0]}; {at}: {ends[1]}; {how}"))
+    end = f"; from there {found.outcome} after {found.time_s:g} s" if found else ""
+    print(printable(f"rebuilt to the bit until {fork * period_s:g} s{end}"))
     return 0
 
 
-def _hand_over(asked: Namespace) -> int:
+def _hand_over(asked: Namespace) -> None:
     """Let the trainer's command take this process's place: it has the screen and the signals."""
     if asked.latency is not None or asked.out is not None:
         raise UserError("--human takes no --latency and no --out: it drives without a network")
@@ -387,7 +301,6 @@ def _hand_over(asked: Namespace) -> int:
 FORK = cli.Subcommand(
     cli.examples(
         "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json",
-        "python -m bridge fork drive.mcap --episode 2 --at 3s --policy my.onnx --latency 80ms",
         "python -m bridge fork drive.mcap --at 12.3s --human web --record runs/forked",
     ),
     _add_fork_arguments,

@@ -1,6 +1,9 @@
-"""Validation of the commands, feedback and health that the simulator hears. No socket.
+"""The vehicle's side of the safety rules: what the simulator believes, holds and brakes for. Pure.
 
-What is not believed is counted by reason.
+`CommandCheck`, `FeedbackCheck` and `EdgeCounts` read what comes back over the wire, and count by
+reason what is not believed. `CommandHold` is the contract's rule on every clock: the newest command
+is held from tick to tick; when none has arrived for 2 T, or when the command itself says
+``safe_stop``, the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -9,11 +12,10 @@ import contextlib
 import threading
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import msgspec
 
-from bridge.virtual_link import BRAKE_PERIODS, ROUNDING_S, UNKNOWN_SAFE_STOP, Decision
 from edge_runtime.manifest import Action, Task
 from edge_runtime.wire import (
     DRIVE,
@@ -28,6 +30,83 @@ from edge_runtime.wire import (
     decode_feedback,
     decode_health,
 )
+
+BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
+ROUNDING_S = 1e-9
+"""Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
+NO_COMMAND = "no_command"  # Brake reason: the vehicle brakes by itself after 2 T of silence
+UNKNOWN_SAFE_STOP = "safe_stop"  # Brake reason when a safe_stop command gives none of its own
+NO_FEEDBACK = "no_feedback"
+"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
+SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
+UNKNOWN_STEP = "unknown_step"  # It answers a state never sent
+NOT_COMMANDED = ""
+"""Session of a vehicle that has not taken a command since its edge runtime was started."""
+COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
+"""Of an action's whole range: a policy clamps to the last bit, an actuator is measured."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The vehicle's decision in one tick."""
+
+    command: Command | None  # The newest command, held; None before the first of the episode
+    fresh: bool  # It arrived since the decision before this one
+    brake_reason: str  # Why the vehicle brakes; empty while it obeys the command
+    ridden: int = 0
+    """Which action of its plan ``command`` has in the place of its own; 0: its own."""
+    feedback: Feedback | None = None
+    """The vehicle in the loop about the tick; None without a vehicle, or where it is silent."""
+    waits: bool = False
+    """The episode's first command may still be under way."""
+
+
+class CommandHold:
+    """The newest command of one episode, and its age; ``period_s`` is T."""
+
+    def __init__(self, now_s: float, period_s: float) -> None:
+        self._period_s, self._silence_s = period_s, BRAKE_PERIODS * period_s
+        self.newest: Command | None = None
+        self._heard_s = now_s
+        self._fresh = False
+
+    @property
+    def newest_step(self) -> int:
+        return -1 if self.newest is None else self.newest.step
+
+    def admit(self, command: Command, now_s: float) -> bool:
+        """Take the command if it is newer than the newest one; return whether it was taken.
+
+        An edge runtime in safe stop repeats its answer to the last state it heard at rate 1/T;
+        such a repetition is as good a heartbeat as a new answer. A repeated ``drive`` is not: it
+        would keep a frozen controller alive.
+        """
+        repeats_stop = command.step == self.newest_step and command.mode == SAFE_STOP
+        if command.step <= self.newest_step and not repeats_stop:
+            return False
+        self.newest, self._heard_s, self._fresh = command, now_s, True
+        return True
+
+    def decide(self, now_s: float, edge_silent: bool = False) -> Decision:
+        """Decide this tick.
+
+        ``edge_silent``: lock-step has waited in vain; virtual time stood still meanwhile.
+        """
+        brake_reason, command, ridden = "", self.newest, 0
+        plan = command.plan or [] if command is not None and command.mode == DRIVE else []
+        silent_s = now_s - self._heard_s
+        ride_s = len(plan) * self._period_s
+        if edge_silent or silent_s > self._silence_s + ride_s + ROUNDING_S:
+            brake_reason = NO_COMMAND
+        elif command is not None and command.mode == SAFE_STOP:
+            brake_reason = command.reason or UNKNOWN_SAFE_STOP
+        elif command is not None and plan:
+            ridden = min(int((silent_s + ROUNDING_S) / self._period_s), len(plan))
+            if ridden:
+                command = msgspec.structs.replace(command, action=plan[ridden - 1])
+        fresh, self._fresh = self._fresh, False
+        waits = command is None and not edge_silent
+        return Decision(command, fresh, brake_reason, ridden, waits=waits)
 
 
 class CommandCheck:
@@ -109,11 +188,6 @@ class CommandCheck:
         return command.episode == ended_episode and command.step > answered_step
 
 
-UNKNOWN_STEP = "unknown_step"  # It answers a state never sent
-COMMAND_ROUNDING, FEEDBACK_ROUNDING = 1e-6, 5e-4
-"""Of an action's whole range: a policy clamps to the last bit, an actuator is measured."""
-
-
 def _action_fault(
     values: Sequence[float], actions: Sequence[Action], rounding: float = COMMAND_ROUNDING
 ) -> str:
@@ -124,13 +198,6 @@ def _action_fault(
         if not row.low - slack <= value <= row.high + slack:
             return "action_range"  # Where no policy and no actuator is
     return ""
-
-
-NO_FEEDBACK = "no_feedback"
-"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
-SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
-NOT_COMMANDED = ""
-"""Session of a vehicle that has not taken a command since its edge runtime was started."""
 
 
 class FeedbackCheck:
@@ -149,16 +216,10 @@ class FeedbackCheck:
         self._commands, self._silence_s = commands, BRAKE_PERIODS * commands.period_s
         self._met = False  # The vehicle has heard of this session.
         self._newest: Feedback | None = None
-        self._newest_s = self._received_s = 0.0
+        self._newest_s = 0.0
 
-    def read(
-        self, payload: bytes, now_s: float, received_s: float | None = None
-    ) -> Feedback | None:
-        """Return the feedback if it is this vehicle's newest, else None.
-
-        Monotonic times: ``received_s`` from the wire (None: now), and ``now_s`` after the simulated
-        network.
-        """
+    def read(self, payload: bytes, now_s: float) -> Feedback | None:
+        """Return the feedback if it is this vehicle's newest, else None; ``now_s`` is monotonic."""
         feedback = decode_feedback(payload)
         if isinstance(feedback, Rejection):
             self.rejected[feedback.reason.value] += 1
@@ -171,7 +232,6 @@ class FeedbackCheck:
             return None
         self._met = self._met or feedback.session == self._commands.session
         self._newest, self._newest_s = feedback, now_s
-        self._received_s = now_s if received_s is None else received_s
         return feedback
 
     def decide(self, heard: Decision, episode: int, now_s: float) -> Decision:
@@ -192,14 +252,8 @@ class FeedbackCheck:
             reason = heard.brake_reason or UNKNOWN_SAFE_STOP
         elif feedback.self_braking:
             reason = SELF_BRAKING
-        return replace(
-            heard,
-            brake_reason=reason,
-            command_age_s=None if reason else heard.command_age_s,
-            ridden=0 if reason else heard.ridden,
-            feedback=feedback,
-            feedback_age_s=None if feedback is None else now_s - self._received_s,
-        )
+        ridden = 0 if reason else heard.ridden
+        return replace(heard, brake_reason=reason, ridden=ridden, feedback=feedback)
 
     def _fault(self, feedback: Feedback, now_s: float) -> str:
         if fault := _action_fault(feedback.action, self._commands.actions, FEEDBACK_ROUNDING):
@@ -213,11 +267,8 @@ class FeedbackCheck:
         return Reason.STALE.value if in_order and feedback.sent_ns < newest_ns else ""
 
 
-OVERTAKEN_S = 5.0  # At most, by a message or an answer that came later
-
-
 class EdgeCounts:
-    """Adds up how the edge's counts grow from the first health on.
+    """Adds up how the edge's counts of rejected states grow from the first health on.
 
     Two threads report here: health messages on Zenoh's, answers to the status query on the
     caller's. The public values are only ever replaced, so readers need no lock.
@@ -226,7 +277,6 @@ class EdgeCounts:
     def __init__(self) -> None:
         self.rejected: Counter[str] = Counter()  # States that the edge rejected, by reason
         self.unreadable: Counter[str] = Counter()  # Health messages, as ``health_REASON``
-        self.changes = 0  # How often another edge runtime took over, or the same was restarted
         self.newest: Health | None = None
         self._lock = threading.Lock()
 
@@ -244,18 +294,14 @@ class EdgeCounts:
             self.observe(msgspec.json.decode(payload, type=Health))
 
     def observe(self, health: Health) -> None:
-        """Add the growth since the last health."""
+        """Add the growth since the last health; another edge runtime counts from zero."""
         with self._lock:
             last, before = self.newest, health.rejected
             if last is not None:
-                # Where a message and an answer have overtaken one another both clocks are behind by
-                # little. A board that starts anew, its wall clock not yet set, is behind by much.
-                behind_s = last.uptime_s - health.uptime_s, (last.sent_ns - health.sent_ns) * 1e-9
-                if all(0.0 <= behind < OVERTAKEN_S for behind in behind_s):
-                    return
-                # A restarted edge runtime has a younger clock; it counts from zero, as another.
-                another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
-                self.changes += another
-                before = {} if another else last.rejected
+                is_younger = health.uptime_s < last.uptime_s
+                if is_younger and health.sent_ns < last.sent_ns:
+                    return  # A message and an answer have overtaken one another.
+                is_another = is_younger or health.policy_id != last.policy_id
+                before = {} if is_another else last.rejected
             self.rejected = self.rejected + (Counter(health.rejected) - Counter(before))
             self.newest = health

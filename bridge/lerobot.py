@@ -22,13 +22,13 @@ import numpy as np
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
-from bridge.replay import Answer, RecordedDrive, key_of
+from bridge.replay import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
 from edge_runtime.files import check_writable, write_json
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.util import UserError, counted
-from edge_runtime.wire import State, is_foreign
+from edge_runtime.wire import Command, State, is_foreign
 
 try:
     import av
@@ -112,14 +112,14 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     return bounds[-1]
 
 
-def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Answer]]:
-    """Yield the readable states with their answers; of a plan, only the action of now."""
+def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Command]]:
+    """Yield the readable states with their answers."""
     layout, size = Layout(task), len(task.action)
     for state in drive.states():
         answer = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
-        if readable and answer and answer.action and len(answer.action) % size == 0:
-            yield state, answer._replace(action=answer.action[:size])
+        if readable and answer is not None and len(answer.action) == size:
+            yield state, answer
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:

@@ -34,6 +34,15 @@ class Heard(NamedTuple):
     """This process's clock: the wall's at the start, then monotonic, so that it never goes back."""
     size: int  # Bytes on the wire; a payload over the contract's limit is not kept
 
+    @property
+    def vehicle_id(self) -> str:
+        return self.key.split("/")[1]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the payload was kept."""
+        return self.size == len(self.payload)
+
 
 Point = tuple[float, float]
 

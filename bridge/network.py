@@ -1,60 +1,42 @@
 """The simulated network: when a message between two ends arrives, drawn from a seed.
 
-Pure: the caller passes the time in. The same model serves lock-step and training (virtual time),
-and real time (timers). The way of a message (`LatencyModel`): queue and line, outage, loss, time
-under way, held back or not, duplicated or not, and in order if order is kept.
+Pure: the caller passes the time in. `LatencyModel` serves virtual time (`VirtualLink`, in lock-step
+and in training) and real time (timers). The way of a message: line, outage, loss, time under way,
+held back or not, duplicated or not.
 """
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 
+from bridge.inbound import ROUNDING_S, CommandHold, Decision
+from edge_runtime.latest import Freshness
+from edge_runtime.safety import (
+    Event,
+    Mode,
+    Safety,
+    advance,
+    classify_arrival,
+    classify_fresh,
+    note_arrival,
+)
 from edge_runtime.util import UserError
+from edge_runtime.wire import SAFE_STOP, Command
 
 DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
-TAILS = ("normal", "lognormal", "pareto")
-ORDERS = ("free", "kept")
-
-
-class Kind(NamedTuple):
-    """How the value of a setting is read (None where it does not fit) and written."""
-
-    read: Callable[[str], Any]
-    write: Callable[[Any], str] = str
-
-
-def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kind:
-    """Make the kind of a number with a unit; values are kept in the first, whose factor is 1."""
-    first = next(iter(units))
-
-    def read(text: str) -> float | None:
-        match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
-        if match is None or match[2] not in units:
-            return None
-        value = float(match[1]) * units[match[2]]
-        return value if least <= value <= most else None
-
-    # Reads back as the same
-    return Kind(read, lambda value: repr(float(value)).removesuffix(".0") + first)
-
-
-def _choice(words: Sequence[str]) -> Kind:
-    return Kind(lambda text: text if text in words else None)
-
-
-MS = _measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
-SECONDS = _measure({"s": 1.0, "ms": 1e-3, "us": 1e-6}, most=1e6)
-PERCENT = _measure({"%": 1.0}, most=100.0)
-COUNT = _measure({"": 1.0}, most=1e6, least=1.0)
-_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
-RATE = _measure(_RATES, most=1e9, least=math.ulp(0.0))
+COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
+QUEUE_S = 0.2  # Longest wait for a line of limited rate; then a message is dropped
+PARETO_ALPHA = 3.0  # As netem's pareto table: variance is finite above 2
 
 
 @dataclass(frozen=True)
@@ -66,109 +48,144 @@ class Outage:
     period_s: float | None = None  # From one window's begin to the next; None: there is only one
 
     def covers(self, now_s: float) -> bool:
+        """Return whether a message that leaves now is lost."""
         since_s = now_s - self.start_s
         if since_s < 0:
             return False
         return (since_s % self.period_s if self.period_s else since_s) < self.length_s
 
 
-def _read_outages(text: str) -> tuple[Outage, ...] | None:
+@dataclass(frozen=True)
+class DirectionSpec:
+    """One direction of the network. UserError for impossible bursts."""
+
+    delay_ms: float = 0.0  # Mean time under way
+    jitter_ms: float = 0.0
+    """Standard deviation of the time under way; what falls below zero becomes zero."""
+    tail: str = "normal"
+    """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
+    loss_percent: float = 0.0  # Share of messages that never arrive, over good and bad stretches
+    burst_messages: float = 0.0
+    """Mean length of a bad stretch, in which all is lost; 0: losses are independent."""
+    clear_loss_percent: float = 0.0  # Loss outside of bad stretches
+    reorder_percent: float = 0.0  # Share of messages held back, so that later ones can overtake
+    reorder_by_ms: float = 150.0  # The default lets one state of the control loop pass
+    duplicate_percent: float = 0.0
+    """Share of messages that arrive twice; the copy's time under way is drawn anew."""
+    rate_kbps: float = 0.0  # Bandwidth in 1000 bit/s; 0: no limit
+    outages: tuple[Outage, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.burst_messages:
+            return
+        clear, loss = self.clear_loss_percent, self.loss_percent
+        # Good stretches last one message at least, so bad ones cannot fill more than this.
+        most = self.burst_messages / (self.burst_messages + 1.0)
+        if not (clear <= loss and clear < 100.0 and self.bad_share <= most):
+            raise UserError(
+                f"loss {loss:g}% is impossible in bursts of {self.burst_messages:g} messages with"
+                f" {clear:g}% outside of them"
+            )
+
+    @property
+    def bad_share(self) -> float:
+        """Share of messages in bad stretches that makes the overall loss the asked one."""
+        return (self.loss_percent - self.clear_loss_percent) / (100.0 - self.clear_loss_percent)
+
+    def written(self, prefix: str = "") -> list[str]:
+        """Return the settings that are not at their default, as a specification has them."""
+        return [
+            f"{prefix}{name}={row.write(value)}"
+            for name, row in SETTINGS.items()
+            if (value := getattr(self, row.field)) != getattr(DirectionSpec, row.field)
+        ]
+
+
+class Setting(NamedTuple):
+    """A setting of a specification: how its value is read (ValueError if wrong) and written."""
+
+    field: str
+    example: str
+    read: Callable[[str], Any]
+    write: Callable[[Any], str] = str
+
+
+_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+_MS = {"ms": 1.0, "us": 1e-3, "s": 1e3}
+_KBPS = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
+
+
+def _quantity(text: str, units: Mapping[str, float], most: float, least: float = 0.0) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
+    if match is None or match[2] not in units:
+        raise ValueError(text)
+    value = float(match[1]) * units[match[2]]
+    if not least <= value <= most:
+        raise ValueError(text)
+    return value
+
+
+def _written(value: float, unit: str) -> str:
+    return repr(float(value)).removesuffix(".0") + unit  # Reads back as the same
+
+
+def _number(
+    field: str, example: str, units: Mapping[str, float], most: float, least: float = 0.0
+) -> Setting:
+    """Make a setting with a unit; values are kept in the first, whose factor is 1."""
+    read, unit = partial(_quantity, units=units, most=most, least=least), next(iter(units))
+    return Setting(field, example, read, lambda value: _written(value, unit))
+
+
+def _read_tail(text: str) -> str:
+    if text not in SHAPES:
+        raise ValueError(text)
+    return text
+
+
+def _read_outages(text: str) -> tuple[Outage, ...]:
     """Read windows with a plus between: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
     windows = []
     # A plus also stands inside an exponent, where it is followed by a bare number.
     for part in re.split(r"(?<!e)\+", text):
         match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", part)
-        times_s = [SECONDS.read(word) for word in match.groups() if word] if match else []
-        if match is None or len(times_s) < 2 or None in times_s:
-            return None
-        length_s, period_s = times_s[0], times_s[1] if match[2] else None
-        if period_s is not None and length_s >= period_s:
-            return None
-        windows.append(Outage(length_s, times_s[-1], period_s))
+        times_s = (
+            [_quantity(word, _S, most=1e6) for word in match.groups() if word] if match else []
+        )
+        if match is None or len(times_s) < 2 or (match[2] and times_s[0] >= times_s[1]):
+            raise ValueError(text)
+        windows.append(Outage(times_s[0], times_s[-1], times_s[1] if match[2] else None))
     return tuple(windows)
 
 
 def _write_outages(outages: tuple[Outage, ...]) -> str:
     """Write the windows; a start that is the period is left out."""
     return "+".join(
-        SECONDS.write(outage.length_s)
-        + ("" if outage.period_s is None else "/" + SECONDS.write(outage.period_s))
-        + ("" if outage.start_s == outage.period_s else "@" + SECONDS.write(outage.start_s))
+        _written(outage.length_s, "s")
+        + ("" if outage.period_s is None else f"/{_written(outage.period_s, 's')}")
+        + ("" if outage.start_s == outage.period_s else f"@{_written(outage.start_s, 's')}")
         for outage in outages
     )
 
 
-OUTAGES = Kind(_read_outages, _write_outages)
-
-
-def _setting(default: Any, name: str, kind: Kind, example: str) -> Any:
-    return field(default=default, metadata={"name": name, "kind": kind, "example": example})
-
-
-@dataclass(frozen=True)
-class DirectionSpec:
-    """One direction of the network: the table of settings. UserError for impossible bursts."""
-
-    delay_ms: float = _setting(0.0, "delay", MS, "50ms")  # Mean time under way
-    jitter_ms: float = _setting(0.0, "jitter", MS, "10ms")
-    """Standard deviation of the time under way; what falls below zero becomes zero."""
-    loss_percent: float = _setting(0.0, "loss", PERCENT, "1%")
-    """Share of the messages that never arrive, in percent, over all states of the burst model."""
-    tail: str = _setting("normal", "tail", _choice(TAILS), "|".join(TAILS))
-    """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
-    burst_messages: float = _setting(0.0, "burst", COUNT, "5")
-    """Mean length of a bad stretch in messages (`loss_percents`); 0: losses are independent."""
-    burst_loss_percent: float = _setting(100.0, "burst_loss", PERCENT, "80%")
-    """Loss inside a bad stretch."""
-    clear_loss_percent: float = _setting(0.0, "clear_loss", PERCENT, "0.1%")
-    """Loss outside bad stretches."""
-    reorder_percent: float = _setting(0.0, "reorder", PERCENT, "1%")
-    """Share of the messages that are held back, so that later ones can overtake them."""
-    reorder_by_ms: float = _setting(150.0, "reorder_by", MS, "300ms")
-    """How long they are held back; the default lets one state of the control loop pass."""
-    order: str = _setting("free", "order", _choice(ORDERS), "|".join(ORDERS))
-    """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
-    duplicate_percent: float = _setting(0.0, "duplicate", PERCENT, "1%")
-    """Share of the messages that arrive twice; the copy's time under way is drawn anew."""
-    rate_kbps: float = _setting(0.0, "rate", RATE, "1Mbit/s")
-    """Bandwidth in 1000 bit/s; 0: no limit."""
-    queue_ms: float = _setting(200.0, "queue", MS, "100ms")
-    """Longest wait for the line; a message that would wait longer is dropped."""
-    outages: tuple[Outage, ...] = _setting((), "outage", OUTAGES, "0.5s@2s+0.2s/10s")
-    """Windows in which whatever leaves the sender is lost."""
-
-    def __post_init__(self) -> None:
-        if not self.burst_messages:
-            return
-        clear, loss, burst = self.clear_loss_percent, self.loss_percent, self.burst_loss_percent
-        # Good stretches last one message at least, so bad ones cannot fill more than this.
-        most = self.burst_messages / (self.burst_messages + 1.0)
-        if not (clear <= loss and clear < burst and self.bad_share <= most):
-            raise UserError(
-                f"loss {loss:g}% is impossible in bursts of {self.burst_messages:g} messages with"
-                f" {burst:g}% inside and {clear:g}% outside of them"
-            )
-
-    @property
-    def bad_share(self) -> float:
-        """Share of messages in the bad state that makes the overall loss the asked one."""
-        return (self.loss_percent - self.clear_loss_percent) / (
-            self.burst_loss_percent - self.clear_loss_percent
-        )
-
-    def written(self, prefix: str = "") -> list[str]:
-        return [
-            f"{prefix}{row.metadata['name']}={row.metadata['kind'].write(value)}"
-            for row in fields(self)
-            if (value := getattr(self, row.name)) != row.default
-        ]
-
-
-SETTINGS = {row.metadata["name"]: row for row in fields(DirectionSpec)}
-"""Name in a specification -> field, whose metadata hold how it is read, and an example."""
+_PERCENT = {"%": 1.0}
+SETTINGS = {
+    "delay": _number("delay_ms", "50ms", _MS, 60_000.0),
+    "jitter": _number("jitter_ms", "10ms", _MS, 60_000.0),
+    "tail": Setting("tail", "pareto", _read_tail),
+    "loss": _number("loss_percent", "1%", _PERCENT, 100.0),
+    "burst": _number("burst_messages", "5", {"": 1.0}, 1e6, least=1.0),
+    "clear_loss": _number("clear_loss_percent", "0.1%", _PERCENT, 100.0),
+    "reorder": _number("reorder_percent", "1%", _PERCENT, 100.0),
+    "reorder_by": _number("reorder_by_ms", "300ms", _MS, 60_000.0),
+    "duplicate": _number("duplicate_percent", "1%", _PERCENT, 100.0),
+    "rate": _number("rate_kbps", "1Mbit/s", _KBPS, 1e9, least=math.ulp(0.0)),
+    "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages, _write_outages),
+}
+"""Name in a specification -> setting."""
 GRAMMAR = (
     "none, 50ms+-10ms, or settings such as "
-    + ",".join(f"{name}={row.metadata['example']}" for name, row in SETTINGS.items())
+    + ",".join(f"{name}={row.example}" for name, row in SETTINGS.items())
     + ", each also with up. or down. before it"
 )
 
@@ -220,41 +237,26 @@ def _parse_part(part: str) -> Iterator[tuple[str, Any]]:
     for name, word in pairs:
         if name not in SETTINGS:
             raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
-        row = SETTINGS[name]
-        if (value := row.metadata["kind"].read(word)) is None:
-            example = row.metadata["example"]
-            raise UserError(f"{part!r} is not understood; write it like {name}={example}")
-        yield row.name, value
-
-
-LOGNORMAL_SIGMA = 1.0
-PARETO_ALPHA = 3.0
-"""As netem's pareto table. Variance is finite above 2; the third moment is not at 3."""
-
-_LOGNORMAL_MEAN = math.exp(LOGNORMAL_SIGMA**2 / 2)
-_LOGNORMAL_STD = _LOGNORMAL_MEAN * math.sqrt(math.expm1(LOGNORMAL_SIGMA**2))
-_PARETO_MEAN = PARETO_ALPHA / (PARETO_ALPHA - 1)
-_PARETO_STD = _PARETO_MEAN / math.sqrt(PARETO_ALPHA * (PARETO_ALPHA - 2))
+        try:
+            yield SETTINGS[name].field, SETTINGS[name].read(word)
+        except ValueError:
+            example = f"{name}={SETTINGS[name].example}"
+            raise UserError(f"{part!r} is not understood; write it like {example}") from None
 
 
 def _pareto(draw: float) -> float:
-    upper_tail = 0.5 * math.erfc(draw / math.sqrt(2.0))
-    return (upper_tail ** (-1.0 / PARETO_ALPHA) - _PARETO_MEAN) / _PARETO_STD
+    mean, upper_tail = PARETO_ALPHA / (PARETO_ALPHA - 1), 0.5 * math.erfc(draw / math.sqrt(2.0))
+    std = mean / math.sqrt(PARETO_ALPHA * (PARETO_ALPHA - 2))
+    return (upper_tail ** (-1.0 / PARETO_ALPHA) - mean) / std
 
 
-SHAPES: dict[str, Callable[[float], float]] = {
-    "normal": lambda draw: draw,
-    "lognormal": lambda draw: (math.exp(LOGNORMAL_SIGMA * draw) - _LOGNORMAL_MEAN) / _LOGNORMAL_STD,
-    "pareto": _pareto,
-}
+SHAPES: dict[str, Callable[[float], float]] = {"normal": lambda draw: draw, "pareto": _pareto}
 """How long a message is under way: shapes with mean 0 and standard deviation 1.
 
-The delay is ``delay + jitter * shape``, so rows with the same delay and jitter compare whatever
-their tail; netem's distribution tables are used the same way. All shapes are increasing functions
-of one standard normal draw: the same seed delays the same messages, and only how far differs.
-
-A long-tailed network has a floor (propagation) little below its mean and rare, very late messages:
-at least ``delay - 0.76 jitter`` with ``lognormal`` and ``delay - 0.58 jitter`` with ``pareto``.
+The delay is ``delay + jitter * shape``, as with netem's distribution tables, so rows with the same
+delay and jitter compare whatever their tail. Both shapes are increasing functions of one standard
+normal draw: the same seed delays the same messages, and only how far differs. A long-tailed network
+has a floor (propagation) of ``delay - 0.58 jitter`` and rare, very late messages.
 """
 
 
@@ -269,8 +271,8 @@ def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[flo
 
         r   = 1 / burst                     bad to good; a bad stretch has 1/r messages on average
         p   = r s / (1 - s)                 good to bad
-        1-h = burst_loss, 1-k = clear_loss  loss in the bad and in the good state
-        s   = (loss - clear_loss) / (burst_loss - clear_loss)     share of messages in the bad state
+        1-h = 1, 1-k = clear_loss           loss in the bad and in the good state
+        s   = (loss - clear_loss) / (1 - clear_loss)     share of messages in the bad state
 
     so that ``loss`` stays the overall rate and rows with and without bursts compare.
     """
@@ -280,7 +282,7 @@ def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[flo
     to_bad = to_good * share / (1.0 - share)
     bad = rng.random() < share
     while True:
-        yield spec.burst_loss_percent if bad else spec.clear_loss_percent
+        yield 100.0 if bad else spec.clear_loss_percent
         if rng.random() < (to_good if bad else to_bad):
             bad = not bad
 
@@ -299,7 +301,7 @@ class LatencyModel:
         self._reorder_rng, self._duplicate_rng = reorder, duplicate
         self._loss_percents = loss_percents(spec, bursts)
         self._shape = SHAPES[spec.tail]
-        self._line_free_s = self._newest_arrival_s = float("-inf")
+        self._line_free_s = float("-inf")
 
     def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
         """Return when a message handed over at ``now_s`` arrives (s, same clock), earliest first.
@@ -316,18 +318,14 @@ class LatencyModel:
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
         delays_ms = (self.spec.delay_ms + self.spec.jitter_ms * self._shape(d) for d in draws)
-        times = sorted(left_s + max(0.0, delay_ms) * 1e-3 + extra_s for delay_ms in delays_ms)
-        if self.spec.order == "kept":
-            times = [max(arrival_s, self._newest_arrival_s) for arrival_s in times]
-            self._newest_arrival_s = times[-1]
-        return tuple(times)
+        return tuple(sorted(left_s + max(0.0, ms) * 1e-3 + extra_s for ms in delays_ms))
 
     def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
         """Return when the message's last byte has left; None if the queue is full."""
         if not self.spec.rate_kbps:
             return now_s
         begin_s = max(now_s, self._line_free_s)
-        if begin_s - now_s > self.spec.queue_ms * 1e-3:
+        if begin_s - now_s > QUEUE_S:
             return None
         self._line_free_s = begin_s + size_bytes / (self.spec.rate_kbps * 1e3 / 8)
         return self._line_free_s
@@ -344,3 +342,133 @@ def make_network(spec: LatencySpec, seed: int) -> Network:
     """Make both directions, each with its own stream of the seed."""
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Network(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
+
+
+# On the wire, for links of limited rate: the same for every message, so that a longer session name
+# or another digit does not change a drive.
+STATE_BYTES = 122  # Besides its observation
+COMMAND_BYTES = 217
+
+Message = TypeVar("Message")
+
+
+@dataclass(frozen=True)
+class Arrival(Generic[Message]):
+    """A state that has reached the edge runtime."""
+
+    step: int
+    arrived_s: float
+    message: Message
+    overtaken: bool  # One as new came before: the edge runtime rejects this without answer.
+
+
+class VirtualLink(Generic[Message]):
+    """An episode's network in virtual time, and the command that the vehicle holds.
+
+    For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``. The
+    caller gives the answers: those of a real edge runtime, or of a function. They take no virtual
+    time. A real edge runtime does not notice a gap in virtual time. So the link runs the safety
+    machine on virtual time itself, from standby at each episode's start, and turns into a safe stop
+    what that machine would not drive.
+
+    Args:
+        spec: delays, losses and the like.
+        seed: of the episode.
+        period_s: the control period T.
+        observation_bytes: what a state carries.
+        on_heard: called with each newest answer's latency in s, state sent to command received.
+        on_stale: called for each answer that is not newer than the newest.
+    """
+
+    def __init__(
+        self,
+        spec: LatencySpec,
+        seed: int,
+        period_s: float,
+        observation_bytes: int,
+        on_heard: Callable[[float], None] = lambda latency_s: None,
+        on_stale: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
+        self.hold = CommandHold(0.0, period_s)
+        self._link = make_network(spec, seed)
+        self._on_heard, self._on_stale = on_heard, on_stale
+        # A heap by arrival time; messages of the same time keep their order.
+        self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
+        self._numbers = itertools.count()
+        self._newest_at_edge = -1
+        self._safety = Safety(period_s)
+        self._freshness = Freshness(self._safety.answer_s)
+        self._unanswered = -1  # The step of a state that came too late to be driven on
+        self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
+        self._admitted_s = 0.0
+
+    def send_state(self, step: int, message: Message) -> None:
+        """Begin tick ``step``: its state leaves the vehicle."""
+        tick_s = step * self._period_s
+        self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
+        for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
+            self._push(arrival_s, partial(self._arrive_at_edge, step, message))
+
+    def next_at_edge(self) -> Arrival[Message] | None:
+        """Let time run to the next state's arrival at the edge runtime; None at window end."""
+        while self._under_way and self._under_way[0][0] <= self._window_end_s + ROUNDING_S:
+            now_s, _, arrive = heapq.heappop(self._under_way)
+            if arrival := arrive(now_s):
+                return arrival
+        return None
+
+    def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
+        """Send the answer to the newest state back; ``computing_s`` is reported only.
+
+        An edge runtime that drives does not answer a state that lags too far behind.
+        """
+        if arrival.step == self._unanswered:
+            return
+        if self._safety.mode is Mode.SAFE_STOP:
+            command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
+        if command.plan:  # as long as the edge runtime's own silence
+            ride_s = len(command.plan) * self._period_s
+            self._safety = self._safety._replace(ride_s=ride_s)
+        for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
+            self._push(arrival_s, partial(self._arrive_at_vehicle, command, computing_s))
+
+    def decide(self, edge_silent: bool = False) -> Decision:
+        """Decide this tick; for ``edge_silent`` see ``CommandHold.decide``."""
+        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
+        answered = self.hold.newest_step >= self._step
+        return self.hold.decide(self._admitted_s if answered else self._window_end_s, edge_silent)
+
+    def _push(self, arrival_s: float, arrive: Callable[[float], Arrival[Message] | None]) -> None:
+        heapq.heappush(self._under_way, (arrival_s, next(self._numbers), arrive))
+
+    def _arrive_at_edge(self, step: int, message: Message, now_s: float) -> Arrival[Message]:
+        overtaken = step <= self._newest_at_edge
+        if not overtaken:
+            self._newest_at_edge = step
+            self._judge(step, now_s)
+        return Arrival(step, now_s, message, overtaken)
+
+    def _judge(self, step: int, now_s: float) -> None:
+        """Let the edge runtime's safety machine judge the arrival of a newest state."""
+        gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
+        if gap is not None:
+            self._safety = advance(self._safety, gap)
+        stands, sent_s = self._safety.mode is Mode.SAFE_STOP, step * self._period_s
+        lag_s = self._freshness.lag_s("", sent_s, now_s, None, stands)
+        if lag_s > self._safety.answer_s + ROUNDING_S:
+            self._safety = advance(self._safety, Event.LATE)
+            self._unanswered = step if self._safety.mode is Mode.DRIVE else -1
+            return
+        self._safety = note_arrival(self._safety, "", now_s)
+        fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = advance(self._safety, fresh)
+
+    def _arrive_at_vehicle(self, command: Command, computing_s: float, now_s: float) -> None:
+        answered_step = self.hold.newest_step
+        if not self.hold.admit(command, now_s):
+            self._on_stale()
+            return
+        self._admitted_s = now_s
+        if command.step > answered_step:
+            self._on_heard(now_s - command.step * self._period_s + computing_s)

@@ -1,4 +1,4 @@
-"""Both ends of the bridge on Zenoh, the options that commands share, and ``bridge router``.
+"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `bridge record`.
 
 The simulator's port publishes states and hands on what comes back. A listener (viewer, recorder)
 hears every topic through a bounded queue. Zenoh's threads only put into it, so a listener that
@@ -16,32 +16,42 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
 import zenoh
 
-from bridge.environments import picture_of, scene_of
+from bridge.environments import picture_of, say_once, scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import GRAMMAR, parse_spec
+from bridge.recording import RecordingWriter, new_recording
 from edge_runtime import tls as access
-from edge_runtime.cli import Subcommand, examples, not_negative, seconds, sigterm_as_interrupt
+from edge_runtime.cli import (
+    Subcommand,
+    examples,
+    not_negative,
+    quit_on_signals,
+    seconds,
+    sigterm_as_interrupt,
+)
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
 RETRY_S = 0.1
+FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
+NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
 QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 QUERY_S = 1.0
-_UNDRAWN: set[type[Exception]] = set()  # Already reported
 
 
 def scene_payload(environment: Any, stamps: Scene) -> bytes:
@@ -51,9 +61,7 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
             return encode_scene(scene, stamps)
         stamps = msgspec.structs.replace(stamps, picture=picture_of(environment))
     except Exception as error:  # Somebody else's code; the drive goes on
-        if type(error) not in _UNDRAWN:  # Not at every step, whose number may be in its text
-            _UNDRAWN.add(type(error))
-            print(f"the environment cannot be shown: {error!r}", file=sys.stderr)
+        say_once(f"the environment cannot be shown: {type(error).__name__}")
     return encode_scene({}, stamps)
 
 
@@ -96,7 +104,7 @@ class SimulatorPort:
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
-        while not self._edge_is_there():
+        while not any(True for _ in self._statuses()):
             if self._tls is not None:
                 self._tls.require_valid(time.time())
             if time.monotonic() >= give_up_s:
@@ -117,12 +125,6 @@ class SimulatorPort:
                 fields = msgspec.json.decode(status, type=dict[str, msgspec.Raw])
                 return msgspec.json.decode(fields["manifest"], type=Manifest)
         return None
-
-    def _edge_is_there(self) -> bool:
-        """Return whether its token is there or it answers: Zenoh can lose the token for a while."""
-        alive = key(self.vehicle_id, "alive")
-        tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
-        return any(reply.ok for reply in tokens) or any(True for _ in self._statuses())
 
     def _statuses(self) -> Iterator[bytes]:
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
@@ -199,23 +201,23 @@ class WireListener:
                 return
 
     def hear(self, sample: zenoh.Sample) -> None:
-        key, size = str(sample.key_expr), len(sample.payload)
-        if "*" in key:
-            return  # put to many vehicles at once: no vehicle's own
-        # A flood of huge messages must not fill the memory.
-        self._put(key, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
+        """Queue a message; a flood of huge ones must not fill the memory."""
+        size = len(sample.payload)
+        self._put(sample, sample.payload.to_bytes() if size <= MAX_STATE_BYTES else b"", size)
 
     def watch(self, sample: zenoh.Sample) -> None:
+        """Queue the change of a token."""
         key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
-        if "*" in key:
-            return
-        if key.endswith("/simulator"):
+        if key.endswith("/simulator") and "*" not in key:
             (self._simulators.add if here else self._simulators.discard)(key)
             if here:
                 self.simulator_seen.set()
-        self._put(key, bytes([here]), size=1)
+        self._put(sample, bytes([here]), size=1)
 
-    def _put(self, key: str, payload: bytes, size: int) -> None:
+    def _put(self, sample: zenoh.Sample, payload: bytes, size: int) -> None:
+        key = str(sample.key_expr)
+        if "*" in key:
+            return  # Put to many vehicles at once: no vehicle's own
         topic, arrived_ns = key.rpartition("/")[2], self._zero_ns + time.monotonic_ns()
         try:
             self.queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
@@ -315,31 +317,25 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "settings from a file of `python -m deploy router`, without other options"
+    config = "settings from a file of `python -m deploy router`, in the place of other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
     listens, config = arguments.listen or [DEFAULT_ENDPOINT], arguments.config
-    if config and (arguments.listen or arguments.tls or arguments.vehicle_id):
-        raise UserError("--config goes with no other option: the file says it all")
     tls, rules = tls_for(arguments.tls, *listens), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
-        if config is None:
-            session = open_session(listen=listens, mode="router", tls=tls, access=rules)
-        else:
-            read_bytes(config, "router's config file")
-            try:  # as zenohd would
-                session = zenoh.open(zenoh.Config.from_file(config))
-            except zenoh.ZError as error:
-                raise UserError(f"Zenoh opens no router with {config}: {error}") from None
+        try:  # As zenohd would
+            session = zenoh.open(zenoh.Config.from_file(config)) if config else None
+        except zenoh.ZError as error:
+            raise UserError(f"Zenoh opens no router with {config}: {error}") from None
+        session = session or open_session(listen=listens, mode="router", tls=tls, access=rules)
         with closing(session):
-            print(f"ready config={config}" if config else f"ready listen={','.join(listens)}")
-            sys.stdout.flush()
+            print(f"ready {config or ','.join(listens)}", flush=True)
             wait_to_be_told(tls)
     return 0
 
@@ -353,3 +349,67 @@ ROUTER = Subcommand(
     _add_router_arguments,
     _run_router,
 )
+
+
+def _add_record_arguments(parser: Any) -> None:
+    add, one = parser.add_argument, "record this vehicle only (otherwise all)"
+    linger = "longest wait for a simulator that has gone to come back, in s"
+    out = "the recording, which must not exist yet"
+    add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--vehicle-id", default=None, help=one)
+    add("--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger)
+
+
+def _run_record(arguments: Any) -> int:
+    """Record until the simulators go, the time is over, or somebody interrupts."""
+    tls = tls_for(arguments.tls, arguments.connect)
+    path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
+    ended = threading.Event()
+    with (
+        sigterm_as_interrupt(),
+        open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
+        closing(RecordingWriter(path)) as writer,
+    ):
+
+        def end() -> bool:
+            ended.set()
+            return True
+
+        print(f"recording {path}", flush=True)
+        try:
+            # A signal is the ordinary way to end a recording: it must not cut a message in two.
+            with quit_on_signals(end):
+                _listen(listener, writer, arguments, ended)
+                writer.finish()
+        except OSError as error:
+            stopped = f"error: recording {path} stopped: {error.strerror}"
+            print(f"{stopped}; it holds what was written before", file=sys.stderr)
+            return NOT_WRITTEN
+    if listener.dropped:
+        dropped = counted(listener.dropped, "message")
+        print(f"{dropped} came faster than they could be written", file=sys.stderr)
+    print(f"wrote {path}: {counted(writer.messages, 'message')}")
+    return 0
+
+
+def _listen(
+    listener: WireListener, writer: RecordingWriter, arguments: Any, ended: threading.Event
+) -> None:
+    flush_s = time.monotonic() + FLUSH_S
+    for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
+        if heard is not None:
+            # Under a flood the copies for viewers are the first to go.
+            writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
+        if time.monotonic() >= flush_s:
+            writer.flush()
+            flush_s = time.monotonic() + FLUSH_S
+        if ended.is_set():
+            return
+
+
+RECORD_EXAMPLE = examples(
+    "python -m bridge record --out drive.mcap",
+    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
+)
+RECORD = Subcommand(RECORD_EXAMPLE, _add_record_arguments, _run_record)

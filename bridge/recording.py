@@ -1,55 +1,53 @@
-"""Read MCAP recordings, also those cut off by a kill or a full disk, and damaged ones.
+"""Recordings of the wire as MCAP files, read and written.
 
-A chunk has a checksum: one that does not match is left out and counted. Where even the length of a
-record is broken, reading goes on at the next chunk, which is searched byte by byte.
+The file holds the exact payloads for replay, and copies that viewers can draw:
 
-Anybody may have made the file. The size that a chunk announces is checked before it is unpacked,
-and the work of reading is limited by the length of the file.
+| topic | encoding |
+|---|---|
+| ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
+| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
+| ``view/<id>/frames`` | ``foxglove.RawImage`` of each picture array: frame t-1 above frame t |
+| ``view/<id>/<topic>``, of every topic of the wire | ``phil.State`` and so on |
+| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
+
+The copies are JSON with a JSON Schema of the structs: Foxglove reads any, and knows
+``foxglove.RawImage`` and ``foxglove.Log`` by name. rerun reads none; `bridge view` is for it.
 """
 
 from __future__ import annotations
 
-import os
-import re
+import contextlib
+import functools
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+import msgspec
 import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata
-from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
-from mcap.writer import MCAP0_MAGIC
+from mcap.reader import SeekingReader, Summary
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from bridge.messages import DECODERS, Heard, decode
+from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, decode, images_of
+from edge_runtime import __version__, wire
+from edge_runtime.files import check_writable, make_directory
+from edge_runtime.manifest import Layout
 from edge_runtime.util import UserError, counted, open_regular
-from edge_runtime.wire import Rejection
 
 WIRE_ENCODING = "msgpack"
-METADATA = "phil"
+ENCODING, SCHEMA_ENCODING = "json", "jsonschema"  # Of the copies for viewers
+CHUNK_BYTES = 1 << 20
 MAX_RECORD_BYTES = 8 << 20
 """Of a record, and of a chunk when it is unpacked; ours hold little more than 5 MiB."""
-MAX_WORK = 200
-"""Bytes read for each byte of the file, above one record."""
-RECORD_BYTES = 256
-"""Work that a record in a chunk counts as, however empty it is."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
 )  # fmt: skip
-"""Exceptions of the libraries for bytes that are no MCAP."""
-LANDMARK = re.compile(
-    rb"\x06(?=.{4}\x00{4}.{28}\x04\x00{3}zstd)"  # a chunk as we write it
-    rb"|\x0c(?=.{4}\x00{4}\x04\x00{3}phil)"  # our metadata
-    rb"|\x02(?=\x14\x00{7}.{20}\x89MCAP0\r\n)",  # the footer
-    re.DOTALL,
-)
-"""First bytes of records that can be recognised without knowing where the one before ends."""
-LANDMARK_BYTES = 45
-BLOCK_BYTES = 1 << 16
+"""Exceptions of the libraries for bytes that are no MCAP. Anybody may have made the file."""
 
 
 class Recording:
@@ -58,32 +56,20 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.invalid_messages = 0  # Of the last pass of `valid_messages`
-        self._begin()
-
-    def _begin(self) -> None:
-        self.metadata: dict[str, str] = {}
         self.cut_off = False
-        """The file ends without its index, between two records or within a record: a kill."""
-        self.torn_bytes = 0  # Of the record within which the file stops
-        self.damaged_places = 0
-        self.damaged_bytes = 0
-        self.nameless_messages = 0  # Whole ones whose topic stood in a broken part alone
-        self._work_bytes = 0
+        """The file has no end of its own: a kill, or damage beyond which nothing can be read."""
+        self.damaged_places = 0  # Chunks that do not match their checksums
 
     @property
     def is_damaged(self) -> bool:
         """Whether more is amiss than a kill leaves behind."""
-        return self.damaged_places > 0 or self.nameless_messages > 0
+        return self.damaged_places > 0
 
     def trouble(self) -> str:
         """Return what is wrong with the file, as a verb with its object; empty: nothing."""
-        if not (self.is_damaged or self.cut_off):
-            return ""
-        lost = counted(self.damaged_bytes + self.torn_bytes, "byte")
-        what = "was cut off"
         if self.is_damaged:
-            what = f"has {counted(self.damaged_places, 'damaged place')}"
-        return f"{what} ({lost} and {counted(self.nameless_messages, 'message')} lost)"
+            return f"has {counted(self.damaged_places, 'damaged place')}"
+        return "was cut off" if self.cut_off else ""
 
     def say_trouble(self, taken: str = "") -> None:
         """Print the trouble, if any, in one line on stderr, with how much is taken."""
@@ -101,112 +87,55 @@ class Recording:
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Yield the messages, with their channels, in the order of the file, that of arrival.
 
-        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
-        reading than its size accounts for.
+        A damaged chunk is left out and counted; a torn file is read up to the tear.
+        UserError for a file that is not there, cannot be read, or is no MCAP at all.
         """
-        channels: dict[int, Channel] = {}
-        has_looked = False
-        for record in self._records():
-            if isinstance(record, Metadata):
-                self.metadata |= record.metadata
-            elif isinstance(record, Channel):
-                # The first of an id counts: it is from a chunk, which has a checksum.
-                channels.setdefault(record.id, record)
-            elif isinstance(record, Message):
-                if record.channel_id not in channels and not has_looked:
-                    # The chunk that named it is broken; the index at the end repeats all names.
-                    has_looked = True
-                    for other in Recording(self.path)._records():
-                        if isinstance(other, Channel):
-                            channels.setdefault(other.id, other)
-                if channel := channels.get(record.channel_id):
-                    yield channel, record
-                else:
-                    self.nameless_messages += 1
-
-    def _records(self) -> Iterator[McapRecord]:
-        """Yield every record that can be read, a chunk as what it holds."""
-        self._begin()
+        self.cut_off, self.damaged_places, self._whole_chunks = True, 0, 0
         try:
             with open_regular(self.path) as stream:
-                begins = stream.read(MAGIC_SIZE) == MCAP0_MAGIC
-                self._size = stream.seek(0, os.SEEK_END)
-                stream.seek(max(0, self._size - MAGIC_SIZE))
-                self.cut_off = stream.read(MAGIC_SIZE) != MCAP0_MAGIC
-                if self._size <= MAGIC_SIZE or (self.cut_off and not begins):
+                if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     raise UserError(f"{self.path} is no MCAP recording")
-                yield from self._walk(stream)
+                summary = _summary(stream)
+                channels = dict(summary.channels)
+                stream.seek(len(MCAP0_MAGIC))
+                for record in self._records(stream):
+                    if isinstance(record, Channel):
+                        channels[record.id] = record
+                    elif isinstance(record, Message) and record.channel_id in channels:
+                        yield channels[record.channel_id], record
         except OSError as error:
             raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
+        if summary.statistics is not None:  # Some may have been no chunks to the reader.
+            self.damaged_places = max(0, summary.statistics.chunk_count - self._whole_chunks)
 
-    def _walk(self, stream: BinaryIO) -> Iterator[McapRecord]:
-        at = MAGIC_SIZE
-        while at < self._size:
-            stream.seek(at)
-            reader = StreamReader(stream, True, True, record_size_limit=MAX_RECORD_BYTES)
-            try:
-                for record in reader.records:
-                    end = stream.tell()
-                    stream.seek(at + 1)
-                    said = 9 + int.from_bytes(stream.read(8), "little")
-                    stream.seek(end)
-                    parts = _parts(record, end - at, said)
-                    self._spend(RECORD_BYTES * len(parts))
-                    at = end
-                    yield from parts
-                    if isinstance(record, Footer):
-                        self.cut_off = False
-                        return
-            except TORN:
-                if at >= self._size:  # It ends between two records.
-                    return
-                read_to = stream.tell()
-                self._spend(read_to - at + BLOCK_BYTES)
-                end = _find_landmark(stream, at + 1)
-                if self.cut_off and min(read_to, end) >= self._size:
-                    self.torn_bytes = end - at
-                else:
+    def _records(self, stream: BinaryIO) -> Iterator[McapRecord]:
+        """Yield what the chunks hold; no checksum is over a record outside of them."""
+        reader = StreamReader(stream, True, True, record_size_limit=MAX_RECORD_BYTES)
+        with contextlib.suppress(*TORN):
+            for record in reader.records:
+                if isinstance(record, Footer):
+                    self.cut_off = False
+                if not isinstance(record, Chunk):
+                    continue
+                try:
+                    size = zstandard.frame_content_size(record.data) if record.compression else 0
+                    if max(size, record.uncompressed_size) > MAX_RECORD_BYTES:
+                        raise ValueError("a chunk larger than any of ours")
+                    parts = breakup_chunk(record, validate_crc=True)
+                except TORN:
                     self.damaged_places += 1
-                    self.damaged_bytes += end - at
-                at = end
-
-    def _spend(self, count: int) -> None:
-        """Count the bytes read; UserError for more than damage explains."""
-        self._work_bytes += count
-        if self._work_bytes > MAX_RECORD_BYTES + MAX_WORK * self._size:
-            what = f"reading it takes more than {MAX_WORK} times its size"
-            raise UserError(f"recording {self.path} is refused: {what}")
+                else:
+                    self._whole_chunks += 1
+                    yield from parts
 
 
-def _parts(record: McapRecord, size: int, said: int) -> list[McapRecord]:
-    """Return a record that took ``size`` bytes and announced ``said``; a chunk as its contents.
-
-    Raises one of TORN if it is not whole.
-    """
-    builder = RecordBuilder()
-    record.write(builder)
-    # The library reads on over lengths that do not fit, or skips some.
-    if not builder.count == size == said:
-        raise ValueError("a record of another length than it says")
-    if not isinstance(record, Chunk):
-        return [] if isinstance(record, Message) else [record]  # No checksum is over that one.
-    size = zstandard.frame_content_size(record.data) if record.compression else len(record.data)
-    # -1: the data do not say. They are then unpacked up to what the chunk says.
-    if size not in (-1, record.uncompressed_size) or record.uncompressed_size > MAX_RECORD_BYTES:
-        raise ValueError(f"a chunk of {record.uncompressed_size} bytes")
-    return breakup_chunk(record, validate_crc=True)
-
-
-def _find_landmark(stream: BinaryIO, at: int) -> int:
-    """Return where the next record begins that can be recognised, or the file's end."""
-    while True:
-        stream.seek(at)
-        block = stream.read(BLOCK_BYTES + LANDMARK_BYTES)
-        if match := LANDMARK.search(block):
-            return at + match.start()
-        if len(block) < BLOCK_BYTES + LANDMARK_BYTES:
-            return at + len(block)
-        at += BLOCK_BYTES
+def _summary(stream: BinaryIO) -> Summary:
+    """Return the index, which repeats all channels: the chunk that names one may be damaged."""
+    with contextlib.suppress(*TORN, OSError):
+        stream.seek(0)
+        if found := SeekingReader(stream, record_size_limit=MAX_RECORD_BYTES).get_summary():
+            return found
+    return Summary()
 
 
 def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
@@ -235,7 +164,7 @@ def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Hear
     for heard in heard_of(recording, vehicle_id):
         if heard.topic in DECODERS:
             message = decode(heard)
-            if isinstance(message, Rejection):
+            if isinstance(message, wire.Rejection):
                 recording.invalid_messages += 1
             else:
                 yield heard, message
@@ -247,3 +176,198 @@ def _wire_topic(channel: Channel) -> tuple[str, str]:
     if channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
         return "", ""
     return parts[1], parts[2]
+
+
+class RecordingWriter:
+    """Writes one recording. Not thread-safe; any call raises OSError where the disk is full."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages = 0
+        self._copies = ViewerCopies(self._add_copy)
+        self._file, self._mcap = new_recording_at(path)
+        # Each is registered once; with its schema, as a picture may have the name of a message.
+        self._channel = functools.cache(self._mcap.register_channel)
+        self._schema = functools.cache(self._mcap.register_schema)
+
+    def write(self, heard: Heard, with_view: bool = True) -> None:
+        """Add one message; ``with_view`` False leaves out the copy for viewers."""
+        self.messages += 1
+        if heard.topic in TOKEN_TOPICS:
+            text = b'{"here": true}' if heard.payload == b"\x01" else b'{"here": false}'
+            self._add(heard.key, ENCODING, heard.arrived_ns, text)
+        elif heard.is_whole:
+            self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
+        if with_view:
+            self._copies.write(heard)
+
+    def flush(self) -> None:
+        """End the chunk: a kill does not lose what was written before."""
+        self._mcap.flush()
+
+    def finish(self) -> None:
+        """Write the index: the recording is whole."""
+        self._mcap.finish()
+        self._file.close()
+
+    def close(self) -> None:
+        """Close the file, finished or not."""
+        close_torn(self._file)
+
+    def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
+        schema_id = self._schema(schema.name, SCHEMA_ENCODING, schema.data)
+        self._add(topic, ENCODING, now_ns, data, schema_id)
+
+    def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
+        channel_id = self._channel(topic, encoding, schema_id)
+        self._mcap.add_message(channel_id, now_ns, data, now_ns)
+
+
+def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
+    """Begin a new MCAP file, in chunks with checksums; UserError, and no file, on a full disk."""
+    make_directory(path.parent)
+    stream = path.open("xb")
+    try:
+        writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+        writer.start(profile="", library=f"phil-hil {__version__}")
+        writer.flush()  # Before anybody is told of the file, it is an MCAP file.
+    except OSError as error:
+        close_torn(stream)
+        path.unlink()
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    return stream, writer
+
+
+def close_torn(stream: BinaryIO) -> None:
+    """Close a file whose last bytes the disk may not take."""
+    with contextlib.suppress(OSError):
+        stream.close()
+
+
+@contextlib.contextmanager
+def whole_recording(path: str) -> Iterator[RecordingWriter]:
+    """Write a recording in one go; where that fails, no file is left."""
+    new_recording(path)
+    with contextlib.closing(RecordingWriter(Path(path))) as writer:
+        try:
+            yield writer
+            writer.finish()
+        except BaseException:
+            Path(path).unlink()
+            raise
+
+
+def new_recording(path: str) -> str:
+    """Return the absolute path; UserError where no recording could be begun there."""
+    check_writable(path)
+    if Path(path).exists():
+        raise UserError(f"{path} exists; choose another name: no recording is lost")
+    return str(Path(path).absolute())
+
+
+class Stamp(msgspec.Struct):
+    """Time since 1970."""
+
+    sec: int
+    nsec: int
+
+
+class RawImage(msgspec.Struct):
+    """``foxglove.RawImage``."""
+
+    timestamp: Stamp
+    width: int
+    height: int
+    encoding: str
+    step: int
+    data: bytes
+    frame_id: str
+
+
+class Log(msgspec.Struct):
+    """``foxglove.Log``, of which we fill time, level, text and sender."""
+
+    timestamp: Stamp
+    level: int
+    message: str
+    name: str
+    file: str = ""
+    line: int = 0
+
+
+class Schema(NamedTuple):
+    """A message type: its full name, and its JSON Schema."""
+
+    name: str
+    data: bytes
+
+
+NOT_COPIED = {"observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal"}
+"""Fields that no viewer plots."""
+INFO, WARNING = 2, 3  # Of ``foxglove.Log.level``
+
+
+@functools.cache
+def describe(kind: type[msgspec.Struct]) -> Schema:
+    """Return the schema of the fields that are copied for viewers; None is never copied."""
+    _, parts = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
+    fields = parts.pop(kind.__name__)["properties"].items()
+    copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
+    schema = {"type": "object", "properties": copied, "$defs": parts}  # As Foxglove wants it
+    package = "foxglove" if kind in (RawImage, Log) else "phil"
+    return Schema(f"{package}.{kind.__name__}", msgspec.json.encode(schema))
+
+
+class ViewerCopies:
+    """Makes copies that viewers can draw, and hands each to ``add``. Not thread-safe."""
+
+    def __init__(self, add: Callable[[str, Schema, int, bytes], None]) -> None:
+        self._add = add
+        self._layouts: dict[str, Layout | None] = {}  # By the vehicle, as its scenes say
+
+    def write(self, heard: Heard) -> None:
+        """Copy a message, or log an event about it."""
+        if heard.topic in TOKEN_TOPICS:
+            who = "edge runtime" if heard.topic == "alive" else "simulator"
+            what = "is here" if heard.payload == b"\x01" else "has gone"
+            self._event(heard, INFO, f"{who} {what}")
+            return
+        if not heard.is_whole:
+            self._event(heard, WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
+            return
+        message = decode(heard)
+        if isinstance(message, wire.Rejection):
+            self._event(heard, WARNING, f"unreadable {heard.topic}: {message.detail}")
+            return
+        self._copy(heard, heard.topic, message)
+        if isinstance(message, Scene):
+            self._layouts[heard.vehicle_id] = Layout(message.task) if message.task else None
+        elif isinstance(message, wire.State) and (layout := self._layouts.get(heard.vehicle_id)):
+            self._copy_images(heard, message, layout)
+
+    def _copy_images(self, heard: Heard, state: wire.State, layout: Layout) -> None:
+        if layout.refusal(state.observation) is not None:
+            return
+        for name, array in layout.arrays(state.observation).items():
+            if (images := images_of(array)) is None:
+                continue
+            # They lie one after the other: in memory that is one picture, so many times as high.
+            count, height, width, colours = images.shape
+            encoding = "rgb8" if colours == 3 else "mono8"
+            size = (width, count * height, encoding, width * colours)
+            image = RawImage(_stamp(heard), *size, images.tobytes(), heard.vehicle_id)
+            self._copy(heard, name, image)
+
+    def _event(self, heard: Heard, level: int, text: str) -> None:
+        self._copy(heard, "events", Log(_stamp(heard), level, text, heard.vehicle_id))
+
+    def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
+        """Add what viewers can draw, to the vehicle's topic of that name."""
+        fields = msgspec.structs.asdict(values).items()
+        unknown = (None, msgspec.UNSET)
+        drawn = {n: v for n, v in fields if n not in NOT_COPIED and v not in unknown}
+        topic, data = f"view/{heard.vehicle_id}/{name}", msgspec.json.encode(drawn)
+        self._add(topic, describe(type(values)), heard.arrived_ns, data)
+
+
+def _stamp(heard: Heard) -> Stamp:
+    return Stamp(*divmod(heard.arrived_ns, 10**9))

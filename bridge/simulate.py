@@ -1,30 +1,47 @@
-"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report."""
+"""``python -m bridge simulate``: serve an environment to an edge runtime, and write a report.
+
+`EpisodeRunner` drives one episode of an environment over the wire, by any clock.
+"""
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
+from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
+    Adapter,
     Environment,
     describe,
+    finite,
     make_environment,
+    offered,
     scenarios,
 )
-from bridge.episode import EpisodeRunner, OnTick, policy_action, vehicle_action
-from bridge.inbound import CommandCheck
-from bridge.messages import Origin
+from bridge.inbound import CommandCheck, Decision
+from bridge.messages import Origin, Scene
+from bridge.outcomes import outcome_of
 from bridge.ports import SimulatorPort, add_options, open_port
-from bridge.progress import ProgressBar
-from bridge.report import episode_line, make_report, summary_line
-from bridge.virtual_link import Decision
+from bridge.report import (
+    EpisodeResult,
+    ProgressBar,
+    SafeStopLog,
+    accelerations,
+    episode_line,
+    make_report,
+    number_of,
+    of_known,
+    summary_line,
+)
 from edge_runtime.cli import (
     ArgumentParser,
     examples,
@@ -33,11 +50,14 @@ from edge_runtime.cli import (
     sigterm_as_interrupt,
 )
 from edge_runtime.files import write_json_out
-from edge_runtime.run import rearm_command
+from edge_runtime.manifest import Task
+from edge_runtime.safety import Event
 from edge_runtime.transport import DEFAULT_ENDPOINT, tls_for
-from edge_runtime.util import UserError, printable
+from edge_runtime.util import UserError
+from edge_runtime.wire import State
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
+PEDAL = "pedal"
 EXAMPLE = examples(
     "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime --latency 50ms+-10ms",
     "python -m bridge simulate --env SCENARIO --condition variant --episodes 20 --out r.json",
@@ -87,55 +107,43 @@ def run(asked: Namespace) -> int:
         kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
         check = CommandCheck(port.session, task)
         clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
-        bar = stack.enter_context(ProgressBar("episodes", asked.episodes))
-        bar.show("waiting for an edge runtime")
         port.hear("command", clock.receive)
         port.wait_for_edge(wait_s, endpoint)
         if isinstance(clock, VehicleClock):
             port.hear("feedback", clock.receive_feedback)
             clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-        report = _drive(asked, environment, port, clock, bar)
+        report = _drive(asked, environment, port, clock)
     write_json_out(asked.out, report)
     print(summary_line(report))
     return 0
 
 
 def _drive(
-    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock, bar: ProgressBar
+    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
     network, task, manifest = str(asked.latency), clock.task, port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
-    runner = EpisodeRunner(
-        environment,
-        clock,
-        port.publish_scene,
-        _shown_on(bar, port, rearm_command(asked.connect or asked.listen, asked.vehicle_id)),
-        task,
-        Origin(session=port.session, environment=asked.env, latency=network, **how),
-        apply=vehicle_action if vehicle else policy_action,
-    )
+    origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
+    apply = vehicle_action if vehicle else policy_action
+    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin, apply)
     # Without a manifest, the edge runtime itself compares what the states say.
     if manifest is not None and manifest.text != task.text:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
-        raise UserError(
-            f"the edge runtime's policy is for another task ({manifest.text!r}) than --env"
-            f" {asked.env} ({task.text!r}); start it with a policy of this, or choose another --env"
-        )
+        raise other_task(task)
     results = []
     port.note_edge_counts()
-    started_s = time.monotonic()
-    for episode in range(asked.episodes):
-        if vehicle is not None:
-            vehicle.wait_for_standstill()
-        results.append(runner.run(episode, asked.seed + episode))
-        stops = [event for event in runner.safe_stops.events if event.episode == episode]
-        told = episode_line(episode + 1, asked.episodes, results[-1], stops)
-        bar.advance({}, told=told)
-    wall_s = time.monotonic() - started_s
+    with ProgressBar("episodes", asked.episodes) as bar:
+        for episode in range(asked.episodes):
+            if vehicle is not None:
+                vehicle.wait_for_standstill()
+            results.append(runner.run(episode, asked.seed + episode))
+            stops = [event for event in runner.safe_stops.events if event.episode == episode]
+            bar.say(episode_line(episode + 1, asked.episodes, results[-1], stops))
+            bar.advance({})
     port.note_edge_counts()
     edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
     facts = {
@@ -145,32 +153,155 @@ def _drive(
         "policy_ids": clock.check.policy_ids,
         "deadline_misses": runner.deadline_misses,
         "ridden_steps": runner.ridden_steps,
-        "tick_overruns": clock.tick_overruns,
         "missed_ticks": clock.missed_ticks,
         "wall_clock_stalls": clock.wall_clock_stalls,
-        "edge_changes": edge.changes,
         "rejected": dict(edge.rejected + by_simulator),
         "rejected_by_edge": dict(edge.rejected),
         "rejected_by_simulator": dict(by_simulator),
-        "wall_s": wall_s,
-        "vehicle": vehicle.report() if vehicle else None,
+        "vehicle": vehicle.log.report() if vehicle else None,
     }
-    stops, ages_ms = runner.safe_stops.events, runner.command_ages_ms
-    return make_report(results, stops, clock.latencies_ms, ages_ms, facts)
+    return make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
 
 
-def _shown_on(bar: ProgressBar, port: SimulatorPort, rearm: str) -> OnTick:
-    """Return what shows each tick on the bar, and says when the vehicle waits for a re-arm."""
-    waited = False
+def other_task(task: Task) -> UserError:
+    return UserError(
+        f"the edge runtime's policy is for another task than --env ({task.text!r}); start it with"
+        " a policy of this one, or choose another --env"
+    )
 
-    def on_tick(episode: int, step: int, decision: Decision) -> None:
-        nonlocal waited
-        doing = f"braking: {decision.brake_reason}" if decision.brake_reason else "driving"
-        bar.show(f"step {step:3d}  {printable(doing)[:40]}")
-        newest = port.edge_counts.newest
-        waits = newest is not None and newest.needs_rearm
-        if waits and not waited:
-            bar.say(f"the vehicle stands until it is re-armed: {rearm}")
-        waited = waits
 
-    return on_tick
+def policy_action(adapter: Adapter, decision: Decision) -> np.ndarray:
+    """Return the command's action, the safe stop's, or (before the first command) hands off."""
+    adapter.press_brake(bool(decision.brake_reason))
+    if decision.brake_reason:
+        return adapter.stop()
+    if decision.command is None:
+        return adapter.hands_off
+    return adapter.within(decision.command.action)
+
+
+def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
+    """Return what the vehicle's actuators have reached; the safe stop without feedback.
+
+    Where the vehicle reports the speed of the scenario's car and the environment knows which pedal
+    leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
+    for what the last step missed, while errors of pedals would add up.
+    """
+    adapter.press_brake(bool(decision.brake_reason))
+    if decision.feedback is None:
+        return adapter.stop()
+    pedal_for_speed = offered(adapter.env, "pedal_for_speed")
+    speed_mps, action = decision.feedback.scenario_speed_mps, list(decision.feedback.action)
+    for place, row in enumerate(adapter.task.action):
+        if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
+            action[place] = float(pedal_for_speed(speed_mps))
+    return adapter.within(action)
+
+
+@dataclass
+class EpisodeRunner:
+    """Drives one environment through a clock and collects figures for the report."""
+
+    environment: Environment
+    clock: Clock
+    publish_scene: Callable[[Any, Scene], None]
+    """Called with the environment and the fields to add to its own scene."""
+    task: Task
+    origin: Origin
+    """Sent with every scene; each episode has a seed of its own."""
+    apply: Callable[[Adapter, Decision], np.ndarray] = policy_action
+    """Returns the action of one tick, and presses or releases the brake."""
+
+    def __post_init__(self) -> None:
+        self._period_s = self.task.control_period_s
+        self.safe_stops = SafeStopLog(self._period_s)
+        self._adapter = Adapter(self.environment, self.task)
+        self.deadline_misses = 0
+        self.ridden_steps = 0
+        """Ticks in which an action of an earlier command's plan was done."""
+
+    def show_task(self, seed: int) -> None:
+        """Send one state, which is final, so that the edge runtime compares the task as well.
+
+        It holds no observation: another policy's may be of another size.
+        """
+        self.clock.begin(0, seed)
+        self.clock.finish(self._state(0, 0, None, {}, final=True))
+
+    def run(self, episode: int, seed: int) -> EpisodeResult:
+        """Drive one episode to its end; the seed decides the environment and the link.
+
+        Where it is cut short (^C, a fault of the environment) a final state goes out as well, so
+        that the edge runtime stands by instead of stopping for a link that seems to be lost.
+        """
+        self._under_way: State | None = None
+        try:
+            return self._drive(episode, seed)
+        except BaseException:
+            if (cut := self._under_way) is not None:
+                self.clock.finish(msgspec.structs.replace(cut, step=cut.step + 1, final=True))
+            raise
+
+    def _drive(self, episode: int, seed: int) -> EpisodeResult:
+        options = {"standing": True} if self.origin.standing else None
+        observation, info = self.environment.reset(seed=seed, options=options)
+        self.clock.begin(episode, seed)
+        self._adapter.last = self._adapter.hands_off
+        self.origin = msgspec.structs.replace(self.origin, seed=seed)
+        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
+        applied: dict[str, Any] = {}  # What the scene says of the step before
+        felt, ended = [], False
+        while not ended:
+            state = self._state(episode, result.steps, observation, info)
+            self._show(state, applied)
+            self._under_way = state
+            decision = self.clock.exchange(state)
+            if decision.brake_reason == Event.OTHER_TASK.value:
+                raise other_task(self.task)
+            action = self.apply(self._adapter, decision)
+            observation, reward, terminated, truncated, info = self.environment.step(action)
+            result.steps += 1
+            result.actions.append([float(value) for value in action.ravel()])
+            result.reward += finite("reward", reward)
+            felt.append(accelerations(info))
+            self.deadline_misses += not decision.fresh
+            self.ridden_steps += decision.ridden > 0
+            self.safe_stops.observe(episode, state.step, decision)
+            braked = bool(decision.brake_reason)
+            applied = {"applied": result.actions[-1], "braked": braked, "ridden": decision.ridden}
+            ended = bool(terminated or truncated)
+        final = self._state(episode, result.steps, observation, info, final=True)
+        self._show(final, applied)
+        self.clock.finish(final)
+        self._under_way = None
+        result.outcome = outcome_of(info, only_truncated=not terminated)
+        result.distance_m = number_of(info, "distance_m") or 0.0
+        result.time_s = round(result.steps * self._period_s, 6)
+        result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
+            of_known, zip(*felt, strict=True)
+        )
+        return result
+
+    def _state(
+        self, episode: int, step: int, observation: Any, info: dict[str, Any], final: bool = False
+    ) -> State:
+        return State(
+            session=self.origin.session,
+            episode=episode,
+            step=step,
+            sim_time_s=round(step * self._period_s, 6),
+            sent_ns=0,  # The clock stamps it when it sends it.
+            observation={} if observation is None else self._adapter.pack(observation),
+            speed_mps=number_of(info, "speed_mps"),
+            final=final,
+            task=self.task.text,
+        )
+
+    def _show(self, state: State, applied: dict[str, Any]) -> None:
+        step, round_trip_ms = self.clock.newest_answer() or (None, None)
+        stamps = Scene(
+            episode=state.episode, step=state.step, sim_time_s=state.sim_time_s,
+            round_trip_ms=round_trip_ms, answered_step=step, rejected=dict(self.clock.rejected()),
+            task=self.task, origin=self.origin, **applied,
+        )  # fmt: skip
+        self.publish_scene(self.environment, stamps)

@@ -24,8 +24,7 @@ import onnxruntime
 import zenoh
 
 from bridge.ports import add_options
-from bridge.progress import ProgressBar
-from bridge.report import markdown_table
+from bridge.report import ProgressBar, markdown_table
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
 from edge_runtime.files import write_json_out

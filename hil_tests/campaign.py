@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bridge.progress import ProgressBar
-from bridge.report import markdown_table
+from bridge.report import ProgressBar, markdown_table
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError

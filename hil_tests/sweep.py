@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 
 from bridge.network import parse_spec
 from bridge.outcomes import COLLISION, GOAL
-from bridge.progress import ProgressBar
-from bridge.report import EpisodeResult, markdown_table
+from bridge.report import EpisodeResult, ProgressBar, markdown_table
 from bridge.statistics import Estimate, mean_estimate, success_estimate
 from hil_tests.drivers import Drivers
 

@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from bridge.progress import ProgressBar
-from bridge.report import markdown_table
+from bridge.report import ProgressBar, markdown_table
 from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig

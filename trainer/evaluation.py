@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from bridge.episode import accelerations, finite
+from bridge.environments import finite
 from bridge.network import LatencySpec, parse_spec
 from bridge.outcomes import GOAL
-from bridge.progress import ProgressBar
-from bridge.report import EpisodeResult, of_known, summarise
+from bridge.report import EpisodeResult, ProgressBar, accelerations, of_known, summarise
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, counted, name_in_file, read_json

@@ -16,10 +16,18 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bridge.inbound import BRAKE_PERIODS
 from bridge.messages import DECODERS, Heard, Pace, Scene, decode, images_of, is_picture
 from bridge.ports import open_listener, wait_to_be_told
-from bridge.record import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.recording import (
+    ENCODING,
+    SCHEMA_ENCODING,
+    Recording,
+    Schema,
+    ViewerCopies,
+    choose_vehicle,
+    heard_of,
+)
 from bridge.rerun import (
     APPLIED,
     LOOPBACK,
@@ -32,7 +40,6 @@ from bridge.rerun import (
     open_sink,
 )
 from bridge.rerun.draw import Canvas, Plot
-from bridge.virtual_link import BRAKE_PERIODS
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link import link_words

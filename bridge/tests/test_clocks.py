@@ -11,10 +11,9 @@ import msgspec
 import pytest
 
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
-from bridge.inbound import NO_FEEDBACK, CommandCheck
+from bridge.inbound import NO_COMMAND, NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
 from bridge.report import SafeStopLog
-from bridge.virtual_link import NO_COMMAND
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import encode
@@ -182,7 +181,7 @@ def test_the_wait_for_the_first_answer_brakes_and_is_no_stop(kind, spec, answer,
 def stops_of(decisions):
     log = SafeStopLog(T)
     for step, decision in enumerate(decisions):
-        log.observe(0, step, decision, speed_mps=1.0)
+        log.observe(0, step, decision)
     return [event.reason for event in log.events]
 
 
@@ -194,7 +193,6 @@ def test_a_silent_edge_costs_2_periods_of_wall_time_once_then_one_a_step():
     decisions = rig.exchange(3, 4)
     assert 0.28 <= time.monotonic() - started_s < 1.0
     assert reasons(decisions) == [NO_COMMAND, NO_COMMAND]
-    assert decisions[0].undriven_s >= 0.2
     rig.answer = obedient
     assert reasons(rig.exchange(5)) == [""]
 
@@ -232,7 +230,6 @@ def test_in_real_time_a_stall_is_counted_and_not_caught_up():
         rig.exchange(1)
         began_s = time.monotonic()
         rig.exchange(2)
-    assert rig.clock.tick_overruns == 1
     assert rig.clock.missed_ticks >= 2
     assert time.monotonic() - began_s > 0.9 * T
 
@@ -266,7 +263,6 @@ def test_each_tick_ends_with_what_the_vehicle_did_in_it():
     assert rig.clock.rejected() == {"feedback_malformed": 1, "feedback_foreign_session": 1}
     assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
     assert reasons(decisions) == [""] * 4
-    assert all(0 < age_ms < 200 for age_ms in rig.clock.feedback_ages_ms)
 
 
 def test_an_episode_waits_until_there_is_a_vehicle_and_it_stands(monkeypatch):
@@ -280,11 +276,12 @@ def test_an_episode_waits_until_there_is_a_vehicle_and_it_stands(monkeypatch):
         threading.Timer(0.1, rig.report, [0], {"speed_mps": 0.0, "session": ""}).start()
         rig.clock.check.sent(5)
         rig.clock.wait_for_standstill()
-        assert rig.clock.moving_starts == 0
+        assert rig.check.heard.speed_mps == 0.0
         rig.report(1, speed_mps=0.5)
         wait_until(lambda: rig.check.heard == make_feedback(1, speed_mps=0.5, sent_ns=6), "it")
+        began_s = time.monotonic()
         rig.clock.wait_for_standstill()
-    assert rig.clock.moving_starts == 1
+        assert time.monotonic() - began_s >= 0.3
 
 
 def test_the_car_does_what_the_vehicle_did(tmp_path):
@@ -301,14 +298,12 @@ def test_the_car_does_what_the_vehicle_did(tmp_path):
     report = read(out)
     assert (report["loop"], report["clock"], report["standing"]) == ("vehicle", "realtime", True)
     vehicle = report["vehicle"]
-    assert (vehicle["name"], vehicle["moving_starts"], vehicle["faults"]) == ("mock", 0, {})
+    # A vehicle that takes pedals has no speed set-point.
+    assert vehicle == {"name": "mock", "lag_ms": {"speed": None}, "faults": {}}
     # Its actuators take their time: the pedal comes off the brake, and ends where it was asked.
     pedals = [action[0] for action in report["per_episode"][0]["actions"]]
     assert pedals[0] < 0.3
     assert pedals[10] == pytest.approx(0.3, abs=0.02)
-    assert vehicle["action_error"]["pedal"]["max"] > 0.1
-    # A vehicle that takes pedals has no speed set-point.
-    assert vehicle["speed_error_mps"] == {"rmse": None, "max": None}
     # Nobody reports after a kill: the car brakes, and the report says why.
     last = report["safe_stop_events"][-1]
     assert (last["episode"], last["reason"]) == (0, NO_FEEDBACK)

@@ -22,7 +22,7 @@ ROWS = [
     ("simulate --env TOY --listen BUSY --out r.json", "in use"),
     ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),
     ("simulate --env TOY --loop vehicle", "--loop vehicle needs --clock realtime"),
-    ("router --listen FREE --config router.json5", "goes with no other option"),
+    ("router --config there.mcap", "Zenoh opens no router"),
     ("record --out there.mcap", "exists"),
     ("record --out a.mcap --connect FREE --wait-s 0", "nobody"),
     ("replay LEFT_TURN --policy none.onnx", "does not exist"),

@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 from bridge.messages import Scene, encode_scene
-from bridge.record import RawImage
+from bridge.recording import RawImage
 from bridge.rerun import free_port
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint

@@ -5,7 +5,6 @@ import sys
 
 import pytest
 
-from bridge.replay import Answer, compare
 from hil_tests.testing.drives import bridge_status, flip_chunk, make_policy
 from hil_tests.testing.messages import WHITE, frames, make_state
 from hil_tests.testing.recordings import ANSWER_S, SILENCE, Hand, ns
@@ -28,23 +27,15 @@ def replay(hand, policy=None, *options):
     return status, json.loads(out.read_text()) if out.exists() else {}
 
 
-def is_the_same(hand, compared=None):
-    """Whether the policy that always asks for 0.3 answers as it stands in the recording."""
-    status, report = replay(hand)
-    assert status == 0, report["first_differences"]
-    return compared in (None, report["compared"])
-
-
 def test_the_same_policy_is_equal_and_the_report_says_of_what(hand):
     hand.drive(0, 20)
     hand.state(2.0, 20)  # Nobody answered it.
     hand.state(2.01, 19)  # A network has repeated this one.
     status, report = replay(hand)
     assert status == 0
-    assert (report["states"], report["compared"], report["unanswered"]) == (21, 20, 1)
-    assert (report["equal"], report["different"]) == (20, 0)
+    assert (report["compared"], report["different"], report["unanswered"]) == (20, 0, 1)
     assert 0 < report["largest_difference"] < 1e-7  # 0.3 as float32
-    assert report["by_recorded"] == {"drive": {"compared": 20, "different": 0}}
+    assert report["by_recorded"] == {"drive": 20}
 
 
 def test_another_policy_differs_and_the_tolerance_decides(hand, tmp_path):
@@ -77,9 +68,7 @@ def restart(hand):
     hand.drive(0, 5)
     hand.stop(4, 2)
     hand.hear_health(2.9, 0.5)
-    hand.drive(30, 33)  # The new runtime drives at once.
-    hand.edge_clock_s = 3600.0  # A step of the board's clock changes nothing.
-    hand.drive(33, 36)
+    hand.drive(30, 36)  # The new runtime drives at once.
     hand.state(3.6, 36)  # An inference that took too long is replayed as one.
     slow = {"mode": "safe_stop", "reason": "inference_too_long", "action": [-1.0]}
     hand.command(3.7005, 36, answer_s=0.1005, inference_ns=0, **slow)
@@ -108,13 +97,14 @@ def armed_later(hand):
     hand.drive(13, 20, **NOT_ARMED)
 
 
-def repeated_fault(hand):
-    hand.hear_health(0.0, 5.0, vehicle="mock")
+def faults(hand):
+    hand.hear_health(0.0, 5.0, vehicle="hunter")
     hand.drive(0, 3)
+    hand.command(0.25, 2, answer_s=0.05, inference_ns=0, **FAULT)  # While nothing else happens.
     hand.drive(3, 10, **FAULT)
-    # The policy is a little slower this time: the repetition is due before its answer.
-    hand.state(1.0, 10)
-    hand.command(1.0 + 2 * ANSWER_S, 10, answer_s=2 * ANSWER_S, inference_ns=3 * 10**6)
+    hand.drive(10, 13)
+    hand.drive(13, 20, **FAULT)  # Seen when a state was to be answered.
+    hand.drive(20, 23)
 
 
 def late_watchdog(hand):
@@ -125,28 +115,16 @@ def late_watchdog(hand):
 
 STORIES = [
     (braked_gap, 12), (ridden_gap, 9), (restart, 12), (thirty_years, 12), (rearmed_vehicle, 16),
-    (armed_later, 19), (repeated_fault, 11), (late_watchdog, 4),
+    (armed_later, 19), (faults, 23), (late_watchdog, 4),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("story", "compared"), STORIES, ids=lambda it: getattr(it, "__name__", ""))
 def test_the_same_policy_repeats_what_befell_the_runtime(hand, story, compared):
     story(hand)
-    assert is_the_same(hand, compared)
-
-
-@pytest.mark.parametrize(
-    "stamps",
-    [{"received_ns": 0}, {"sent_ns": 2**63, "received_ns": 2**64 - 1}, {"inference_ns": 2**63},
-     {"sent_ns": ns(0.7 - 3600.0)}],
-    ids=repr,
-)  # fmt: skip
-def test_a_clock_that_is_set_between_two_stamps_changes_nothing(hand, stamps):
-    hand.drive(0, 7)
-    hand.state(0.7, 7)
-    hand.command(0.7 + ANSWER_S, 7, **stamps)
-    hand.drive(8, 12)
-    assert is_the_same(hand, compared=12)
+    status, report = replay(hand)
+    assert status == 0, report["first_differences"]
+    assert report["compared"] == compared
 
 
 @pytest.mark.parametrize("vehicle", ["none", "mock"])
@@ -172,16 +150,11 @@ def test_a_runtime_that_drives_too_early_is_found_out(hand):
 def test_a_recorder_that_was_held_up_changes_nothing(hand):
     hand.drive(0, 3)
     for step in range(3, 6):  # Heard half a second late, answered in time.
-        hand.state(0.8 + step * 0.01, step)
-        late_s = 0.8 + step * 0.01 - step * 0.1
         sent_s = step * 0.1 + ANSWER_S
+        hand.state(0.8 + step * 0.01, step)
         stamps = {"received_ns": ns(sent_s - ANSWER_S), "sent_ns": ns(sent_s)}
-        hand.command(sent_s + late_s, step, **stamps)
-    hand.drive(9, 12)
-    status, report = replay(hand)
-    # Between step 5 and 9 the runtime itself heard nothing for 0.4 s.
-    assert status == 1
-    assert [row["step"] for row in report["first_differences"]] == [9, 10, 11]
+        hand.command(0.8 + step * 0.01, step, **stamps)
+    assert replay(hand)[0] == 0
 
 
 def test_a_policy_that_answers_nan_brakes_where_the_recorded_one_drove(hand, tmp_path):
@@ -198,7 +171,7 @@ def test_no_recording_decides_what_is_imported(tmp_path, refusal, monkeypatch):
     (tmp_path / "planted.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(tmp_path)
     policy = make_policy(tmp_path, "constant")
-    for vehicle, says in (("planted:Rover", "planted:Rover"), ("Rover", "--config FILE.toml")):
+    for vehicle, says in (("planted:Rover", "planted:Rover"), ("Rover", "Rover")):
         hand = Hand(tmp_path / f"{vehicle[:4]}.mcap")
         hand.hear_health(0.0, 5.0, vehicle=vehicle)
         hand.drive(0, 3)
@@ -207,27 +180,15 @@ def test_no_recording_decides_what_is_imported(tmp_path, refusal, monkeypatch):
     assert "planted" not in sys.modules
 
 
-def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
+def test_a_vehicles_limits_follow_from_the_settings(hand, tmp_path):
     hand.hear_health(0.0, 5.0, vehicle="hunter")
     hand.drive(0, 3)
-    hand.command(0.25, 2, answer_s=0.05, inference_ns=0, **FAULT)  # While nothing else happens.
-    hand.drive(3, 10, **FAULT)
-    hand.drive(10, 13)
-    hand.drive(13, 20, **FAULT)  # Seen when a state was to be answered.
-    hand.drive(20, 23)
-    assert is_the_same(hand, compared=23)
     settings = tmp_path / "edge.toml"
     link = "connect = 'tls/10.0.0.1:7447'"  # It opens none, and takes no --tls.
     settings.write_text(f"{link}\nvehicle.driver = 'hunter'\nvehicle.hunter.scale = 0.2\n")
     assert replay(hand, None, "--config", str(settings))[0] == 0
     settings.write_text("[vehicle.hunter]\nscale = -1\n")
     assert replay(hand, None, "--config", str(settings))[0] == 2
-
-
-def test_a_state_without_an_answer_in_the_replay_differs():
-    states, none = [("here", 0, step) for step in range(3)], Answer("safe_stop", "", (-1.0,))
-    report = compare(dict.fromkeys(states, none), {states[0]: none, states[2]: none}, states, 0.0)
-    assert (report["equal"], report["different"]) == (2, 1)
 
 
 def test_of_several_vehicles_one_is_named(hand):
@@ -244,10 +205,9 @@ def test_of_a_damaged_recording_the_rest_is_replayed(hand, capsys):
         hand.writer.flush()
     hand.close()
     flip_chunk(hand.path, 1)
-    report = replay(hand)[1]
-    assert (report["states"], report["cut_off"], report["damaged_places"]) == (40, False, 1)
+    assert replay(hand)[1]["compared"] == 40
     (line,) = capsys.readouterr().err.splitlines()
-    assert "damaged place" in line
+    assert "1 damaged place" in line
 
 
 def test_no_terminal_obeys_what_a_recording_holds(hand, tmp_path, capsys):

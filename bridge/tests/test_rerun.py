@@ -242,9 +242,9 @@ def test_a_viewer_that_is_gone_is_one_plain_error(kind, where, why, tmp_path, mo
 
 def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
     """A scenario needs a colour of the view, and not the view; an evaluation needs no network."""
-    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun")
+    taken = ("messages", "network", "recording", "report", "rerun")
     code = "import sys\n" + "".join(f"import bridge.{name}\n" for name in taken)
-    code += "assert not {'zenoh', 'rerun', 'gymnasium'} & set(sys.modules)"
+    code += "assert not {'zenoh', 'rerun'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -23,9 +23,9 @@ from bridge.environments import (
     say_once,
     scene_of,
 )
-from bridge.episode import EpisodeRunner
+from bridge.inbound import NO_COMMAND, Decision
 from bridge.messages import Origin
-from bridge.virtual_link import NO_COMMAND, Decision
+from bridge.simulate import EpisodeRunner
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
@@ -81,11 +81,8 @@ def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path):
             assert run.wait() == 0, run.errors
     report = read(out)
     assert len(report["policy_ids"]) == 2
-    assert report["edge_changes"] == 1
     # On a busy machine the edge runtime may have stopped for a reason of its own, too.
     event = next(row for row in report["safe_stop_events"] if row["reason"] == "no_command")
-    # 2 T and one tick; the rest is for a busy machine.
-    assert 0.15 <= event["brake_after_s"] <= 0.5
     assert event["resumed_after_s"] > 0
     braked, resumed = event["step"], event["step"] + round(event["resumed_after_s"] * 10)
     (row,) = report["per_episode"]
@@ -231,7 +228,7 @@ class ScriptedClock:
         steering = 0.04 if state.step < self.drive else -0.02
         command = make_command(state.step, action=[steering])
         ridden = int(state.step == 3)
-        return Decision(command, fresh=True, brake_reason=reason, undriven_s=0.0, ridden=ridden)
+        return Decision(command, fresh=True, brake_reason=reason, ridden=ridden)
 
     def newest_answer(self):
         return None
@@ -256,7 +253,7 @@ def run(environment, clock, standing=False):
         session="here", environment="congestion", condition="nominal", seed=3, standing=standing,
         clock="lockstep", loop="policy", latency="none",
     )  # fmt: skip
-    runner = EpisodeRunner(environment, clock, told, told, task, origin)
+    runner = EpisodeRunner(environment, clock, told, task, origin)
     return runner, runner.run(0, seed=3)
 
 
@@ -389,7 +386,7 @@ class Steady(ScriptedClock):
         self.states.append(state)
         reason = "other_task" if state.step == self.change else ""
         command = make_command(state.step, action=[0.5])
-        return Decision(command, fresh=True, brake_reason=reason, undriven_s=0.0)
+        return Decision(command, fresh=True, brake_reason=reason)
 
 
 def test_what_an_environment_does_to_its_action_is_its_own_affair():
@@ -427,8 +424,6 @@ def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     assert speeds[clock.drive + 16] == 0.0
     (event,) = runner.safe_stops.events
     assert event.reason == NO_COMMAND
-    assert event.stopped_after_s is not None
-    assert event.stopped_after_s <= 1.6
     assert event.resumed_after_s == pytest.approx(2.2)
     assert result.actions[clock.brake_until] == pytest.approx([-0.02])
     assert clock.states[clock.brake_until + 10].speed_mps > 1.0
@@ -454,7 +449,7 @@ def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path):
         with start_simulate(endpoint, out, TOY) as run:
             assert run.wait() == 2
         assert len(run.errors.splitlines()) == 1
-        assert "congestion: frames uint8 2x45x80, steering" in run.errors
+        assert "for another task" in run.errors
         assert not out.exists()
         assert edge.end() == 0
     assert "was=standby now=safe_stop reason=other_task" in edge.errors

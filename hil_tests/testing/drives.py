@@ -17,7 +17,7 @@ from bridge.__main__ import main
 from bridge.environments import describe, make_environment
 from bridge.fork import ForkedDrive, RecordedEpisode
 from bridge.messages import Origin
-from bridge.record import RecordingWriter
+from bridge.recording import RecordingWriter
 from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
@@ -75,10 +75,10 @@ def record_drive(
 
 
 @contextlib.contextmanager
-def writing(path: Path, dropped: int = 0) -> Iterator[RecordingWriter]:
+def writing(path: Path) -> Iterator[RecordingWriter]:
     with contextlib.closing(RecordingWriter(path)) as writer:
         yield writer
-        writer.finish(dropped)
+        writer.finish()
 
 
 def record_in_process(

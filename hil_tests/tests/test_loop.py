@@ -60,7 +60,6 @@ def test_lock_step_is_the_drive_in_process_to_the_bit(tmp_path, scenario, condit
     assert (report["scenario"], report["condition"]) == (scenario, condition)
     assert set(report) >= set(CONTRACT_KEYS.split())
     assert spec != NONE or (report["rejected"], report["missed_ticks"]) == ({}, 0)
-    assert (report["command_age_ms"]["max"] > 0.0) == (spec != NONE)  # In virtual time
     assert (report["deadline_misses"] > 0) == (spec != NONE)
     assert (report["safe_stops"] > 0) == (spec == BAD)
     for ours, theirs in zip(report["per_episode"], wanted, strict=True):
@@ -77,5 +76,5 @@ def test_every_recorded_command_is_still_the_same(tmp_path):
     assert status == 0, report["first_differences"]
     assert report["compared"] > 200
     # Not only the driving: the simulator was stopped in the middle.
-    assert report["by_recorded"]["safe_stop: no_fresh_state"]["compared"] == 4
-    assert report["different"] == report["dropped"] == 0
+    assert report["by_recorded"]["safe_stop: no_fresh_state"] == 4
+    assert report["different"] == 0

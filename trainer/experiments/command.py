@@ -20,7 +20,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
-from bridge.progress import ProgressBar
+from bridge.report import ProgressBar
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
 from trainer import util

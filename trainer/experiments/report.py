@@ -15,8 +15,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 
-from bridge.progress import ProgressBar
-from bridge.report import markdown_table
+from bridge.report import ProgressBar, markdown_table
 from bridge.statistics import Estimate, mean_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError

@@ -13,7 +13,7 @@ import torch
 from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
-from bridge.progress import ProgressBar
+from bridge.report import ProgressBar
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import options, util

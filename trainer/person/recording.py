@@ -20,8 +20,7 @@ from mcap.stream_reader import MAGIC_SIZE
 from numpy.typing import NDArray
 
 from bridge.outcomes import DISCARDED
-from bridge.record import close_torn, new_recording_at
-from bridge.recording import Recording
+from bridge.recording import Recording, close_torn, new_recording_at
 from edge_runtime.util import UserError
 from trainer.person.interface import Amount, Control
 

@@ -17,7 +17,7 @@ from statistics import fmean
 from typing import Any
 
 from bridge.outcomes import GOAL
-from bridge.progress import ProgressBar
+from bridge.report import ProgressBar
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from bridge.network import LatencySpec
-from bridge.virtual_link import COMMAND_WINDOW, ROUNDING_S, VirtualLink
+from bridge.inbound import ROUNDING_S
+from bridge.network import COMMAND_WINDOW, LatencySpec, VirtualLink
 from edge_runtime.wire import DRIVE, Command
 from trainer.learner.replay import Action, Observation
 

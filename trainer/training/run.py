@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.episode import finite
+from bridge.environments import finite
 from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL
 from bridge.report import EpisodeResult

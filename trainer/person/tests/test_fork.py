@@ -33,7 +33,7 @@ def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
     assert status == 0, errors
     (path,) = find_recordings([Path("rec")])
     (steps,) = read_episodes(read_steps(path))
-    (state,) = {state.observation["frames"] for state in recorded.states[10]}
+    state = recorded.states[10].observation["frames"]
     assert steps[0].observation.tobytes() == state, "what the policy saw 1 s after the start"
     assert {(step.seed, step.scenario) for step in steps} == {(3, "left_turn")}
     assert [step.action for step in steps[1:4]] == [-1.0] * 3
