@@ -7,7 +7,6 @@ observation, so that pictures need no memory.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
@@ -72,9 +72,7 @@ def run(arguments: Any) -> int:
             os.rename(part, out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    left_out = sum(not state.final for state in drive.states()) - frames
-    missing = f"; left out: {counted(left_out, 'state')} without a fit answer" if left_out else ""
-    print(f"wrote {out}: {counted(frames, 'frame')}{missing}")
+    print(f"wrote {out}: {counted(frames, 'frame')}")
     return 0
 
 
@@ -89,15 +87,14 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
     for name in task.observation:
         if not re.fullmatch(r"[\w -]{1,64}", name):  # It becomes part of a path.
             raise UserError(f"the observation {name!r} cannot be the name of a feature")
-    plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
     folder.mkdir(parents=True)
     rate = Fraction(1 / task.control_period_s).limit_denominator(1000)
     columns, bounds = _numbers(drive, task, rate)
     features = {key: _feature(values) for key, values in columns.items()}
     features["action"]["names"] = [row.name for row in task.action]
-    layout = Layout(task)
+    plain = [name for name, entry in task.observation.items() if not is_picture(entry)]
     for name in task.observation:
-        arrays = (layout.arrays(state.observation)[name] for state, _ in _kept(drive, task))
+        arrays = (layout.arrays(s.observation)[name] for layout, s, _ in _kept(drive, task))
         if name in plain:
             key = "observation.state" if len(plain) == 1 else f"observation.{name}"
             columns[key] = np.array([array.ravel() for array in arrays])
@@ -106,37 +103,46 @@ def _export(drive: RecordedDrive, folder: Path) -> int:
             key = f"observation.images.{name}"
             path = folder / f"videos/{key}/{FIRST}.mp4"
             columns[key], features[key] = _encode(path, rate, arrays)
-    robot = None if drive.vehicle == NONE else drive.vehicle
-    info = {"robot_type": robot, "total_frames": bounds[-1], "features": features}
-    _write(folder, task.task, rate, columns, info, bounds)
+    _write_tables(folder, task.task, rate, columns, features, bounds)
+    count = len(bounds) - 1
+    info = {
+        "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
+        "robot_type": None if drive.vehicle == NONE else drive.vehicle,
+        "total_episodes": count, "total_tasks": 1, "splits": {"train": f"0:{count}"},
+        "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
+        "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
+        "total_frames": bounds[-1], "features": features,
+    }  # fmt: skip
+    write_json(folder / "meta/info.json", info)
+    write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
     return bounds[-1]
 
 
-def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[State, Command]]:
-    """Yield the readable states with their answers."""
-    layout, size = Layout(task), len(task.action)
+def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[Layout, State, Command]]:
+    """Yield the readable states with their answers, and how to read them."""
+    layout = Layout(task)
     for state in drive.states():
         answer = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
-        if readable and answer is not None and len(answer.action) == size:
-            yield state, answer
+        if readable and answer is not None and len(answer.action) == len(task.action):
+            yield layout, state, answer
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:
     """Return the features of every data set, and where its episodes begin and the last ends."""
-    kept = [(key_of(state), answer) for state, answer in _kept(drive, task)]
+    kept = [answer for _, _, answer in _kept(drive, task)]
     if not kept:
         raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
     ended = {key_of(state)[:2] for state in drive.states() if state.final}
-    episodes = [key[:2] for key, _ in kept]
+    episodes = [key_of(answer)[:2] for answer in kept]
     bounds = [at for at, name in enumerate(episodes) if not at or name != episodes[at - 1]]
     bounds.append(len(kept))
     index, lengths = np.arange(len(kept)), np.diff(bounds)
     number = index - np.repeat(bounds[:-1], lengths)
     columns = {
-        "action": np.array([answer.action for _, answer in kept], np.float32),
-        "mode": np.array([answer.mode for _, answer in kept]),
-        "step": np.array([key[2] for key, _ in kept], np.uint64).astype(np.int64),
+        "action": np.array([answer.action for answer in kept], np.float32),
+        "mode": np.array([answer.mode for answer in kept]),
+        "step": np.array([answer.step for answer in kept], np.uint64).astype(np.int64),
         "next.done": np.isin(index + 1, bounds) & [name in ended for name in episodes],
         "timestamp": (number / float(rate)).astype(np.float32),
         "frame_index": number,
@@ -164,11 +170,11 @@ def _encode(
         for number, array in enumerate(arrays):
             images: Any = images_of(array)
             height, width = images.shape[1:3]
-            picture = np.ascontiguousarray(np.broadcast_to(images[-1], (height, width, 3)))
             if not number:
                 stream.height, stream.width = height, width
                 # Colours of half the size, as players like them, need even sizes.
                 stream.pix_fmt = "yuv444p" if height % 2 or width % 2 else "yuv420p"
+            picture = np.ascontiguousarray(np.broadcast_to(images[-1], (height, width, 3)))
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))
@@ -184,48 +190,32 @@ def _encode(
     return np.array(sampled), feature | {"names": ["height", "width", "channels"]}
 
 
-def _write(
-    folder: Path, task: str, rate: Fraction, columns: Columns, info: dict[str, Any], bounds: Any
+def _write_tables(
+    folder: Path, task: str, rate: Fraction, columns: Columns, features: Any, bounds: list[int]
 ) -> None:
-    """Write everything but the videos."""
-    features = info["features"]
-    videos = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
-
-    def episode(number: int, start: int, end: int) -> dict[str, Any]:
+    episodes = []
+    places = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
+    for number, (start, end) in enumerate(pairwise(bounds)):
         row = {"episode_index": number, "tasks": [task], "length": end - start}
         row |= {"dataset_from_index": start, "dataset_to_index": end}
-        for place in ("data", "meta/episodes", *videos):
+        for place in ("data", "meta/episodes", *places):
             row |= {f"{place}/chunk_index": 0, f"{place}/file_index": 0}
-        for place in videos:
-            row[f"{place}/from_timestamp"] = float(start / rate)
-            row[f"{place}/to_timestamp"] = float(end / rate)
+        for place in places:
+            row |= {f"{place}/from_timestamp": float(start / rate)}
+            row |= {f"{place}/to_timestamp": float(end / rate)}
         for key, stats in _stats(columns, features, slice(start, end)).items():
             row |= {f"stats/{key}/{name}": value for name, value in stats.items()}
-        return row
-
-    episodes = [episode(number, *ends) for number, ends in enumerate(pairwise(bounds))]
-    # pandas, which reads it, is told that the text is the index.
-    index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-    told = {"index_columns": ["task"], "column_indexes": [], "columns": [index]}
-    tasks = pa.table({"task_index": [0], "task": [task]})
+        episodes.append(row)
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task], name="task"))
     numbers = {key: column for key, column in columns.items() if column.ndim < 3}
     for name, table in {
         f"data/{FIRST}": pa.table({key: _column(column) for key, column in numbers.items()}),
         f"meta/episodes/{FIRST}": pa.Table.from_pylist(episodes),
-        "meta/tasks": tasks.replace_schema_metadata({"pandas": json.dumps(told)}),
+        "meta/tasks": pa.Table.from_pandas(tasks),
     }.items():
         path = folder / f"{name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_table(table, path)
-    write_json(folder / "meta/stats.json", _stats(columns, features, slice(0, bounds[-1])))
-    count = len(episodes)
-    info |= {
-        "codebase_version": "v3.0", "fps": int(rate) if rate.denominator == 1 else float(rate),
-        "total_episodes": count, "total_tasks": 1, "splits": {"train": f"0:{count}"},
-        "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
-        "data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4",
-    }  # fmt: skip
-    write_json(folder / "meta/info.json", info)
 
 
 def _column(values: np.ndarray) -> Any:

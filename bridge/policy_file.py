@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import onnx
 
 from bridge.environments import Adapter, Environment, describe, known_stops, make_environment
@@ -57,42 +56,32 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Make, check and sign a policy file."""
-    out, key = Path(arguments.out), arguments.key
-    if out.suffix != ".onnx":
-        raise UserError(f"--out {out}: a policy file's name ends in .onnx")
+    out, key = arguments.out, arguments.key
     check_writable(out)
     if key:
         read_signing_key(key)
     with closing(make_environment(arguments.env)) as environment:
         task = changed(describe(environment, arguments.period), arguments.changes)
-        _ask_for_stops(environment, task, arguments.changes)
+        for number, row in enumerate(task.action if known_stops(environment) is None else ()):
+            place = f"action.{number}.stop="
+            if not any(change.startswith(place) for change in arguments.changes):
+                ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
+                raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
         model = read_bytes(arguments.model, "model", MAX_POLICY_MIB)
         training = {"source": Path(arguments.model).name, "environment": arguments.env}
         try:
             data = make_policy(model, task, arguments.algorithm, training)
             policy = open_policy(data, UNSIGNED)
-            low, high = _drive(policy, environment)
+            _try(policy, environment)
         except UserError as error:
             raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
-    write_policy(data, out, key)
-    signed = "signed" if key else "not signed"
-    print(f"{out}: {len(data) / 1e6:.1f} MB, {signed}, policy_id {policy.policy_id}")
+    write_policy(data, Path(out), key)
+    print(f"{out}: {'signed' if key else 'not signed'}, policy_id {policy.policy_id}")
     print(f"it drives {task.text}")
-    for row, least, most in zip(task.action, low, high, strict=True):
+    for row in task.action:
         stop = "holds the last value" if row.stop is None else f"is {row.stop:g}"
-        said = f"{least:.3g} to {most:.3g} in {REAL_OBSERVATIONS} steps"
-        print(f"{row.name}: {row.low:g} to {row.high:g}, {said}; its safe stop {stop}")
+        print(f"{row.name}: {row.low:g} to {row.high:g}; its safe stop {stop}")
     return 0
-
-
-def _ask_for_stops(environment: Environment, task: Task, changes: list[str]) -> None:
-    """Raise UserError where nobody has said what a safe stop of each action is."""
-    unknown = task.action if known_stops(environment) is None else []
-    for number, row in enumerate(unknown):
-        place = f"action.{number}.stop="
-        if not any(change.startswith(place) for change in changes):
-            ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
-            raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
 
 
 def changed(task: Task, changes: Sequence[str]) -> Task:
@@ -101,21 +90,20 @@ def changed(task: Task, changes: Sequence[str]) -> Task:
     ``stop``, ``slew_per_s``, ``meaning`` and ``unit`` of an action can be changed. Raises UserError
     for anything else.
     """
-    actions = list(task.action)
+    rows = msgspec.to_builtins(task.action)
     for change in changes:
         match = re.fullmatch(r"action\.(\d+)\.(stop|slew_per_s|meaning|unit)=(.*)", change)
-        if match is None or int(match[1]) >= len(actions):
+        if match is None or int(match[1]) >= len(rows):
             form = "action.N.stop=VALUE, or slew_per_s, meaning, unit"
-            raise UserError(f"--set {change}: expected {form}, N from 0 to {len(actions) - 1}")
+            raise UserError(f"--set {change}: expected {form}, N from 0 to {len(rows) - 1}")
         value: Any = match[3]
         with suppress(ValueError):
             value = json.loads(value)
-        row = msgspec.to_builtins(actions[int(match[1])]) | {match[2]: value}
-        try:
-            actions[int(match[1])] = msgspec.convert(row, Action)
-        except msgspec.ValidationError as error:
-            raise UserError(f"--set {change}: {error}") from None
-    task = msgspec.structs.replace(task, action=actions)
+        rows[int(match[1])][match[2]] = value
+    try:
+        task = msgspec.structs.replace(task, action=msgspec.convert(rows, list[Action]))
+    except msgspec.ValidationError as error:
+        raise UserError(f"--set: {error}") from None
     check_task(task)
     return task
 
@@ -153,31 +141,24 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
             names[:] = [swap.get(name, name) for name in names]
 
 
-def _drive(policy: Policy, environment: Environment) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and largest actions, float [n], over REAL_OBSERVATIONS steps.
+def _try(policy: Policy, environment: Environment) -> None:
+    """Ask the policy in REAL_OBSERVATIONS steps of random actions.
 
-    Random actions drive every other episode: a policy that stands sees little.
     Raises UserError for an action that the environment cannot take.
     """
-    actions: list[np.ndarray] = []
     environment.action_space.seed(0)
-    adapter, episode, over = Adapter(environment, policy.manifest), 0, True
-    seen: Any = None
-    while len(actions) < REAL_OBSERVATIONS:
+    adapter, over, seen = Adapter(environment, policy.manifest), True, None
+    for step in range(REAL_OBSERVATIONS):
         if over:
-            seen, _ = environment.reset(seed=episode)
-            episode += 1
-        observed = policy.layout.arrays(adapter.pack(seen))
+            seen, _ = environment.reset(seed=step)
         try:
-            action = policy.act(observed)
+            action = policy.act(policy.layout.arrays(adapter.pack(seen)))
         except Exception as error:  # onnxruntime's exceptions share no narrower base
             raise UserError(f"onnxruntime does not run it: {error}") from None
         check_answer(action, policy.manifest, "a real observation")
-        actions.append(action)
-        wanted = environment.action_space.sample() if episode % 2 == 0 else action
-        seen, _, terminated, truncated, _ = environment.step(adapter.within(wanted))
+        sampled = adapter.within(environment.action_space.sample())
+        seen, _, terminated, truncated, _ = environment.step(sampled)
         over = terminated or truncated
-    return np.min(actions, axis=0), np.max(actions, axis=0)
 
 
 def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
