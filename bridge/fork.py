@@ -110,7 +110,7 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
                 if isinstance(message, Command):
                     kept = drive.commands
                 kept.setdefault(message.step, message)
-    recording.say_missing()
+    recording.say_trouble()
     number = 0 if number is None and len(drives) == 1 else number
     if number is None or number >= len(drives):
         which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
@@ -241,8 +241,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add_place(parser)
     module = "the environment, if it is in a module: no file decides what is imported"
     add("--env", metavar="ENV", help=module)
-    policy = "the policy that drives on (default: the drive is rebuilt to its end)"
-    add("--policy", metavar="POLICY.onnx", type="path", help=policy)
+    add("--policy", metavar="POLICY.onnx", type="path", help="the policy that drives on")
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
     human = "you drive on: `python -m trainer drive --from`, which has more options"
@@ -256,31 +255,28 @@ def _run_fork(asked: Namespace) -> int:
     """Fork the drive, and print and write what came of it."""
     if asked.human is not None:
         _hand_over(asked)
+    if asked.policy is None:
+        raise UserError("say who drives on: --policy POLICY.onnx, or --human web")
     drive, fork = find_fork(asked.recording, asked)
-    period_s, found, policy_id = drive.task.control_period_s, None, ""
+    policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
     with ExitStack() as stack:
         environment = stack.enter_context(closing(drive.environment(asked.env)))
-        if asked.policy is None:
-            fork = drive.steps
-            ForkedEnvironment(environment, drive, fork).reset()
-        else:
-            policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
-            out = asked.record and stack.enter_context(whole_recording(asked.record))
-            policy_id = policy.policy_id
-            found = ForkedDrive(drive, environment, fork, policy, asked.latency, out or None).run()
+        out = stack.enter_context(whole_recording(asked.record)) if asked.record else None
+        forked = ForkedDrive(drive, environment, fork, policy, asked.latency, out)
+        found = forked.run()
+    at_s = round(fork * drive.task.control_period_s, 6)
     report = {
         "recording": asked.recording,
         "episode": drive.number,
         "origin": msgspec.structs.asdict(drive.origin),
-        "at_s": round(fork * period_s, 6),
-        "latency_spec": drive.origin.latency if asked.latency is None else str(asked.latency),
-        "policy_id": policy_id,
+        "at_s": at_s,
+        "latency_spec": str(forked.spec),
+        "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.policy_id for each in drive.commands.values()}),
-        "fork": None if found is None else asdict(found),
+        "fork": asdict(found),
     }
     write_json_out(asked.out, report)
-    end = f"; from there {found.outcome} after {found.time_s:g} s" if found else ""
-    print(printable(f"rebuilt to the bit until {fork * period_s:g} s{end}"))
+    print(printable(f"forked at {at_s:g} s: {found.outcome} {found.time_s:g} s later"))
     return 0
 
 

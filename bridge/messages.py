@@ -114,10 +114,6 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     ridden: int = 0
 
 
-STAMPS = tuple(n for n in Scene.__struct_fields__ if n not in SeenScene.__struct_fields__)
-"""Fields that the simulator adds to the environment's own ``scene()``."""
-
-
 def plain(value: Any) -> Any:
     """Return NumPy's arrays and numbers as Python's, for msgspec to encode."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
@@ -128,8 +124,10 @@ _DECODER = msgspec.msgpack.Decoder(Scene)
 
 
 def encode_scene(scene: dict[str, Any], stamps: Scene) -> bytes:
-    """Encode an environment's ``scene()`` with the STAMPS of another as a MessagePack map."""
-    return ENCODER.encode({**scene, **{name: getattr(stamps, name) for name in STAMPS}})
+    """Encode an environment's ``scene()`` and the simulator's own fields as a MessagePack map."""
+    own = msgspec.structs.asdict(stamps).items()
+    drawn = SeenScene.__struct_fields__
+    return ENCODER.encode({**scene, **{name: value for name, value in own if name not in drawn}})
 
 
 def read_scene(scene: Mapping[str, Any]) -> SeenScene:

@@ -1,8 +1,8 @@
 """The simulated network: when a message between two ends arrives, drawn from a seed.
 
 Pure: the caller passes the time in. `LatencyModel` serves virtual time (`VirtualLink`, in lock-step
-and in training) and real time (timers). The way of a message: line, outage, loss, time under way,
-held back or not, duplicated or not.
+and in training) and real time (timers). The way of a message: outage, loss, time under way, held
+back or not, duplicated or not.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from edge_runtime.wire import SAFE_STOP, Command
 
 DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
 COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
-QUEUE_S = 0.2  # Longest wait for a line of limited rate; then a message is dropped
 PARETO_ALPHA = 3.0  # As netem's pareto table: variance is finite above 2
 
 
@@ -72,7 +71,6 @@ class DirectionSpec:
     reorder_by_ms: float = 150.0  # The default lets one state of the control loop pass
     duplicate_percent: float = 0.0
     """Share of messages that arrive twice; the copy's time under way is drawn anew."""
-    rate_kbps: float = 0.0  # Bandwidth in 1000 bit/s; 0: no limit
     outages: tuple[Outage, ...] = ()
 
     def __post_init__(self) -> None:
@@ -112,7 +110,6 @@ class Setting(NamedTuple):
 
 _S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _MS = {"ms": 1.0, "us": 1e-3, "s": 1e3}
-_KBPS = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
 
 
 def _quantity(text: str, units: Mapping[str, float], most: float, least: float = 0.0) -> float:
@@ -179,7 +176,6 @@ SETTINGS = {
     "reorder": _number("reorder_percent", "1%", _PERCENT, 100.0),
     "reorder_by": _number("reorder_by_ms", "300ms", _MS, 60_000.0),
     "duplicate": _number("duplicate_percent", "1%", _PERCENT, 100.0),
-    "rate": _number("rate_kbps", "1Mbit/s", _KBPS, 1e9, least=math.ulp(0.0)),
     "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages, _write_outages),
 }
 """Name in a specification -> setting."""
@@ -253,10 +249,10 @@ def _pareto(draw: float) -> float:
 SHAPES: dict[str, Callable[[float], float]] = {"normal": lambda draw: draw, "pareto": _pareto}
 """How long a message is under way: shapes with mean 0 and standard deviation 1.
 
-The delay is ``delay + jitter * shape``, as with netem's distribution tables, so rows with the same
-delay and jitter compare whatever their tail. Both shapes are increasing functions of one standard
-normal draw: the same seed delays the same messages, and only how far differs. A long-tailed network
-has a floor (propagation) of ``delay - 0.58 jitter`` and rare, very late messages.
+The delay is ``delay + jitter * shape``, as with netem's distribution tables. Both shapes are
+increasing functions of one standard normal draw: the same seed delays the same messages, and only
+how far differs. A long-tailed network has a floor of ``delay - 0.58 jitter`` and rare, very late
+messages.
 """
 
 
@@ -266,15 +262,8 @@ def loss_percents(spec: DirectionSpec, rng: np.random.Generator) -> Iterator[flo
     Losses in bursts are a Markov chain with a good and a bad state, and a loss in each: the model
     of Gilbert (1960, Capacity of a burst-noise channel) as Elliott (1963, Estimates of error rates
     for codes on burst-noise channels) extended it. The chain begins in its stationary state and
-    steps once per message (not with time: an idle link does not recover). With netem's
-    ``loss gemodel p r 1-h 1-k``::
-
-        r   = 1 / burst                     bad to good; a bad stretch has 1/r messages on average
-        p   = r s / (1 - s)                 good to bad
-        1-h = 1, 1-k = clear_loss           loss in the bad and in the good state
-        s   = (loss - clear_loss) / (1 - clear_loss)     share of messages in the bad state
-
-    so that ``loss`` stays the overall rate and rows with and without bursts compare.
+    steps once per message (not with time: an idle link does not recover). It goes from bad to good
+    with 1 / burst, and from good to bad so that ``loss`` stays the overall rate.
     """
     if not spec.burst_messages:
         yield from itertools.repeat(spec.loss_percent)
@@ -301,34 +290,22 @@ class LatencyModel:
         self._reorder_rng, self._duplicate_rng = reorder, duplicate
         self._loss_percents = loss_percents(spec, bursts)
         self._shape = SHAPES[spec.tail]
-        self._line_free_s = float("-inf")
 
-    def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
+    def arrivals(self, now_s: float) -> tuple[float, ...]:
         """Return when a message handed over at ``now_s`` arrives (s, same clock), earliest first.
 
-        Empty if it is lost, two times if it is duplicated. ``size_bytes`` matters with a rate.
+        Empty if it is lost, two times if it is duplicated.
         """
         lost = self._rng.random() * 100.0 < next(self._loss_percents)
         draw = self._rng.standard_normal()
         held_back = self._reorder_rng.random() * 100.0 < self.spec.reorder_percent
         duplicated = self._duplicate_rng.random() * 100.0 < self.spec.duplicate_percent
         draws = (draw, self._duplicate_rng.standard_normal())[: 1 + duplicated]
-        left_s = self._leave_s(now_s, size_bytes)
-        if left_s is None or lost or any(outage.covers(left_s) for outage in self.spec.outages):
+        if lost or any(outage.covers(now_s) for outage in self.spec.outages):
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
         delays_ms = (self.spec.delay_ms + self.spec.jitter_ms * self._shape(d) for d in draws)
-        return tuple(sorted(left_s + max(0.0, ms) * 1e-3 + extra_s for ms in delays_ms))
-
-    def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
-        """Return when the message's last byte has left; None if the queue is full."""
-        if not self.spec.rate_kbps:
-            return now_s
-        begin_s = max(now_s, self._line_free_s)
-        if begin_s - now_s > QUEUE_S:
-            return None
-        self._line_free_s = begin_s + size_bytes / (self.spec.rate_kbps * 1e3 / 8)
-        return self._line_free_s
+        return tuple(sorted(now_s + max(0.0, ms) * 1e-3 + extra_s for ms in delays_ms))
 
 
 class Network(NamedTuple):
@@ -343,11 +320,6 @@ def make_network(spec: LatencySpec, seed: int) -> Network:
     up, down = np.random.SeedSequence(seed).spawn(2)
     return Network(LatencyModel(spec.up, up), LatencyModel(spec.down, down))
 
-
-# On the wire, for links of limited rate: the same for every message, so that a longer session name
-# or another digit does not change a drive.
-STATE_BYTES = 122  # Besides its observation
-COMMAND_BYTES = 217
 
 Message = TypeVar("Message")
 
@@ -367,17 +339,11 @@ class VirtualLink(Generic[Message]):
 
     For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``. The
     caller gives the answers: those of a real edge runtime, or of a function. They take no virtual
-    time. A real edge runtime does not notice a gap in virtual time. So the link runs the safety
-    machine on virtual time itself, from standby at each episode's start, and turns into a safe stop
-    what that machine would not drive.
+    time, so an edge runtime does not notice a gap in it: the link runs the safety machine itself,
+    from standby at each episode's start, and turns into a safe stop what that would not drive.
 
-    Args:
-        spec: delays, losses and the like.
-        seed: of the episode.
-        period_s: the control period T.
-        observation_bytes: what a state carries.
-        on_heard: called with each newest answer's latency in s, state sent to command received.
-        on_stale: called for each answer that is not newer than the newest.
+    ``on_heard`` is called with each newest answer's latency in s, state sent to command received,
+    ``on_stale`` for each answer that is not newer than the newest; ``period_s`` is T.
     """
 
     def __init__(
@@ -385,11 +351,10 @@ class VirtualLink(Generic[Message]):
         spec: LatencySpec,
         seed: int,
         period_s: float,
-        observation_bytes: int,
         on_heard: Callable[[float], None] = lambda latency_s: None,
         on_stale: Callable[[], None] = lambda: None,
     ) -> None:
-        self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
+        self._period_s = period_s
         self.hold = CommandHold(0.0, period_s)
         self._link = make_network(spec, seed)
         self._on_heard, self._on_stale = on_heard, on_stale
@@ -407,7 +372,7 @@ class VirtualLink(Generic[Message]):
         """Begin tick ``step``: its state leaves the vehicle."""
         tick_s = step * self._period_s
         self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
-        for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
+        for arrival_s in self._link.up.arrivals(tick_s):
             self._push(arrival_s, partial(self._arrive_at_edge, step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
@@ -430,7 +395,7 @@ class VirtualLink(Generic[Message]):
         if command.plan:  # as long as the edge runtime's own silence
             ride_s = len(command.plan) * self._period_s
             self._safety = self._safety._replace(ride_s=ride_s)
-        for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
+        for arrival_s in self._link.down.arrivals(arrival.arrived_s):
             self._push(arrival_s, partial(self._arrive_at_vehicle, command, computing_s))
 
     def decide(self, edge_silent: bool = False) -> Decision:

@@ -1,17 +1,8 @@
 """Recordings of the wire as MCAP files, read and written.
 
-The file holds the exact payloads for replay, and copies that viewers can draw:
-
-| topic | encoding |
-|---|---|
-| ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
-| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
-| ``view/<id>/frames`` | ``foxglove.RawImage`` of each picture array: frame t-1 above frame t |
-| ``view/<id>/<topic>``, of every topic of the wire | ``phil.State`` and so on |
-| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
-
-The copies are JSON with a JSON Schema of the structs: Foxglove reads any, and knows
-``foxglove.RawImage`` and ``foxglove.Log`` by name. rerun reads none; `bridge view` is for it.
+The topics ``phil/<id>/...`` hold the exact payloads; ``view/<id>/...`` hold copies for Foxglove, in
+JSON with a JSON Schema: of each message, of its pictures (``foxglove.RawImage``, frame t-1 above
+frame t), and ``events`` (``foxglove.Log``: tokens, unreadable and oversized messages).
 """
 
 from __future__ import annotations
@@ -55,7 +46,6 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.invalid_messages = 0  # Of the last pass of `valid_messages`
         self.cut_off = False
         """The file has no end of its own: a kill, or damage beyond which nothing can be read."""
         self.damaged_places = 0  # Chunks that do not match their checksums
@@ -76,13 +66,6 @@ class Recording:
         if trouble := self.trouble():
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
             print(line + taken, file=sys.stderr, flush=True)
-
-    def say_missing(self) -> None:
-        """Say on stderr what `valid_messages` could not read, and what it left out."""
-        self.say_trouble()
-        if self.invalid_messages:
-            left_out = f"left out: {counted(self.invalid_messages, 'message')} not valid"
-            print(f"{self.path}: {left_out}", file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Yield the messages, with their channels, in the order of the file, that of arrival.
@@ -159,14 +142,11 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
-    """Yield a vehicle's messages, heard and decoded; the invalid are left out and counted."""
-    recording.invalid_messages = 0
+    """Yield a vehicle's messages, heard and decoded; the invalid are left out."""
     for heard in heard_of(recording, vehicle_id):
         if heard.topic in DECODERS:
             message = decode(heard)
-            if isinstance(message, wire.Rejection):
-                recording.invalid_messages += 1
-            else:
+            if not isinstance(message, wire.Rejection):
                 yield heard, message
 
 

@@ -66,8 +66,7 @@ def run(arguments: Any) -> int:
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
     report = {
-        "recording": str(arguments.recording),
-        "vehicle_id": drive.vehicle_id,
+        "recording": arguments.recording,
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.policy_id for each in drive.answers.values()}),
         **compare(replay(drive, policy, config), arguments.tolerance),
@@ -112,7 +111,7 @@ class RecordedDrive:
                 start_ns = message.sent_ns - round(message.uptime_s * 1e9)
                 if not self.starts_ns or start_ns > self.starts_ns[-1] + RESTART_NS:
                     self.starts_ns.append(start_ns)
-        self.recording.say_missing()
+        self.recording.say_trouble()
         if not self.answers:
             raise UserError(f"{path} holds no answered state of vehicle {self.vehicle_id}")
 
@@ -137,7 +136,7 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
     started anew, armed or not. Its limits follow from ``config``. UserError where it lacks an
     action of the policy or cannot follow its scenario.
     """
-    limits = _limits(drive, policy, config)
+    limits = shared_limits(policy.manifest.action, _vehicle_limits(drive, policy, config))
     controller, starts_ns = None, drive.starts_ns[1:]
     for state in drive.states():
         recorded = drive.answers.get(key_of(state))
@@ -154,7 +153,7 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
         yield state, recorded if recorded.inference_ns or order else None, order
 
 
-def _limits(drive: RecordedDrive, policy: Policy, config: Config) -> Limits:
+def _vehicle_limits(drive: RecordedDrive, policy: Policy, config: Config) -> Limits:
     """Return the limits of the recorded vehicle; no recording decides what is imported."""
     name = drive.vehicle
     if NONE not in (name, config.vehicle) and find_vehicle(config.vehicle).name == name:
@@ -162,8 +161,7 @@ def _limits(drive: RecordedDrive, policy: Policy, config: Config) -> Limits:
     elif name not in (NONE, *BUILT_IN):
         option = "--config FILE.toml whose table [vehicle] has as its driver"
         name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
-    own = vehicle_limits(name, config.vehicle_settings, policy.manifest)
-    return shared_limits(policy.manifest.action, own)
+    return vehicle_limits(name, config.vehicle_settings, policy.manifest)
 
 
 def controller_of(

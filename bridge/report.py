@@ -108,8 +108,6 @@ class SafeStopEvent:
     reason: str
     """``no_command`` if the simulator braked by itself, else the edge runtime's reason; with a
     vehicle in the loop also ``no_feedback`` and ``self_braking``."""
-    resumed_after_s: float | None = None
-    """From the brake until it drove again, simulated time; None if the episode ended first."""
 
 
 class SafeStopLog:
@@ -119,9 +117,8 @@ class SafeStopLog:
     states is answered, that was a round trip and is no stop.
     """
 
-    def __init__(self, period_s: float) -> None:
+    def __init__(self) -> None:
         self.events: list[SafeStopEvent] = []
-        self._period_s = period_s
         self._open: SafeStopEvent | None = None
         self._waits = False  # In all of the open event the first command may have been under way
 
@@ -137,10 +134,9 @@ class SafeStopLog:
             if command.step <= BRAKE_PERIODS:
                 self.events.remove(event)
                 event = None
-        if event is not None and not decision.brake_reason:
-            event.resumed_after_s = round((step - event.step) * self._period_s, 6)
+        if not decision.brake_reason:
             event = None
-        elif event is None and decision.brake_reason:
+        elif event is None:
             event = SafeStopEvent(episode, step, decision.brake_reason)
             self.events.append(event)
             self._waits = decision.waits and event.reason == NO_COMMAND
@@ -204,15 +200,6 @@ def summary_line(report: Mapping[str, Any]) -> str:
     )
 
 
-def episode_line(
-    number: int, episodes: int, result: EpisodeResult, stops: Sequence[SafeStopEvent]
-) -> str:
-    """Return what became of an episode, as in "episode 2 of 5: goal after 12.3 s"."""
-    braked = f"; {_reasons('safe stop', Counter(e.reason for e in stops))}" if stops else ""
-    told = f"episode {number} of {episodes}: {result.outcome} after {result.time_s:.1f} s"
-    return printable(told + braked)
-
-
 def _reasons(noun: str, counts: Mapping[str, int]) -> str:
     """Return text like "3 safe stops (2 no_command, 1 vehicle_fault)"."""
     each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
@@ -245,11 +232,9 @@ class VehicleLog:
         return {"name": self.name, "lag_ms": lag_ms, "faults": dict(self.faults)}
 
     def _lag_ms(self) -> float | None:
-        """Return the delay that aligns the speeds asked and reached best, in ms.
+        """Return the delay with the least mean square of reached(t) - asked(t - delay), in ms.
 
-        It has the least mean square of reached(t) - asked(t - delay), from 0 to MAX_LAG_S. For a
-        dead time followed by a first-order response, it lies between the dead time and the sum of
-        both. None without a set-point, and where the best delay is the end of what is tried.
+        None without a set-point, and where the best delay is MAX_LAG_S.
         """
         if not self._rows:
             return None

@@ -36,7 +36,6 @@ from bridge.report import (
     ProgressBar,
     SafeStopLog,
     accelerations,
-    episode_line,
     make_report,
     number_of,
     of_known,
@@ -73,7 +72,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     clock = "lockstep waits for each command, realtime never waits"
     loop = "the car follows the policy's commands, or (realtime only) the reports of the vehicle"
     loop += " behind the edge runtime"
-    standing = "begin every episode at rest (always so with --loop vehicle)"
     period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--env", metavar="ENV", required=True, help=env)
     add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
@@ -81,7 +79,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--period", metavar="SECONDS", type=positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
-    add("--standing", action="store_true", help=standing)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
     help_text = "a router to share with other vehicles, instead of listening"
@@ -95,7 +92,6 @@ def run(asked: Namespace) -> int:
     """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
     if asked.loop == VEHICLE and asked.clock != REALTIME:
         raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
-    asked.standing |= asked.loop == VEHICLE
     endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
     tls = tls_for(asked.tls, endpoint)
     with ExitStack() as stack:
@@ -122,7 +118,8 @@ def _drive(
     asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
-    how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop", "standing")}
+    how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop")}
+    how["standing"] = vehicle is not None
     network, task, manifest = str(asked.latency), clock.task, port.edge_manifest()
     if manifest is not None and manifest.text == task.text:
         task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
@@ -141,9 +138,7 @@ def _drive(
             if vehicle is not None:
                 vehicle.wait_for_standstill()
             results.append(runner.run(episode, asked.seed + episode))
-            stops = [event for event in runner.safe_stops.events if event.episode == episode]
-            bar.say(episode_line(episode + 1, asked.episodes, results[-1], stops))
-            bar.advance({})
+            bar.advance({"last": results[-1].outcome})
     port.note_edge_counts()
     edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
     facts = {
@@ -214,7 +209,7 @@ class EpisodeRunner:
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
-        self.safe_stops = SafeStopLog(self._period_s)
+        self.safe_stops = SafeStopLog()
         self._adapter = Adapter(self.environment, self.task)
         self.deadline_misses = 0
         self.ridden_steps = 0

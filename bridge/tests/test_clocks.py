@@ -179,7 +179,7 @@ def test_the_wait_for_the_first_answer_brakes_and_is_no_stop(kind, spec, answer,
 
 
 def stops_of(decisions):
-    log = SafeStopLog(T)
+    log = SafeStopLog()
     for step, decision in enumerate(decisions):
         log.observe(0, step, decision)
     return [event.reason for event in log.events]
@@ -231,7 +231,7 @@ def test_in_real_time_a_stall_is_counted_and_not_caught_up():
         began_s = time.monotonic()
         rig.exchange(2)
     assert rig.clock.missed_ticks >= 2
-    assert time.monotonic() - began_s > 0.9 * T
+    assert time.monotonic() - began_s > 0.7 * T
 
 
 class VehicleRig(Rig):

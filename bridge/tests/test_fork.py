@@ -55,13 +55,14 @@ def test_the_same_policy_ends_the_drive_as_recorded(fork_of, tmp_path):
     assert len(states) == found["steps"] + 1
 
 
-def test_a_drive_is_rebuilt_behind_a_network_and_without_a_policy_only_that(fork_of, tmp_path):
+def test_a_drive_is_rebuilt_behind_a_network(fork_of, tmp_path):
     path, policy = tmp_path / "drive.mcap", make_policy(tmp_path, "constant", 0.5)
     network = "delay=60ms,jitter=40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
-    row = record_in_process(path, "congestion", SHIPPED / "congestion.onnx", 3, network)
-    found = fork_of(path)
-    assert (found["fork"], found["at_s"], found["latency_spec"]) == (None, row.time_s, network)
-    row = record_in_process(tmp_path / "b.mcap", TOY, policy, seed=4, latency="200ms")
+    theirs = SHIPPED / "congestion.onnx"
+    row = record_in_process(path, "congestion", theirs, 3, network)
+    found = fork_of(path, "--at", round(row.time_s - 0.1, 6), "--policy", theirs)
+    assert (found["fork"]["steps"], found["latency_spec"]) == (1, network)
+    record_in_process(tmp_path / "b.mcap", TOY, policy, seed=4, latency="200ms")
     found = fork_of(tmp_path / "b.mcap", "--at", 2, "--policy", policy, "--env", TOY)["fork"]
     # Until the first command arrives the car goes on as it was told last, and no longer than 2 T.
     assert [action[0] for action in found["actions"][:6]] == [0.5, 0.5, -1.0, -1.0, 0.5, 0.5]
@@ -135,11 +136,13 @@ def test_a_recording_that_cannot_be_rebuilt_gets_one_line(tmp_path, refusal, cha
 
 
 def test_other_places(refusal):
+    ours = ("--policy", OURS, "--allow-unsigned")
     congestion = ("--policy", SHIPPED / "congestion.onnx", "--allow-unsigned")
     for words, said in (
-        ((), "--episode says which"), (("--episode", 5), "holds 5 drives"),
-        (("--episode", 1, "--at", "999s"), "fork before"),
-        (("--episode", 1, "--env", "congestion"), "was driven in 'left_turn:"),
+        (("--episode", 1), "say who drives on"), (ours, "--episode says which"),
+        (("--episode", 5, *ours), "holds 5 drives"),
+        (("--episode", 1, "--at", "999s", *ours), "fork before"),
+        (("--episode", 1, "--env", "congestion", *ours), "was driven in 'left_turn:"),
         (("--episode", 1, *congestion), "the policy is for 'congestion:"),
         (("--human", "web", "--latency", "9ms"), "--human takes no"),
     ):  # fmt: skip
@@ -154,7 +157,10 @@ def test_of_a_damaged_recording_what_is_whole_is_forked(fork_of, tmp_path, capsy
     assert fork_of(damaged, *words)["fork"] == fork_of(LEFT_TURN, *words)["fork"]
     assert capsys.readouterr().err.count("damaged place") == 1
     flip_chunk(damaged, 4)  # The middle of the second drive is in it.
-    assert bridge_status(["fork", str(damaged), "--episode", "1", "--at", "5s"]) == 2
+    assert (
+        bridge_status(["fork", str(damaged), "--episode", "1", "--at", "5s", "--policy", str(OURS)])
+        == 2
+    )
     assert "fork before" in capsys.readouterr().err
 
 

@@ -142,15 +142,15 @@ def decisions(*reasons):
 
 
 def test_one_stretch_of_braking_is_one_event():
-    log = SafeStopLog(period_s=0.1)
+    log = SafeStopLog()
     braking = decisions("", "x", "x", "x", "", "x")
     for step, decision in enumerate(braking):
         log.observe(7, step, decision)
     first, second = log.events
     assert (first.episode, first.step, first.reason) == (7, 1, NO_COMMAND)
-    assert (first.resumed_after_s, second.step, second.resumed_after_s) == (0.3, 5, None)
+    assert second.step == 5
     log.observe(8, 0, braking[-1])  # A new episode closes the event of the last.
-    assert [(one.episode, one.resumed_after_s) for one in log.events[1:]] == [(7, None), (8, None)]
+    assert [one.episode for one in log.events] == [7, 7, 8]
 
 
 @pytest.mark.parametrize(

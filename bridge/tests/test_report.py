@@ -31,8 +31,8 @@ def test_a_report_has_the_contracts_keys_and_lines_for_a_terminal():
     line = reports.summary_line(report)
     for part in ("1 goal", "1 collision", "2 no_command", "2 stale", "p99 1.0 ms"):
         assert part in line
-    stop = reports.SafeStopEvent(1, 3, "no\x1bcommand")
-    assert "no\\x1bcommand" in reports.episode_line(2, 5, RESULT, [stop])
+    stopped = report_of(["goal"], ["no\x1bcommand"])
+    assert "no\\x1bcommand" in reports.summary_line(stopped)
     assert set(reports.quantiles([]).values()) == {None}
 
 

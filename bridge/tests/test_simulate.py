@@ -83,11 +83,9 @@ def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path):
     assert len(report["policy_ids"]) == 2
     # On a busy machine the edge runtime may have stopped for a reason of its own, too.
     event = next(row for row in report["safe_stop_events"] if row["reason"] == "no_command")
-    assert event["resumed_after_s"] > 0
-    braked, resumed = event["step"], event["step"] + round(event["resumed_after_s"] * 10)
     (row,) = report["per_episode"]
-    assert row["actions"][braked:resumed] == [[-1.0]] * (resumed - braked)
-    assert row["actions"][resumed] == pytest.approx([0.2])
+    assert row["actions"][event["step"]] == [-1.0]
+    assert row["actions"][-1] == pytest.approx([0.2])
 
 
 def test_an_interrupted_run_writes_no_report(tmp_path):
@@ -424,7 +422,6 @@ def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     assert speeds[clock.drive + 16] == 0.0
     (event,) = runner.safe_stops.events
     assert event.reason == NO_COMMAND
-    assert event.resumed_after_s == pytest.approx(2.2)
     assert result.actions[clock.brake_until] == pytest.approx([-0.02])
     assert clock.states[clock.brake_until + 10].speed_mps > 1.0
     assert runner.ridden_steps == 1

@@ -97,7 +97,7 @@ def drive_hunter(folder):
     common = ("--vehicle-id", "hunter")
     chassis = ("hil_tests", "mock_hunter", "--bus", bus, "--set=dead_time_s=0.1")
     edge = ("edge_runtime", "run", *trusting(POLICY, None), "--connect", endpoint, *common)
-    drive = ("--clock", "realtime", "--loop", "vehicle", "--standing", *common)
+    drive = ("--clock", "realtime", "--loop", "vehicle", *common)
     with (
         Process(*chassis, ready="ready"),
         Process(*edge, "--vehicle", "hunter", "--config", str(config), ready="ready"),

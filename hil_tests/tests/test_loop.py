@@ -22,7 +22,7 @@ episode_reward episode_time_s lateral_acceleration_mps2 longitudinal_acceleratio
 latency_ms deadline_misses safe_stops rejected
 """
 NONE, LATE = "none", "100ms"
-BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s,rate=1Mbit/s"
+BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s"
 
 
 def simulate_undisturbed(folder, endpoint, env, options):
