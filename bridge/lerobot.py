@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
@@ -193,6 +192,8 @@ def _encode(
 def _write_tables(
     folder: Path, task: str, rate: Fraction, columns: Columns, features: Any, bounds: list[int]
 ) -> None:
+    import pandas as pd  # Slow to load; a help does without it.
+
     episodes = []
     places = [f"videos/{key}" for key in features if features[key]["dtype"] == "video"]
     for number, (start, end) in enumerate(pairwise(bounds)):
