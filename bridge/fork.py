@@ -239,8 +239,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("recording", metavar="F.mcap", type="path", help="a file of bridge record")
     add_place(parser)
-    module = "the environment, if it is in a module: no file decides what is imported"
-    add("--env", metavar="ENV", help=module)
+    add("--env", metavar="ENV", help="the environment, where it is in a module")
     add("--policy", metavar="POLICY.onnx", type="path", help="the policy that drives on")
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
@@ -297,7 +296,6 @@ def _hand_over(asked: Namespace) -> None:
 FORK = cli.Subcommand(
     cli.examples(
         "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json",
-        "python -m bridge fork drive.mcap --at 12.3s --human web --record runs/forked",
     ),
     _add_fork_arguments,
     _run_fork,

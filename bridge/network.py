@@ -207,37 +207,36 @@ def parse_spec(text: str) -> LatencySpec:
     (command to simulator) before one is for that way alone and outranks the same one without, in
     any order. GRAMMAR has them all.
     """
-    if text.strip() in ("", "none"):
-        return LatencySpec()
     given: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
+    parts = [] if text.strip() in ("", "none") else text.split(",")
     try:
-        for part in map(str.strip, text.split(",")):
+        for part in map(str.strip, parts):
             prefix, dot, rest = part.partition(".")
             if not dot or prefix not in DIRECTIONS:
                 prefix, rest = "", part
-            for name, value in _parse_part(rest):
-                if name in given[prefix]:
+            name, _, word = rest.partition("=")
+            pairs = [(name, word)]
+            if short := re.fullmatch(r"(\d[^=]*?)(?:(?:\+-|±)(.*))?", rest):
+                pairs = [("delay", short[1])] + ([] if short[2] is None else [("jitter", short[2])])
+            for name, word in pairs:
+                field, value = _read_setting(name, word, part)
+                if field in given[prefix]:
                     raise UserError(f"{name} is set twice")
-                given[prefix][name] = value
+                given[prefix][field] = value
         return LatencySpec(*(DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS))
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
 
 
-def _parse_part(part: str) -> Iterator[tuple[str, Any]]:
-    """Yield field and value of a setting, or of delay and jitter in their short form."""
-    name, is_named, word = part.partition("=")
-    pairs = [(name, word)]
-    if not is_named and (match := re.fullmatch(r"(\d.*?)(?:(?:\+-|±)(.*))?", part)):
-        pairs = [("delay", match[1])] + ([] if match[2] is None else [("jitter", match[2])])
-    for name, word in pairs:
-        if name not in SETTINGS:
-            raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
-        try:
-            yield SETTINGS[name].field, SETTINGS[name].read(word)
-        except ValueError:
-            example = f"{name}={SETTINGS[name].example}"
-            raise UserError(f"{part!r} is not understood; write it like {example}") from None
+def _read_setting(name: str, word: str, part: str) -> tuple[str, Any]:
+    if name not in SETTINGS:
+        raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
+    row = SETTINGS[name]
+    try:
+        return row.field, row.read(word)
+    except ValueError:
+        example = f"{name}={row.example}"
+        raise UserError(f"{part!r} is not understood; write it like {example}") from None
 
 
 def _pareto(draw: float) -> float:

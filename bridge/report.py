@@ -274,10 +274,6 @@ class ProgressBar:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def say(self, line: str) -> None:
-        """Print a line above the bar, as it is."""
-        self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
-
     def advance(self, figures: dict[str, str], count: int = 1) -> None:
         """Count ``count`` more and show the figures."""
         self.done += count
@@ -287,4 +283,4 @@ class ProgressBar:
         is_due = now_s - self._line_s > LINE_INTERVAL_S or self.done >= self.total
         if self._bar.disable and is_due:
             self._line_s = now_s
-            self.say(f"{self.what}: {self.done}/{self.total}  {text}")
+            print(f"{self.what}: {self.done}/{self.total}  {text}", file=sys.stderr)
