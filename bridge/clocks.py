@@ -91,7 +91,7 @@ class _Clock:
     def finish(self, state: State) -> None:
         """Send the final state past the injected network, and forget whatever is under way."""
         with self._arrived:
-            self.check.end(state.step, self._hold.newest_step)
+            self.check.end(state.step)
         self.publish(self._stamped(state))
 
     def close(self) -> None:
@@ -279,10 +279,8 @@ class VehicleClock(RealTimeClock):
     def wait_for_vehicle(self, limit_s: float, vehicle_id: str) -> None:
         """Wait until the vehicle reports; UserError after ``limit_s``."""
         if not self._wait_until(lambda _: True, limit_s):
-            raise UserError(
-                f"no feedback from a vehicle of {vehicle_id} after {limit_s:g} s; give its edge "
-                "runtime one: python -m edge_runtime run --vehicle NAME"
-            )
+            start = "python -m edge_runtime run --vehicle NAME"
+            raise UserError(f"no vehicle of {vehicle_id} reports after {limit_s:g} s: {start}")
 
     def wait_for_standstill(self) -> None:
         """Wait until the vehicle stands, or STANDSTILL_WAIT_S are over."""

@@ -122,28 +122,28 @@ class CommandCheck:
         self.policy_ids: list[str] = []
         self.actions, self.period_s = task.action, task.control_period_s
         self.newest = (0, -1)  # Episode and step of the newest state that was sent
-        self._ended = (-1, -1)
+        self._is_over = False
         self._stamps: deque[int] = deque(maxlen=64)  # Of recent commands: a copy counts once
         self.heard: dict[str, int] = {}
         """The next state's fields about this session's commands; empty before the first."""
 
     def begin(self, episode: int) -> None:
-        """Begin an episode: answers to earlier ones are stale from now on."""
-        self.newest = (episode, -1)
+        """Begin an episode: answers to earlier ones come too late from now on."""
+        self.newest, self._is_over = (episode, -1), False
 
     def sent(self, step: int) -> None:
         """Note a state sent, so that its answer can be told from an invention."""
         self.newest = (self.newest[0], step)
 
-    def end(self, final_step: int, answered_step: int) -> None:
-        """End the episode: answers after ``answered_step`` come too late without a fault."""
+    def end(self, final_step: int) -> None:
+        """End the episode."""
         self.sent(final_step)
-        self._ended = (self.newest[0], answered_step)
+        self._is_over = True
 
     def read(self, payload: bytes, now_ns: int = 0) -> Command | None:
         """Return the command if it answers a state of this episode, else None.
 
-        An answer after its episode's end is not counted. ``now_ns`` is the wall clock.
+        An answer after its episode's end is no fault. ``now_ns`` is the wall clock.
         """
         command = decode_command(payload)
         if isinstance(command, Rejection):
@@ -156,7 +156,7 @@ class CommandCheck:
         if fault := self._fault(command):
             self.reject(fault)
             return None
-        if self._comes_too_late(command):
+        if self._is_over or command.episode < self.newest[0]:
             return None
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
@@ -180,12 +180,7 @@ class CommandCheck:
             return "plan_too_long"  # It would keep the vehicle going for longer than any may
         if (command.episode, command.step) > self.newest:
             return UNKNOWN_STEP
-        is_old = command.episode < self.newest[0] and not self._comes_too_late(command)
-        return Reason.STALE.value if is_old else ""
-
-    def _comes_too_late(self, command: Command) -> bool:
-        ended_episode, answered_step = self._ended
-        return command.episode == ended_episode and command.step > answered_step
+        return ""
 
 
 def _action_fault(
