@@ -207,8 +207,7 @@ class ForkedDrive(LockStepClock):
             self.receive(command)
 
     def _show(self, environment: Environment, stamps: Scene) -> None:
-        if self._out is not None:
-            self._record("scene", scene_payload(environment, stamps))
+        self._record("scene", scene_payload(environment, stamps))
 
     def _record(self, topic: str, payload: bytes) -> None:
         if self._out is not None:

@@ -171,7 +171,13 @@ class WireListener:
         self.end_s = math.inf  # Unix time at which its certificate ends
         self.queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
         self._simulators: set[str] = set()
+        self._is_stopped = False
         self._zero_ns = time.time_ns() - time.monotonic_ns()
+
+    def stop(self) -> bool:
+        """End `until_gone` after its next message; may be called from a signal's handler."""
+        self._is_stopped = True
+        return True
 
     def next(self, timeout_s: float) -> Heard | None:
         """Return the next message, or None after ``timeout_s``."""
@@ -189,7 +195,7 @@ class WireListener:
         """
         now_s = seen_s = time.monotonic()
         end_s = math.inf if duration_s is None else now_s + duration_s
-        while now_s < end_s and time.time() < self.end_s:
+        while now_s < end_s and time.time() < self.end_s and not self._is_stopped:
             yield self.next(POLL_S)
             now_s = time.monotonic()
             if self._simulators:
@@ -360,22 +366,16 @@ def _run_record(arguments: Any) -> int:
     """Record until the simulators go, the time is over, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
-    ended = threading.Event()
     with (
         sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
         closing(RecordingWriter(path)) as writer,
     ):
-
-        def end() -> bool:
-            ended.set()
-            return True
-
         print(f"recording {path}", flush=True)
         try:
             # A signal is the ordinary way to end a recording: it must not cut a message in two.
-            with quit_on_signals(end):
-                _listen(listener, writer, arguments, ended)
+            with quit_on_signals(listener.stop):
+                _listen(listener, writer, arguments)
                 writer.finish()
         except OSError as error:
             stopped = f"error: recording {path} stopped: {error.strerror}"
@@ -388,9 +388,7 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-def _listen(
-    listener: WireListener, writer: RecordingWriter, arguments: Any, ended: threading.Event
-) -> None:
+def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
     flush_s = time.monotonic() + FLUSH_S
     for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
         if heard is not None:
@@ -399,8 +397,6 @@ def _listen(
         if time.monotonic() >= flush_s:
             writer.flush()
             flush_s = time.monotonic() + FLUSH_S
-        if ended.is_set():
-            return
 
 
 RECORD_EXAMPLE = examples(

@@ -143,15 +143,10 @@ class SafeStopLog:
         self._open = event
 
 
-QUANTILES = {"p50": 50, "p99": 99, "max": 100}
-
-
 def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
     """Return p50, p99 and max of times in ms; None each if there are none."""
-    if not values_ms:
-        return dict.fromkeys(QUANTILES)
-    found = np.percentile(values_ms, list(QUANTILES.values()))
-    return dict(zip(QUANTILES, map(float, found), strict=True))
+    found = np.percentile(values_ms, [50, 99, 100]).tolist() if values_ms else [None] * 3
+    return dict(zip(("p50", "p99", "max"), found, strict=True))
 
 
 def make_report(

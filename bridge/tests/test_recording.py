@@ -10,7 +10,6 @@ import signal
 import time
 import tracemalloc
 from pathlib import Path
-from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -234,20 +233,16 @@ def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def listen(listener, writer, ended, linger_s):
-    ports._listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=linger_s), ended)
+def listen(listener, writer, linger_s):
+    ports._listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=linger_s))
 
 
 def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     """Not even while the writer is in the middle of one."""
-    listener, ended, path = WireListener(), Event(), tmp_path / "a.mcap"
+    listener, path = WireListener(), tmp_path / "a.mcap"
     monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
 
-    def end() -> bool:
-        ended.set()
-        return True
-
-    with writing(path) as writer, quit_on_signals(end):
+    with writing(path) as writer, quit_on_signals(listener.stop):
         copy = writer._copies.write
 
         def signalled(one):
@@ -255,7 +250,7 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
             copy(one)
 
         monkeypatch.setattr(writer._copies, "write", signalled)
-        listen(listener, writer, ended, 9.0)
+        listen(listener, writer, 9.0)
     assert [topic for topic, _, _ in told_in(path)] == ["phil/v/state", "view/v/state"]
 
 
@@ -281,7 +276,7 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
 
     monkeypatch.setattr(listener, "next", hear)
     with writing(tmp_path / "drive.mcap") as writer:
-        listen(listener, writer, Event(), 0.05)
+        listen(listener, writer, 0.05)
     assert writer.messages > 0
 
 
