@@ -218,14 +218,11 @@ class ForkedDrive(LockStepClock):
 def add_place(parser: Any) -> None:
     """Declare the options that say where a drive is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
-    parser.add_argument("--at", metavar="T", type=_seconds, default=0.0, help=at)
+    at_s = {"type": lambda text: cli.seconds(text.removesuffix("s")), "default": 0.0}
+    parser.add_argument("--at", metavar="T", **at_s, help=at)
     parser.add_argument("--episode", metavar="K", type=cli.not_negative, help=which)
     several = "the vehicle, if the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
-
-
-def _seconds(text: str) -> float:
-    return cli.seconds(text.removesuffix("s"))
 
 
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
@@ -292,10 +289,5 @@ def _hand_over(asked: Namespace) -> None:
     os.execv(sys.executable, command)
 
 
-FORK = cli.Subcommand(
-    cli.examples(
-        "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json",
-    ),
-    _add_fork_arguments,
-    _run_fork,
-)
+EXAMPLE = "python -m bridge fork drive.mcap --at 12.3s --policy other.onnx --out fork.json"
+FORK = cli.Subcommand(cli.examples(EXAMPLE), _add_fork_arguments, _run_fork)

@@ -275,7 +275,7 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
-_VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
+_ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
 _TLS = "folder with ca.pem, cert.pem and key.pem (python -m deploy certs), for tls/... endpoints"
 _UNTIL = "stop after this time, in s (default: when no simulator is left)"
 _NETWORK = "simulated network: " + GRAMMAR.replace("%", "%%")
@@ -283,7 +283,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "endpoint for edge runtimes and viewers"},
     "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": "simulator or router"},
     "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
-    "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
+    "--vehicle-id": {**_ID, "help": "the vehicle"},
     "--wait-s": {**_SECONDS, "default": 10.0, "help": "longest wait for a simulator, in s"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},
     "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "longest wait for an edge, in s"},
@@ -341,15 +341,8 @@ def _run_router(arguments: Any) -> int:
     return 0
 
 
-ROUTER = Subcommand(
-    examples(
-        "python -m bridge router --listen tcp/127.0.0.1:7447",
-        "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
-        "    --vehicle-id hunter01 --vehicle-id hunter02",
-    ),
-    _add_router_arguments,
-    _run_router,
-)
+ROUTER_EXAMPLE = "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router"
+ROUTER = Subcommand(examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
 
 
 def _add_record_arguments(parser: Any) -> None:
@@ -399,8 +392,5 @@ def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> 
             flush_s = time.monotonic() + FLUSH_S
 
 
-RECORD_EXAMPLE = examples(
-    "python -m bridge record --out drive.mcap",
-    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
-)
-RECORD = Subcommand(RECORD_EXAMPLE, _add_record_arguments, _run_record)
+RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
+RECORD = Subcommand(examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)

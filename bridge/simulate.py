@@ -59,9 +59,7 @@ POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 PEDAL = "pedal"
 EXAMPLE = examples(
     "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime --latency 50ms+-10ms",
-    "python -m bridge simulate --env SCENARIO --condition variant --episodes 20 --out r.json",
-    "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle \\\n"
-    "    --connect tcp/127.0.0.1:7447 --vehicle-id car-a",
+    "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle --vehicle-id car-a",
 )
 
 
@@ -81,8 +79,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
-    help_text = "a router to share with other vehicles, instead of listening"
-    add_options(where, "--connect", default=None, help=help_text)
+    add_options(where, "--connect", default=None, help="a router to share with other vehicles")
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
     add_options(parser, "--vehicle-id", help="the vehicle to simulate")
     add_options(parser, "--seed", help="episode i is reset with seed + i")
