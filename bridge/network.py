@@ -169,8 +169,8 @@ _PERCENT = {"%": 1.0}
 SETTINGS = {
     "delay": _number("delay_ms", "50ms", _MS, 60_000.0),
     "jitter": _number("jitter_ms", "10ms", _MS, 60_000.0),
-    "tail": Setting("tail", "pareto", _read_tail),
     "loss": _number("loss_percent", "1%", _PERCENT, 100.0),
+    "tail": Setting("tail", "pareto", _read_tail),
     "burst": _number("burst_messages", "5", {"": 1.0}, 1e6, least=1.0),
     "clear_loss": _number("clear_loss_percent", "0.1%", _PERCENT, 100.0),
     "reorder": _number("reorder_percent", "1%", _PERCENT, 100.0),
