@@ -236,7 +236,7 @@ def _add_fork_arguments(parser: Any) -> None:
     add("recording", metavar="F.mcap", type="path", help="a file of bridge record")
     add_place(parser)
     add("--env", metavar="ENV", help="the environment, where it is in a module")
-    add("--policy", metavar="POLICY.onnx", type="path", help="the policy that drives on")
+    add("--policy", metavar="POLICY.onnx", type="path", help="drives on (default: rebuild only)")
     add_trust(parser)
     add_options(parser, "--latency", default=None, help="another network, as for `bridge simulate`")
     human = "you drive on: `python -m trainer drive --from`, which has more options"
@@ -250,28 +250,30 @@ def _run_fork(asked: Namespace) -> int:
     """Fork the drive, and print and write what came of it."""
     if asked.human is not None:
         _hand_over(asked)
-    if asked.policy is None:
-        raise UserError("say who drives on: --policy POLICY.onnx, or --human web")
     drive, fork = find_fork(asked.recording, asked)
-    policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
+    at_s, found, policy = fork * drive.task.control_period_s, None, None
+    if asked.policy is not None:
+        policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
     with ExitStack() as stack:
         environment = stack.enter_context(closing(drive.environment(asked.env)))
-        out = stack.enter_context(whole_recording(asked.record)) if asked.record else None
-        forked = ForkedDrive(drive, environment, fork, policy, asked.latency, out)
-        found = forked.run()
-    at_s = round(fork * drive.task.control_period_s, 6)
+        if policy is None:
+            ForkedEnvironment(environment, drive, drive.steps).reset()
+        else:
+            out = stack.enter_context(whole_recording(asked.record)) if asked.record else None
+            found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
     report = {
         "recording": asked.recording,
         "episode": drive.number,
         "origin": msgspec.structs.asdict(drive.origin),
-        "at_s": at_s,
-        "latency_spec": str(forked.spec),
-        "policy_id": policy.policy_id,
+        "at_s": round(at_s, 6),
+        "latency_spec": str(asked.latency or drive.origin.latency),
+        "policy_id": policy.policy_id if policy else "",
         "recorded_policy_ids": sorted({each.policy_id for each in drive.commands.values()}),
-        "fork": asdict(found),
+        "fork": found and asdict(found),
     }
     write_json_out(asked.out, report)
-    print(printable(f"forked at {at_s:g} s: {found.outcome} {found.time_s:g} s later"))
+    end = f"forked at {at_s:g} s: {found.outcome} {found.time_s:g} s later" if found else ""
+    print(printable(end or "rebuilt to its end, to the bit"))
     return 0
 
 

@@ -60,6 +60,7 @@ def test_a_drive_is_rebuilt_behind_a_network(fork_of, tmp_path):
     network = "delay=60ms,jitter=40ms,loss=8%,burst=4,duplicate=5%,outage=0.6s@2s"
     theirs = SHIPPED / "congestion.onnx"
     row = record_in_process(path, "congestion", theirs, 3, network)
+    assert fork_of(path)["fork"] is None, "rebuilt to its end"
     found = fork_of(path, "--at", round(row.time_s - 0.1, 6), "--policy", theirs)
     assert (found["fork"]["steps"], found["latency_spec"]) == (1, network)
     record_in_process(tmp_path / "b.mcap", TOY, policy, seed=4, latency="200ms")
@@ -139,7 +140,7 @@ def test_other_places(refusal):
     ours = ("--policy", OURS, "--allow-unsigned")
     congestion = ("--policy", SHIPPED / "congestion.onnx", "--allow-unsigned")
     for words, said in (
-        (("--episode", 1), "say who drives on"), (ours, "--episode says which"),
+        (ours, "--episode says which"),
         (("--episode", 5, *ours), "holds 5 drives"),
         (("--episode", 1, "--at", "999s", *ours), "fork before"),
         (("--episode", 1, "--env", "congestion", *ours), "was driven in 'left_turn:"),
