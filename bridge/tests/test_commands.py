@@ -24,7 +24,7 @@ ROWS = [
     ("simulate --env TOY --loop vehicle", "--loop vehicle needs --clock realtime"),
     ("router --config there.mcap", "Zenoh opens no router"),
     ("record --out there.mcap", "exists"),
-    ("record --out a.mcap --connect FREE --wait-s 0", "nobody"),
+    ("record --out a.mcap --connect FREE --wait-s 0", "no link"),
     ("replay LEFT_TURN --policy none.onnx", "does not exist"),
     ("replay missing.mcap --policy p.onnx", "No such file"),
     ("replay there.mcap --policy p.onnx", "no MCAP recording"),
