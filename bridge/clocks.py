@@ -39,7 +39,7 @@ from bridge.network import (
     make_network,
 )
 from bridge.report import STANDSTILL_MPS, VehicleLog
-from edge_runtime.manifest import Task
+from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, Command, Feedback, Reason, State, encode
@@ -116,6 +116,7 @@ class LockStepClock(_Clock):
             self.spec,
             seed,
             self._period_s,
+            Layout(self.task).size,
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
             on_stale=lambda: self.check.reject(Reason.STALE.value),
         )
@@ -228,7 +229,7 @@ class RealTimeClock(_Clock):
     def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
-        for arrival_s in direction.arrivals(sent_s):
+        for arrival_s in direction.arrivals(sent_s, len(payload)):
             self._line.push(self._begun_s + arrival_s, partial(deliver, payload))
 
     def _wait_for_tick(self, step: int) -> float:

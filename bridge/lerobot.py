@@ -121,10 +121,10 @@ def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[Layout, State, Com
     """Yield the readable states with their answers, and how to read them."""
     layout = Layout(task)
     for state in drive.states():
-        answer = None if state.final else drive.answers.get(key_of(state))
+        exchange = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
-        if readable and answer is not None and len(answer.action) == len(task.action):
-            yield layout, state, answer
+        if readable and exchange and len(exchange.command.action) == len(task.action):
+            yield layout, state, exchange.command
 
 
 def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns, list[int]]:

@@ -1,8 +1,8 @@
 """The simulated network: when a message between two ends arrives, drawn from a seed.
 
 Pure: the caller passes the time in. `LatencyModel` serves virtual time (`VirtualLink`, in lock-step
-and in training) and real time (timers). The way of a message: outage, loss, time under way, held
-back or not, duplicated or not.
+and in training) and real time (timers). The way of a message (`LatencyModel`): queue and line,
+outage, loss, time under way, held back or not, duplicated or not, and in order if order is kept.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from edge_runtime.wire import SAFE_STOP, Command
 
 DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
 COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
+STATE_BYTES, COMMAND_BYTES = 122, 217  # A state without its observation
+FREE, KEPT = ORDERS = ("free", "kept")
 PARETO_ALPHA = 3.0  # As netem's pareto table: variance is finite above 2
 
 
@@ -69,8 +71,13 @@ class DirectionSpec:
     clear_loss_percent: float = 0.0  # Loss outside of bad stretches
     reorder_percent: float = 0.0  # Share of messages held back, so that later ones can overtake
     reorder_by_ms: float = 150.0  # The default lets one state of the control loop pass
+    order: str = FREE
+    """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
     duplicate_percent: float = 0.0
     """Share of messages that arrive twice; the copy's time under way is drawn anew."""
+    rate_kbps: float = 0.0  # Bandwidth in 1000 bit/s; 0: no limit
+    queue_ms: float = 200.0
+    """Longest wait for the line; a message that would wait longer is dropped."""
     outages: tuple[Outage, ...] = ()
 
     def __post_init__(self) -> None:
@@ -134,10 +141,13 @@ def _number(
     return Setting(field, example, read, lambda value: _written(value, unit))
 
 
-def _read_tail(text: str) -> str:
-    if text not in SHAPES:
-        raise ValueError(text)
-    return text
+def _choice(field: str, words: tuple[str, ...]) -> Setting:
+    def read(text: str) -> str:
+        if text not in words:
+            raise ValueError(text)
+        return text
+
+    return Setting(field, words[-1], read)
 
 
 def _read_outages(text: str) -> tuple[Outage, ...]:
@@ -166,16 +176,20 @@ def _write_outages(outages: tuple[Outage, ...]) -> str:
 
 
 _PERCENT = {"%": 1.0}
+_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
 SETTINGS = {
     "delay": _number("delay_ms", "50ms", _MS, 60_000.0),
     "jitter": _number("jitter_ms", "10ms", _MS, 60_000.0),
     "loss": _number("loss_percent", "1%", _PERCENT, 100.0),
-    "tail": Setting("tail", "pareto", _read_tail),
+    "tail": _choice("tail", ("normal", "pareto")),
     "burst": _number("burst_messages", "5", {"": 1.0}, 1e6, least=1.0),
     "clear_loss": _number("clear_loss_percent", "0.1%", _PERCENT, 100.0),
     "reorder": _number("reorder_percent", "1%", _PERCENT, 100.0),
     "reorder_by": _number("reorder_by_ms", "300ms", _MS, 60_000.0),
+    "order": _choice("order", ORDERS),
     "duplicate": _number("duplicate_percent", "1%", _PERCENT, 100.0),
+    "rate": _number("rate_kbps", "1Mbit/s", _RATES, 1e9, least=math.ulp(0.0)),
+    "queue": _number("queue_ms", "100ms", _MS, 60_000.0),
     "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages, _write_outages),
 }
 """Name in a specification -> setting."""
@@ -289,22 +303,38 @@ class LatencyModel:
         self._reorder_rng, self._duplicate_rng = reorder, duplicate
         self._loss_percents = loss_percents(spec, bursts)
         self._shape = SHAPES[spec.tail]
+        self._line_free_s = self._newest_arrival_s = -math.inf
 
-    def arrivals(self, now_s: float) -> tuple[float, ...]:
+    def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
         """Return when a message handed over at ``now_s`` arrives (s, same clock), earliest first.
 
-        Empty if it is lost, two times if it is duplicated.
+        Empty if it is lost, two times if it is duplicated. ``size_bytes`` matters with a rate.
         """
         lost = self._rng.random() * 100.0 < next(self._loss_percents)
         draw = self._rng.standard_normal()
         held_back = self._reorder_rng.random() * 100.0 < self.spec.reorder_percent
         duplicated = self._duplicate_rng.random() * 100.0 < self.spec.duplicate_percent
         draws = (draw, self._duplicate_rng.standard_normal())[: 1 + duplicated]
-        if lost or any(outage.covers(now_s) for outage in self.spec.outages):
+        left_s = self._leave_s(now_s, size_bytes)
+        if left_s is None or lost or any(outage.covers(left_s) for outage in self.spec.outages):
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
         delays_ms = (self.spec.delay_ms + self.spec.jitter_ms * self._shape(d) for d in draws)
-        return tuple(sorted(now_s + max(0.0, ms) * 1e-3 + extra_s for ms in delays_ms))
+        times = sorted(left_s + max(0.0, ms) * 1e-3 + extra_s for ms in delays_ms)
+        if self.spec.order == KEPT:
+            times = [max(arrival_s, self._newest_arrival_s) for arrival_s in times]
+            self._newest_arrival_s = times[-1]
+        return tuple(times)
+
+    def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
+        """Return when the message's last byte has left; None if the queue is full."""
+        if not self.spec.rate_kbps:
+            return now_s
+        begin_s = max(now_s, self._line_free_s)
+        if begin_s - now_s > self.spec.queue_ms * 1e-3:
+            return None
+        self._line_free_s = begin_s + size_bytes / (self.spec.rate_kbps * 1e3 / 8)
+        return self._line_free_s
 
 
 class Network(NamedTuple):
@@ -342,7 +372,8 @@ class VirtualLink(Generic[Message]):
     from standby at each episode's start, and turns into a safe stop what that would not drive.
 
     ``on_heard`` is called with each newest answer's latency in s, state sent to command received,
-    ``on_stale`` for each answer that is not newer than the newest; ``period_s`` is T.
+    ``on_stale`` for each answer that is not newer than the newest; ``period_s`` is T,
+    ``observation_bytes`` what a state carries.
     """
 
     def __init__(
@@ -350,10 +381,11 @@ class VirtualLink(Generic[Message]):
         spec: LatencySpec,
         seed: int,
         period_s: float,
+        observation_bytes: int,
         on_heard: Callable[[float], None] = lambda latency_s: None,
         on_stale: Callable[[], None] = lambda: None,
     ) -> None:
-        self._period_s = period_s
+        self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
         self._link = make_network(spec, seed)
         self._on_heard, self._on_stale = on_heard, on_stale
@@ -371,7 +403,7 @@ class VirtualLink(Generic[Message]):
         """Begin tick ``step``: its state leaves the vehicle."""
         tick_s = step * self._period_s
         self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW * self._period_s
-        for arrival_s in self._link.up.arrivals(tick_s):
+        for arrival_s in self._link.up.arrivals(tick_s, self._state_bytes):
             self._push(arrival_s, partial(self._arrive_at_edge, step, message))
 
     def next_at_edge(self) -> Arrival[Message] | None:
@@ -394,7 +426,7 @@ class VirtualLink(Generic[Message]):
         if command.plan:  # as long as the edge runtime's own silence
             ride_s = len(command.plan) * self._period_s
             self._safety = self._safety._replace(ride_s=ride_s)
-        for arrival_s in self._link.down.arrivals(arrival.arrived_s):
+        for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
             self._push(arrival_s, partial(self._arrive_at_vehicle, command, computing_s))
 
     def decide(self, edge_silent: bool = False) -> Decision:

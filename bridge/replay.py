@@ -1,7 +1,8 @@
 """``python -m bridge replay``: run recorded states through a policy and compare its commands.
 
 The policy runs inside the edge runtime's own decision logic, at the times that the recorded
-runtime stamped: two replays of one file are the same.
+runtime stamped: two replays of one file are the same. The stamps are carried over to the recorder's
+clock, since a board's clock may be set during a drive.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bridge.ports import add_options
 from bridge.recording import Recording, choose_vehicle, valid_messages
@@ -34,12 +35,23 @@ from edge_runtime.wire import DRIVE, Command, Health, State, is_foreign
 
 RUNTIME_ENDED = "runtime_ended"  # Reason of a runtime's farewell, which answers no state
 JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
-RESTART_NS = 500_000_000  # Starts that are further apart belong to two runtimes
+RESTART_S = 0.5  # Starts that are further apart belong to two runtimes
+CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock was set
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
 
 Key = tuple[str, int, int]  # Session, episode, step
+
+
+class Exchange(NamedTuple):
+    """A recorded answer, and its times in seconds since the recording's first message."""
+
+    command: Command
+    arrived_s: float  # When the state reached the runtime
+    sent_s: float  # When the answer was sent
+
+
 Row = tuple[State, Command | None, Order | None]
 """A state with its recorded answer and the replayed one; no recorded answer of the policy: None."""
 EXAMPLE = examples("python -m bridge replay drive.mcap --policy my.onnx --public-key policy.pub")
@@ -68,7 +80,7 @@ def run(arguments: Any) -> int:
     report = {
         "recording": arguments.recording,
         "policy_id": policy.policy_id,
-        "recorded_policy_ids": sorted({each.policy_id for each in drive.answers.values()}),
+        "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
         **compare(replay(drive, policy, config), arguments.tolerance),
     }
     if report["compared"] == 0:
@@ -95,25 +107,45 @@ class RecordedDrive:
     def __init__(self, path: Path, vehicle_id: str | None) -> None:
         self.recording = Recording(path)
         self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
-        self.answers: dict[Key, Command] = {}
+        self.answers: dict[Key, Exchange] = {}
         self.vehicle = NONE
         self.task: Task | None = None  # As the simulator's scenes say
-        self.starts_ns: list[int] = []  # Of the edge runtimes, one after the other
+        self.starts_s: list[float] = []  # Of the edge runtimes, one after the other
+        zero_ns: int | None = None
+        self._lead_s: float | None = None  # Of the recorder's clock before the runtime's
+        self._newest_s = -math.inf  # Arrival of the newest state
         for heard, message in valid_messages(self.recording, self.vehicle_id):
+            zero_ns = heard.arrived_ns if zero_ns is None else zero_ns
+            heard_s = (heard.arrived_ns - zero_ns) * 1e-9
             if heard.topic == "scene":
                 self.task = self.task or message.task
             elif isinstance(message, Command) and message.reason != RUNTIME_ENDED:
                 known = self.answers.get(key_of(message))
-                if known is None or (message.inference_ns and not known.inference_ns):
-                    self.answers[key_of(message)] = message
+                exchange = self._exchange(message, heard_s)
+                if known is None or (message.inference_ns and not known.command.inference_ns):
+                    self.answers[key_of(message)] = exchange
             elif isinstance(message, Health):
                 self.vehicle = message.vehicle
-                start_ns = message.sent_ns - round(message.uptime_s * 1e9)
-                if not self.starts_ns or start_ns > self.starts_ns[-1] + RESTART_NS:
-                    self.starts_ns.append(start_ns)
+                start_s = heard_s - message.uptime_s
+                if not self.starts_s or start_s > self.starts_s[-1] + RESTART_S:
+                    self.starts_s.append(start_s)
+                    self._lead_s = None
         self.recording.say_trouble()
         if not self.answers:
             raise UserError(f"{path} holds no answered state of vehicle {self.vehicle_id}")
+
+    def _exchange(self, command: Command, heard_s: float) -> Exchange:
+        """Carry a command's stamps over to the recorder's clock."""
+        stamp_s = command.sent_ns * 1e-9
+        lead_s = heard_s - stamp_s
+        if self._lead_s is None or abs(lead_s - self._lead_s) > CLOCK_STEP_S:
+            self._lead_s = lead_s
+        sent_s = stamp_s + self._lead_s
+        # By one clock, unless that was set between the two stamps; states arrive in order.
+        took_s = (command.sent_ns - command.received_ns) * 1e-9
+        arrived_s = sent_s - (took_s if 0.0 <= took_s < CLOCK_STEP_S else 0.0)
+        self._newest_s = max(self._newest_s, arrived_s)
+        return Exchange(command, self._newest_s, max(sent_s, self._newest_s))
 
     def states(self) -> Iterator[State]:
         """Yield the states in their order, each once: a network may repeat a message."""
@@ -137,19 +169,21 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
     action of the policy or cannot follow its scenario.
     """
     limits = shared_limits(policy.manifest.action, _vehicle_limits(drive, policy, config))
-    controller, starts_ns = None, drive.starts_ns[1:]
+    controller, starts_s = None, drive.starts_s[1:]
     for state in drive.states():
-        recorded = drive.answers.get(key_of(state))
-        if recorded is None:
+        exchange = drive.answers.get(key_of(state))
+        if exchange is None:
             yield state, None, None
             continue
-        started = [start_ns for start_ns in starts_ns if start_ns <= recorded.received_ns]
+        recorded = exchange.command
+        started = [start_s for start_s in starts_s if start_s <= exchange.arrived_s]
         if controller is None or started:
-            starts_ns = starts_ns[len(started) :]
+            starts_s = starts_s[len(started) :]
             armed = recorded.reason != Event.NOT_ARMED.value
-            needs_rearm, commands = drive.vehicle != NONE, drive.answers.values()
+            needs_rearm = drive.vehicle != NONE
+            commands = [each.command for each in drive.answers.values()]
             controller = controller_of(policy, limits, commands, needs_rearm, armed)
-        order = _answer(controller, policy, state, recorded)
+        order = _answer(controller, policy, state, exchange)
         yield state, recorded if recorded.inference_ns or order else None, order
 
 
@@ -178,18 +212,17 @@ def controller_of(
 
 
 def _answer(
-    controller: Controller, policy: Policy, state: State, recorded: Command
+    controller: Controller, policy: Policy, state: State, exchange: Exchange
 ) -> Order | None:
     """Return what the runtime answers to the state: None where only its watchdog would speak."""
-    arrived_ns, layout = recorded.received_ns, policy.layout
-    arrived_s, sent_s = arrived_ns * 1e-9, recorded.sent_ns * 1e-9
-    begun_s = max(arrived_s, sent_s - recorded.inference_ns * 1e-9)
+    recorded, arrived_s, sent_s = exchange
+    layout, begun_s = policy.layout, max(arrived_s, sent_s - recorded.inference_ns * 1e-9)
     if not recorded.inference_ns:
         begun_s = sent_s = arrived_s
     _watchdog(controller, begun_s)
     if recorded.mode == DRIVE and controller.waits_for_rearm:
         controller.rearm(arrived_s)
-    controller.begin(Received(state, arrived_s, arrived_ns), begun_s)
+    controller.begin(Received(state, arrived_s, recorded.received_ns), begun_s)
     if recorded.reason == Event.TOO_LONG.value and not recorded.inference_ns:
         return controller.tick(begun_s + policy.manifest.control_period_s + JUST_AFTER_S)
     output = None

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.network import (
+    ORDERS,
     SETTINGS,
     SHAPES,
     DirectionSpec,
@@ -27,9 +28,9 @@ outages = st.one_of(
 )
 common = {
     "delay_ms": milliseconds, "jitter_ms": milliseconds, "tail": st.sampled_from(list(SHAPES)),
-    "reorder_percent": percent, "reorder_by_ms": milliseconds,
-    "duplicate_percent": percent,
-    "outages": st.lists(outages, max_size=3).map(tuple),
+    "reorder_percent": percent, "reorder_by_ms": milliseconds, "order": st.sampled_from(ORDERS),
+    "duplicate_percent": percent, "rate_kbps": st.one_of(st.just(0.0), st.floats(1.0, 1e6)),
+    "queue_ms": milliseconds, "outages": st.lists(outages, max_size=3).map(tuple),
 }  # fmt: skip
 independent = st.builds(DirectionSpec, loss_percent=percent, **common)
 bursty = st.builds(
@@ -52,7 +53,9 @@ JITTERY = {"delay_ms": 50, "jitter_ms": 10}
     ("text", "up", "down"),
     [
         ("none", {}, {}),
-        ("up.loss=0%", {}, {}),
+        ("up.loss=0%,queue=200ms", {}, {}),
+        ("rate=1Mbit/s,queue=50ms", *[{"rate_kbps": 1000, "queue_ms": 50}] * 2),
+        ("rate=800bit/s", *[{"rate_kbps": 0.8}] * 2),
         ("50ms+-10ms", JITTERY, JITTERY),
         ("delay=50ms,jitter=10ms,loss=1%", *[{**JITTERY, "loss_percent": 1}] * 2),
         ("up.delay=30ms,down.loss=2%", {"delay_ms": 30}, {"loss_percent": 2}),
@@ -71,8 +74,8 @@ def test_each_way_has_its_own_settings_and_units_are_taken(text, up, down):
 
 BAD = """
 50 delay=50 delay=-5ms delay=nanms delay=2e9s jitter=5% loss=101% loss=0.1 loss=5 loss=-1%
-loss=5,burst=3 lag=3ms delay=1ms,delay=2ms up.up.delay=1ms 50ms+- , side.loss=1% tail=fat
-burst=0.5 burst=5% outage=1s outage=1s@ outage=10s/1s outage=1s@2s+
+loss=5,burst=3 lag=3ms delay=1ms,delay=2ms up.up.delay=1ms 50ms+- , side.loss=1% tail=fat order=
+burst=0.5 burst=5% rate=0Mbit/s rate=1MB/s outage=1s outage=1s@ outage=10s/1s outage=1s@2s+
 outage=1s@2s@3s loss=90%,burst=5 loss=2%,clear_loss=3%,burst=5
 """
 
@@ -100,6 +103,7 @@ def test_a_specification_reads_back_from_its_text_which_is_canonical(spec, space
     assert (again, str(again)) == (spec, text)
 
 
+SIZE_BYTES = 7_300
 PERIOD_S = 0.1
 seeds = st.integers(0, 2**32)
 
@@ -110,7 +114,7 @@ def one_way(text, seed=0):
 
 def run(model, count, start_s=0.0, period_s=PERIOD_S):
     """The arrivals of ``count`` messages that are sent ``period_s`` apart."""
-    return [model.arrivals(start_s + k * period_s) for k in range(count)]
+    return [model.arrivals(start_s + k * period_s, SIZE_BYTES) for k in range(count)]
 
 
 def delays_ms(text, count=20_000):
@@ -130,13 +134,15 @@ def test_delay_jitter_and_loss_draw_what_they_drew_before_there_was_more():
 
 
 @given(directions, seeds, st.floats(0.0, 1e6))
-def test_none_comes_early_or_thrice(spec, seed, start_s):
+def test_none_comes_early_or_thrice_and_none_overtakes_where_order_is_kept(spec, seed, start_s):
     model = LatencyModel(spec, np.random.SeedSequence(seed))
     sent = run(model, 30, start_s)
     for number, times in enumerate(sent):
         assert all(arrival_s >= start_s + number * PERIOD_S for arrival_s in times)
         assert list(times) == sorted(times)
         assert len(times) <= 2
+    arrivals = [time for times in sent for time in times]
+    assert spec.order != "kept" or arrivals == sorted(arrivals)
     perfect = make_network(LatencySpec(), seed)
     assert run(perfect.up, 2, start_s) == [(start_s,), (start_s + PERIOD_S,)]
 
@@ -218,3 +224,23 @@ def test_a_feature_does_not_change_the_luck_of_the_others():
     assert all(b in (a, ()) for a, b in zip(clean, plain, strict=True))
     more = run(one_way("50ms+-10ms,loss=10%,duplicate=20%,reorder=20%"), 300)
     assert [bool(times) for times in plain] == [bool(times) for times in more]
+
+
+def test_jitter_overtakes_where_order_is_free_and_is_waited_for_where_it_is_kept():
+    free = [times[0] for times in run(one_way("200ms+-100ms"), 200)]
+    kept = [times[0] for times in run(one_way("200ms+-100ms,order=kept"), 200)]
+    assert free != sorted(free)
+    assert kept == list(np.maximum.accumulate(free))
+
+
+def test_a_full_queue_drops_and_drains():
+    model = one_way("rate=1Mbit/s,queue=25ms")
+    came = [model.arrivals(0.0, 1250) for _ in range(5)]
+    assert came[:3] == [pytest.approx((time,)) for time in (0.01, 0.02, 0.03)]
+    assert came[3:] == [(), ()]
+    assert model.arrivals(0.011, 1250) == pytest.approx((0.04,))
+
+
+def test_what_waits_for_the_line_is_lost_if_the_outage_begins_before_it_leaves():
+    model = one_way("rate=100kbit/s,queue=1s,outage=1s@0.15s")
+    assert [bool(model.arrivals(0.0, 1250)) for _ in range(3)] == [True, False, False]

@@ -68,7 +68,9 @@ def restart(hand):
     hand.drive(0, 5)
     hand.stop(4, 2)
     hand.hear_health(2.9, 0.5)
-    hand.drive(30, 36)  # The new runtime drives at once.
+    hand.drive(30, 33)  # The new runtime drives at once.
+    hand.edge_clock_s = 3600.0  # A step of the board's clock changes nothing.
+    hand.drive(33, 36)
     hand.state(3.6, 36)  # An inference that took too long is replayed as one.
     slow = {"mode": "safe_stop", "reason": "inference_too_long", "action": [-1.0]}
     hand.command(3.7005, 36, answer_s=0.1005, inference_ns=0, **slow)
@@ -225,3 +227,18 @@ def test_no_terminal_obeys_what_a_recording_holds(hand, tmp_path, capsys):
     assert "\\x1b]0;title\\x07" in said.out
     assert "\\x1b[2J" in said.err
     assert all(line.isprintable() for line in (said.out + said.err).splitlines())
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [{"received_ns": 0}, {"sent_ns": 2**63, "received_ns": 2**64 - 1}, {"inference_ns": 2**63},
+     {"sent_ns": ns(0.7 - 3600.0)}],
+    ids=repr,
+)  # fmt: skip
+def test_a_clock_that_is_set_between_two_stamps_changes_nothing(hand, stamps):
+    hand.drive(0, 7)
+    hand.state(0.7, 7)
+    hand.command(0.7 + ANSWER_S, 7, **stamps)
+    hand.drive(8, 12)
+    status, report = replay(hand)
+    assert (status, report["compared"]) == (0, 12), report["first_differences"]

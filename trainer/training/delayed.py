@@ -38,7 +38,9 @@ class DelayedVehicle:
 
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed)
-        self.link: VirtualLink[Observation] = VirtualLink(self.spec, seed, self.control_period_s)
+        self.link: VirtualLink[Observation] = VirtualLink(
+            self.spec, seed, self.control_period_s, observation.nbytes
+        )
         self._tick = 0
         return observation, info
 
