@@ -20,8 +20,8 @@ from bridge.rerun import LOOPBACK, Viewer, ViewerGone, free_port
 from edge_runtime.cli import run_cli
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_json
+from hil_tests.campaign import draw_axes
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
-from hil_tests.sweep import draw_axes
 from trainer.drivers import load_driver
 from trainer.environments import make_environment
 from trainer.person.tests.browser import (

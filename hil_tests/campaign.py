@@ -1,30 +1,77 @@
 """``python -m hil_tests campaign``: every fault, and every network of the axes, in one report.
 
 The report is JSON, and beside it Markdown for people, with a table for each part and a picture.
+Along each axis one thing about the network gets worse, each way. Every network is driven with the
+same seeds, in virtual time. The budget is the largest value of each axis up to which the policy
+holds a share of successes.
 """
 
 from __future__ import annotations
 
 import argparse
 import fnmatch
+import math
 import shlex
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from bridge.report import ProgressBar, markdown_table
+from matplotlib.figure import Figure
+
+from bridge.network import parse_spec
+from bridge.outcomes import GOAL
+from bridge.report import EpisodeResult, ProgressBar, markdown_table
+from bridge.statistics import success_estimate
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
+from hil_tests.drivers import Drivers
+from hil_tests.faults.rows import ROWS, Row
 from hil_tests.faults.run import run_faults
-from hil_tests.faults.table import ROWS, Row
-from hil_tests.sweep import NETWORK_AXES, Axis, draw_axes, render_latency, run_latency
 from trainer.training.metrics import write_figure
 from trainer.util import cores, kept
 
-SHOWN_WRONG = 5
-ENDS = ("_ms", "_limit_ms")
+Found = Mapping[str, Any]  # A part of a report's JSON
+PANELS = 3  # In a row
+
+
+class Axis(NamedTuple):
+    """What gets worse, step by step."""
+
+    name: str
+    title: str
+    unit: str
+    values: tuple[float, ...]  # Ascending
+    pattern: str  # The specification of a point, which is its name in the report
+    base: str = "none"  # The specification at value 0
+
+    @property
+    def specs(self) -> list[str]:
+        """Return the specifications of all values."""
+        return [self.pattern.format(f"{value:g}") if value else self.base for value in self.values]
+
+
+_LATE = "delay=100ms"
+"""What jitter is measured on: without delay, half of it would be cut off at zero."""
+_MS = (0, 10, 20, 40, 60, 80, 100)
+AXES = (
+    Axis("delay", "delay each way", "ms",
+         (0, 25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 300, 400, 500, 750, 1000),
+         "delay={}ms"),
+    Axis("jitter", "normal jitter (standard deviation) on 100 ms each way", "ms", _MS,
+         f"{_LATE},jitter={{}}ms", _LATE),
+    Axis("tail", "long-tailed (Pareto) jitter on 100 ms each way", "ms", _MS,
+         f"{_LATE},jitter={{}}ms,tail=pareto", _LATE),
+    Axis("loss", "independent loss each way", "%", (0, 1, 2, 5, 10, 15, 20, 25, 30, 40),
+         "loss={}%"),
+    Axis("burst", "loss in bursts of 5 messages each way", "%", (0, 1, 2, 5, 10, 15, 20, 30),
+         "loss={}%,burst=5"),
+    Axis("outage", "outage every 3 s, both ways", "s",
+         (0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0), "outage={}s/3s@1s"),
+)  # fmt: skip
 
 
 @sigterm_as_interrupt()  # whoever ends a campaign ends its processes
@@ -32,43 +79,33 @@ def run(arguments: argparse.Namespace) -> int:
     """Run both parts or one; return 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
     markdown, picture = out.with_suffix(".md"), out.with_name(f"{out.stem}_success.png")
-    if markdown == out:
-        raise UserError(f"--out {out} is for the JSON; the Markdown is written beside it")
     check_writable(out)
-    check_writable(markdown)
     axes, rows = choose(arguments.rows, arguments.only)
     policy = Path(arguments.policy or kept(f"results/policies/{arguments.scenario}.onnx"))
     result: dict[str, Any] = {"command": f"python -m hil_tests {shlex.join(sys.argv[1:])}"}
     text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{result['command']}`", ""]
-    if axes:
-        latency = run_latency(arguments, policy, axes)
-        write_figure(draw_axes(latency), picture)
-        result["latency"] = {**latency, "figures": {"success": picture.name}}
-        text += ["## Latency", "", render_latency(result["latency"])]
-        print(latency["budget"]["sentence"])
     passed = True
+    if axes:
+        result["latency"] = latency = run_latency(arguments, policy, axes)
+        write_figure(draw_axes(latency), picture)
+        text += ["## Latency", "", f"![success]({picture.name})", "", *render_latency(latency)]
+        print(latency["budget"]["sentence"])
     if rows:
-        result["faults"] = found = _run_faults(arguments, rows, policy)
-        text += ["## Faults", "", render_faults(found)]
-        passed = found["passed"]
+        with ProgressBar("faults", arguments.tries * len(rows)) as bar:
+            result["faults"] = faults = run_faults(
+                rows, arguments.tries, policy, lambda row: bar.advance({"row": row}),
+                arguments.jobs or cores(), arguments.public_key,
+            )  # fmt: skip
+        text += ["## Faults", "", *render_faults(faults)]
+        passed = faults["passed"]
+        for row in faults["rows"]:
+            for what in (*row["wrong"], *row["unsafe"], *row["crashes"]):
+                print(f"{row['name']}: {what}")
+        print("Every fault was met." if passed else "Not every fault was met.")
     write_json_out(out, result)
     write_atomic(markdown, ("\n".join(text).rstrip() + "\n").encode())
     print(f"{out} and {markdown}")
     return 0 if passed else 1
-
-
-def _run_faults(arguments: argparse.Namespace, rows: list[Row], policy: Path) -> dict[str, Any]:
-    with ProgressBar("faults", arguments.tries * len(rows)) as bar:
-        found = run_faults(
-            rows, arguments.tries, policy, lambda row: bar.advance({"row": row}),
-            arguments.jobs or cores(), arguments.public_key,
-        )  # fmt: skip
-    for row in found["rows"]:
-        for kind in ("wrong", "unsafe", "crashes"):
-            for what in row[kind][:SHOWN_WRONG]:
-                print(f"{row['name']}: {kind}: {what}")
-    print("Every fault was met." if found["passed"] else "Not every fault was met.")
-    return found
 
 
 def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
@@ -76,45 +113,122 @@ def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
 
     Raises UserError where a name fits none.
     """
-    axes = NETWORK_AXES if only != "faults" else ()
-    faults = ROWS if only != "latency" else ()
+    axes, faults = AXES if only != "faults" else (), ROWS if only != "latency" else ()
     known, chosen = [row.name for row in (*axes, *faults)], set[str]()
     for name in names.split(",") if names else ["*"]:
         if not (found := fnmatch.filter(known, name)):
-            kind = " or ".join(["latency axis"] * bool(axes) + ["fault"] * bool(faults))
-            raise UserError(f"no {kind} {name!r}; choose from {', '.join(known)}")
+            raise UserError(f"there is no {name!r}; choose from {', '.join(known)}")
         chosen.update(found)
     wanted = [axis for axis in axes if axis.name in chosen]
     return wanted, [row for row in faults if row.name in chosen]
 
 
-def render_faults(report: Mapping[str, Any]) -> str:
+def render_faults(report: Found) -> list[str]:
     """Render a row for each fault; reaction and recovery as min / median / max over its tries."""
     head = ("fault", "expected", "tries", "reaction, ms", "limit", "recovery, ms", "limit",
             "verdict")  # fmt: skip
     rows = []
     for row in report["rows"]:
-        again = f" (+{row['disturbed']} again)" if row["disturbed"] else ""
-        times = (_ms(row[f"{kind}{end}"]) for kind in ("reaction", "recovery") for end in ENDS)
-        tries = f"{row['tries']}{again}"
-        rows.append((row["done"], row["expected"], tries, *times, fault_verdict(row)))
-    end = (
-        f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
-        "over the whole campaign."
-    )
-    return "\n".join([*markdown_table(head, rows), end])
+        tries = f"{row['tries']} (+{row['disturbed']} again)" if row["disturbed"] else row["tries"]
+        times = []
+        for kind in ("reaction", "recovery"):
+            spread, limit = row[f"{kind}_ms"] or {}, row[f"{kind}_limit_ms"]
+            times.append(" / ".join(f"{value:.0f}" for value in spread.values()) or "-")
+            times.append("-" if limit is None else f"{limit:.0f}")
+        late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
+        missed = [f"{count} {name} late" for name, count in late.items() if count]
+        missed += [f"{len(row[it])} {it}" for it in ("unsafe", "crashes", "wrong") if row[it]]
+        counted = sum(row["rejected"].values())
+        met = f"met, {counted:,} rejected and counted" if counted else "met"
+        verdict = f"MISSED: {', '.join(missed)}" if missed else met
+        rows.append((row["done"], row["expected"], tries, *times, verdict))
+    crashes, unsafe = report["crashes"], report["unsafe_commands"]
+    return [*markdown_table(head, rows), f"{crashes} crashes and {unsafe} unsafe commands."]
 
 
-def fault_verdict(row: Mapping[str, Any]) -> str:
-    """Return ``met``, or what was not."""
-    late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
-    faults = [f"{count} {name} late" for name, count in late.items() if count]
-    faults += [f"{len(row[name])} {name}" for name in ("unsafe", "crashes", "wrong") if row[name]]
-    counted = sum(row["rejected"].values())
-    met = f"met, {counted:,} rejected and counted" if counted else "met"
-    return "MISSED: " + ", ".join(faults) if faults else met
+def run_latency(
+    arguments: argparse.Namespace, policy: Path, axes: Sequence[Axis]
+) -> dict[str, Any]:
+    """Drive every network of the axes; return the report's part ``latency``."""
+    specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
+    seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    asked = {name: getattr(arguments, name) for name in ("scenario", "condition", "seed", "runs")}
+    task = (str(policy), arguments.scenario, arguments.condition, arguments.public_key)
+    rows = {}
+    with Drivers(*task, arguments.jobs) as drivers, ProgressBar("networks", len(specs)) as bar:
+        for spec in specs:
+            rows[spec] = make_row(spec, drivers.drive(parse_spec(spec), seeds))
+            bar.advance({"network": spec})
+    told = ("name", "title", "unit", "values", "specs")
+    return {
+        "policy": str(policy),
+        "policy_id": drivers.policy_id,
+        **asked,
+        "axes": [{name: getattr(axis, name) for name in told} for axis in axes],
+        "rows": rows,
+        "budget": budget(axes, rows, arguments.target, policy.stem),
+    }
 
 
-def _ms(found: Mapping[str, float] | float | None) -> str:
-    values = [] if found is None else [found] if isinstance(found, float) else found.values()
-    return " / ".join(f"{value:.0f}" for value in values) or "-"
+def make_row(spec: str, results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Sum up the drives of a network; the success has Wilson's interval of 95 %."""
+    outcomes = Counter(result.outcome for result in results)
+    success = success_estimate(outcomes[GOAL], len(results))._asdict()
+    return {"spec": spec, "episodes": len(results), "success": success, "outcomes": dict(outcomes)}
+
+
+def budget(axes: Sequence[Axis], rows: Found, target: float, name: str) -> dict[str, Any]:
+    """Return each axis's limit, and a sentence of them.
+
+    A limit is the largest value up to which every tested one is at the target; None: not even 0.
+    """
+    limits, parts = {}, []
+    for axis in axes:
+        points = zip(axis.values, axis.specs, strict=True)
+        holds = takewhile(lambda point: rows[point[1]]["success"]["value"] >= target, points)
+        limit = max((value for value, _ in holds), default=None)
+        limits[axis.name] = limit
+        most = " (the most that was tested)" if limit == axis.values[-1] else ""
+        found = f"{limit:g} {axis.unit}" if limit is not None else "not even 0"
+        parts.append(f"{found}{most} of {axis.title}")
+    sentence = f"{name} holds at least {100 * target:g}% success up to {'; '.join(parts)}. "
+    return {"target_success": target, "limits": limits, "sentence": f"{sentence}One at a time."}
+
+
+def render_latency(latency: Found) -> list[str]:
+    """Render the budget's sentence and a table for each axis, as lines of Markdown."""
+    lines = [latency["budget"]["sentence"], ""]
+    for axis in latency["axes"]:
+        rows = []
+        for value, spec in zip(axis["values"], axis["specs"], strict=True):
+            row = latency["rows"][spec]
+            interval = "{value:.0%} ({low:.0%} to {high:.0%})".format(**row["success"])
+            ends = ", ".join(f"{count} {name}" for name, count in row["outcomes"].items())
+            rows.append((f"{value:g} {axis['unit']}", interval, ends))
+        head = ("value", "success (95 %)", "episodes")
+        lines += [f"### {axis['title']}", "", *markdown_table(head, rows)]
+    return lines
+
+
+def draw_axes(swept: Found) -> Figure:
+    """Draw a panel for each axis of a report's part ``latency``."""
+    axes = swept["axes"]
+    rows, columns = math.ceil(len(axes) / PANELS), min(PANELS, len(axes))
+    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
+    for panel, axis in zip(panels, axes, strict=False):
+        values = axis["values"]
+        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
+        panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5)
+        low, high = ([each[end] for each in estimates] for end in ("low", "high"))
+        panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
+        panel.axhline(swept["budget"]["target_success"], color="0.4", lw=0.8, linestyle="--")
+        panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
+        panel.grid(alpha=0.3)
+        panel.set_ylim(-0.03, 1.03)
+    for panel in panels[len(axes) :]:
+        panel.set_visible(False)
+    figure.supylabel("success")
+    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
+    figure.suptitle(f"{Path(swept['policy']).stem}: {drives}; Wilson's 95 % interval; target")
+    return figure

@@ -14,12 +14,12 @@ from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
 from bridge.inbound import NO_COMMAND, NO_FEEDBACK, CommandCheck
 from bridge.network import parse_spec
 from bridge.report import SafeStopLog
+from bridge.tests.recordings import wait_until_driving_steadily
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import encode
 from hil_tests.processes import PATIENCE_S, wait_until
-from hil_tests.testing.drives import SLOW_TOY, make_policy, read, start_simulate
-from hil_tests.testing.edge import start_edge, wait_until_driving_steadily
+from hil_tests.testing.drives import SLOW_TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.testing.messages import make_command, make_feedback, make_state
 from hil_tests.testing.policies import TASK, T
 

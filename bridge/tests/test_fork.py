@@ -12,16 +12,13 @@ import msgspec
 import pytest
 
 from bridge.recording import Recording, choose_vehicle, heard_of
-from hil_tests.testing.drives import (
-    LEFT_TURN,
-    TOY,
+from bridge.tests.recordings import (
     bridge_status,
     flip_chunk,
-    make_policy,
-    read,
     record_in_process,
     writing,
 )
+from hil_tests.testing.drives import LEFT_TURN, TOY, make_policy, read
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"
 OURS = SHIPPED / "left_turn.onnx"

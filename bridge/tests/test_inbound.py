@@ -15,12 +15,12 @@ from bridge.environments import Adapter, describe
 from bridge.inbound import NO_COMMAND, CommandHold
 from bridge.report import SafeStopLog
 from bridge.simulate import vehicle_action
+from bridge.tests.recordings import health
 from edge_runtime.manifest import Action
 from edge_runtime.wire import encode
 from hil_tests.testing.environments import ToyEnv
 from hil_tests.testing.messages import make_command, make_feedback
 from hil_tests.testing.policies import TASK, T
-from hil_tests.testing.recordings import health
 
 
 def checking(task=TASK):

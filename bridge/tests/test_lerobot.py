@@ -16,15 +16,16 @@ from pyarrow import parquet
 from bridge.messages import Scene, encode_scene
 from bridge.recording import RawImage
 from bridge.rerun import free_port
+from bridge.tests import recordings
+from bridge.tests.recordings import heard
 from edge_runtime.manifest import Action, Entry, Task
 from edge_runtime.reach import free_endpoint
 from edge_runtime.wire import encode
 from hil_tests.processes import Process
 from hil_tests.testing import drives
-from hil_tests.testing.edge import start_edge
+from hil_tests.testing.drives import start_edge
 from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import TASK
-from hil_tests.testing.recordings import heard
 
 SEEN = {
     "a": Entry(dtype="uint8", shape=[6, 8, 3]),
@@ -40,7 +41,7 @@ FILE = "chunk-000/file-000"
 
 
 def recorded(path, task):
-    with drives.writing(path) as writer:
+    with recordings.writing(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for (episode, step), mode in STEPS.items():
@@ -65,7 +66,7 @@ def export(path, out):
 
 def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
     out = tmp_path / "sets" / "a"
-    assert drives.bridge_status(export(recorded(tmp_path / "a.mcap", ROVER), out)) == 0
+    assert recordings.bridge_status(export(recorded(tmp_path / "a.mcap", ROVER), out)) == 0
     assert capsys.readouterr().out.endswith("5 frames\n")
     rows = parquet.read_table(out / f"data/{FILE}.parquet").to_pylist()
     episodes = parquet.read_table(out / f"meta/episodes/{FILE}.parquet").to_pylist()
@@ -96,7 +97,7 @@ def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
 def drive_of(path, entry, values, action=0.5):
     """A recording of answered states, each of one array as bytes."""
     task = msgspec.structs.replace(ROVER, observation={"a": entry}, action=ACTIONS[:1])
-    with drives.writing(path) as writer:
+    with recordings.writing(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for step, value in enumerate(values):
@@ -110,11 +111,11 @@ def test_large_numbers_have_finite_statistics_and_too_large_ones_are_left_out(tm
     large = np.full(2, np.finfo(np.float32).max, np.float32)
     values = [large.tobytes(), (-large).tobytes()] * 3
     path = drive_of(tmp_path / "a.mcap", SEEN["b"], values, action=1e11)
-    assert drives.bridge_status(export(path, tmp_path / "a")) == 0
+    assert recordings.bridge_status(export(path, tmp_path / "a")) == 0
     stats = json.loads((tmp_path / "a/meta/stats.json").read_text())
     assert stats["observation.state"]["std"] == pytest.approx(large.astype(float).tolist())
     path = drive_of(tmp_path / "b.mcap", SEEN["b"], values, action=1e308)
-    assert drives.bridge_status(export(path, tmp_path / "b")) == 2
+    assert recordings.bridge_status(export(path, tmp_path / "b")) == 2
 
 
 def test_memory_does_not_grow_with_the_pictures(tmp_path):
@@ -124,7 +125,7 @@ def test_memory_does_not_grow_with_the_pictures(tmp_path):
     path = drive_of(tmp_path / "a.mcap", entry, [black] * frames)
     tracemalloc.start()
     try:
-        assert drives.bridge_status(export(path, tmp_path / "a")) == 0
+        assert recordings.bridge_status(export(path, tmp_path / "a")) == 0
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -29,6 +29,7 @@ from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe
 from bridge.replay import RecordedDrive, replay
+from bridge.tests.recordings import chunks, flip, health, heard, record_drive, start_record, writing
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -41,19 +42,13 @@ from hil_tests.processes import wait_until
 from hil_tests.testing.drives import (
     LEFT_TURN,
     SLOW_TOY,
-    chunks,
-    flip,
     make_policy,
     read,
-    record_drive,
-    start_record,
+    start_edge,
     start_simulate,
-    writing,
 )
-from hil_tests.testing.edge import start_edge
 from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import SIZE, TASK
-from hil_tests.testing.recordings import health, heard
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
 MIB = 1 << 20

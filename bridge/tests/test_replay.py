@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from hil_tests.testing.drives import bridge_status, flip_chunk, make_policy
+from bridge.tests.recordings import ANSWER_S, SILENCE, Hand, bridge_status, flip_chunk, ns
+from hil_tests.testing.drives import make_policy
 from hil_tests.testing.messages import WHITE, frames, make_state
-from hil_tests.testing.recordings import ANSWER_S, SILENCE, Hand, ns
 
 FAULT = {"mode": "safe_stop", "reason": "vehicle_fault", "action": [-1.0]}
 NOT_ARMED = {"mode": "safe_stop", "reason": "not_armed", "action": [-1.0]}

@@ -34,6 +34,7 @@ from bridge.rerun import (
     shades,
 )
 from bridge.rerun.wire_view import DriveTime, WireLog
+from bridge.tests import recordings
 from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.link import FIELDS
 from edge_runtime.reach import free_endpoint
@@ -41,7 +42,7 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing import drives
-from hil_tests.testing.edge import start_edge
+from hil_tests.testing.drives import start_edge
 from hil_tests.testing.environments import ToyEnv
 from hil_tests.testing.messages import HEALTH, make_command, make_feedback, make_state
 from hil_tests.testing.policies import TASK
@@ -249,8 +250,8 @@ def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
 
 
 def verify(recording):
-    drives.rerun("rrd", "verify", str(recording))
-    return drives.rerun("rrd", "stats", str(recording))
+    recordings.rerun("rrd", "verify", str(recording))
+    return recordings.rerun("rrd", "stats", str(recording))
 
 
 @pytest.mark.parametrize("told", ["the drive ends", "the view is interrupted"])
@@ -300,7 +301,7 @@ def test_a_ride_is_shown_and_no_silence(log):
 def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_path, capsys):
     path, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
     shutil.copy(drives.LEFT_TURN, path)
-    drives.flip_chunk(path, 3)
+    recordings.flip_chunk(path, 3)
     assert main(["view", str(path), "--save", str(out)]) == 0
     found, said = verify(out), capsys.readouterr()
     entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
@@ -340,7 +341,7 @@ def test_no_number_ends_a_viewer_or_makes_a_recording_unviewable(tmp_path, capsy
     """What is absurd is left out and counted, by the recorder's copies and the view."""
     path, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
     absurd = [(t, one) for t, good in GOOD.items() for one in with_each_number_absurd(good)]
-    with drives.writing(path) as writer:
+    with recordings.writing(path) as writer:
         for at_ns, (topic, message) in enumerate([*absurd, *GOOD.items()], 10**18):
             payload = msgspec.msgpack.encode(message)
             key = f"phil/v/{topic}"

@@ -26,6 +26,8 @@ from bridge.environments import (
 from bridge.inbound import NO_COMMAND, Decision
 from bridge.messages import Origin
 from bridge.simulate import EpisodeRunner
+from bridge.tests.odd import odd
+from bridge.tests.recordings import bridge_status, record_drive, rerun, wait_until_driving_steadily
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
@@ -34,15 +36,11 @@ from hil_tests.processes import Process
 from hil_tests.testing.drives import (
     SLOW_TOY,
     TOY,
-    bridge_status,
     make_policy,
     read,
-    record_drive,
-    rerun,
+    start_edge,
     start_simulate,
 )
-from hil_tests.testing.edge import start_edge, wait_until_driving, wait_until_driving_steadily
-from hil_tests.testing.environments import odd
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import STEERING, write_policy, write_rover
 
@@ -92,7 +90,7 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
     endpoint, out = free_endpoint(), tmp_path / "half.json"
     policy = make_policy(tmp_path, "constant")
     with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, SLOW_TOY) as run:
-        wait_until_driving(edge)
+        edge.wait_for_line("now=drive")
         run.send(signal.SIGTERM)
         assert run.wait(10) == 130
         time.sleep(0.5)

@@ -20,7 +20,7 @@ from deploy.installer.layout import CURRENT, PREVIOUS, Releases
 from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
-from hil_tests.testing.edge import Simulator
+from hil_tests.testing.drives import Simulator
 from hil_tests.testing.messages import make_state
 
 RUN = "edge_runtime/run.py"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import List
 
 import pytest
-from hil_tests.testing.edge import Simulator, run_edge
+from hil_tests.testing.drives import Simulator, run_edge
 from hil_tests.testing.messages import make_state
 
 import edge_runtime

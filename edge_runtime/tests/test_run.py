@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing.commands import run_command
-from hil_tests.testing.edge import Simulator, run_edge
+from hil_tests.testing.drives import Simulator, run_edge
 from hil_tests.testing.messages import WHITE, frames, make_state
 from hil_tests.testing.policies import T
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.edge import run_edge
+from hil_tests.testing.drives import run_edge
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import PEDAL, TASK, T
 

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 from hil_tests.processes import wait_until
-from hil_tests.testing.edge import Simulator
+from hil_tests.testing.drives import Simulator
 from hil_tests.testing.messages import make_state
 
 import edge_runtime

@@ -13,22 +13,18 @@ from bridge.messages import DECODERS
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
-from edge_runtime.wire import DRIVE, Command, Feedback, Message, Rejection, encode
+from edge_runtime.wire import DRIVE, Command, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, noisy_state
-from hil_tests.faults.table import GAP, Try, drives_on, fault
+from hil_tests.faults.rows import Try, drives_on, fault
 from hil_tests.processes import wait_until
+from hil_tests.testing.messages import make_command, make_feedback
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
-BAD_STATE_ROUNDS = 50
-SECOND_S = 2.0
-OVERSIZED, OVERSIZED_BYTES = 5, 10_000_000
 COUNT, PER_S = 10_000, 2_500
 """Of garbage, and its pace: enough to hurt, little enough that the drive goes on beside it."""
 _FOREIGN = "garbage"
 """Session of the messages that mutations start from: what is valid still is rejected by it."""
 _HOUR_NS = 3600 * 1_000_000_000
-_LONGEST_RANDOM, _SPLICED = 512, 64
-
 _COUNTED = "drives on; each rejected and counted by reason"
 
 
@@ -36,39 +32,50 @@ _COUNTED = "drives on; each rejected and counted by reason"
 def bad_states(rig: Rig, number: int) -> Try:
     """Truncated, wrong schema, NaN, old, repeated, reordered, future states."""
     sent: Counter[str] = Counter()
-    for _ in range(BAD_STATE_ROUNDS):
+    for turn in range(50):
         with rig.sender.lock:
             for reason, payload in _bad_of(rig.sender.step, rig.task):
                 rig.probe.put("state", payload)
                 sent[reason] += 1
-            # Two states that have overtaken one another, and one that says it is from the future.
-            rig.sender.step += 3
-            step = rig.sender.step
-            rig.sender.send(noisy_state(step - 1, rig.task))
-            rig.probe.put("state", encode(noisy_state(step - 2, rig.task)))
+            # From now on they say that they are from the future, which is no reason to stop.
+            rig.sender.ahead_ns += _HOUR_NS * (turn == 25)
+            rig.sender.step += 2  # Two states have overtaken one another.
+            rig.sender.send(rig.sender.state(rig.sender.step))
+            rig.probe.put("state", encode(rig.sender.state(rig.sender.step - 1)))
             sent["stale"] += 1
-            rig.sender.send(noisy_state(step, rig.task, sent_ns=time.time_ns() + _HOUR_NS))
         time.sleep(rig.period_s / 2)
     return Try(rejected=sent)
+
+
+def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
+    """Yield (reason, payload) of states that must be rejected, around the newest step."""
+    state, (name, *_) = noisy_state(step + 1, task), task.observation
+    large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
+    valid = encode(state)
+    yield "malformed", valid[: len(valid) // 2]
+    yield "malformed", without(valid, "observation")
+    yield "oversized", with_fields(valid, observation=large)
+    yield "schema", with_fields(valid, schema=1)
+    yield "observation", with_fields(valid, observation=small)
+    yield "not_finite", with_fields(valid, speed_mps=float("nan"))
+    yield "duplicate", encode(noisy_state(step, task))
+    yield "stale", encode(noisy_state(step - 1, task))
 
 
 @drives_on(_COUNTED, counted="edge")
 def oversized(rig: Rig, number: int) -> Try:
     """States of 10 MB."""
-    payload, memory_mb = bytes(OVERSIZED_BYTES), rig.edge.resident_mb()
-    for _ in range(OVERSIZED):
-        rig.probe.put("state", payload)
+    for _ in range(5):
+        rig.probe.put("state", bytes(10_000_000))
         time.sleep(rig.period_s)
-    figures = {"memory grown, MB": rig.edge.resident_mb() - memory_mb}
-    return Try(rejected={"oversized": OVERSIZED}, figures=figures)
+    return Try(rejected={"oversized": 5})
 
 
-@fault("answers the newest, or stops", GAP, rig={"sender": True}, alone=True)
+@fault("answers the newest, or stops", rig={"sender": True}, alone=True)
 def flood(rig: Rig, number: int) -> Try:
     """10,000 states a second for 2 s."""
     rig.sender.running.clear()
-    memory_mb, begin_s = rig.edge.resident_mb(), time.monotonic()
-    sent = 0
+    begin_s, sent = time.monotonic(), 0
     while (now_s := time.monotonic()) < begin_s + FLOOD_S:
         while sent < (now_s - begin_s) * FLOOD_PER_S:
             rig.sender.send_next()
@@ -76,24 +83,18 @@ def flood(rig: Rig, number: int) -> Try:
         time.sleep(0.001)
     end_s = time.monotonic()
     rig.sender.running.set()
-    recovered_s = rig.recovered_after_s(end_s)
-    figures = {
-        "states/s": sent / (end_s - begin_s),
-        "memory grown, MB": rig.edge.resident_mb() - memory_mb,
-    }
-    return Try(rig.longest_gap(begin_s, end_s), recovered_s, figures=figures)
+    return Try(rig.timeline.longest_gap_s(begin_s, end_s), rig.recovered_after_s(end_s))
 
 
 @drives_on(_COUNTED, counted="edge")
 def second_simulator(rig: Rig, number: int) -> Try:
     """A second simulator with the same id."""
-    steps = round(SECOND_S / rig.period_s)
+    steps = round(2.0 / rig.period_s)
     for step in range(steps):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
         rig.timeline.states[("second", number, step)] = time.monotonic()
-        rig.probe.put(
-            "state", encode(noisy_state(step, rig.task, session="second", episode=number))
-        )
+        state = noisy_state(step, rig.task, session="second", episode=number)
+        rig.probe.put("state", encode(state))
         time.sleep(rig.period_s)
     return Try(rejected={"foreign_session": steps})
 
@@ -132,22 +133,26 @@ def garbage_commands(rig: Rig, number: int) -> Try:
     return Try(rejected=Counter(done.rejected) + Counter(others.keys()))
 
 
+def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
+    """Make a drive command to the newest state, or to one ``ahead`` of it."""
+    session, episode, step = rig.timeline.commands[-1].place
+    middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
+    fields = {"session": session, "episode": episode, "action": middle, **changes}
+    return make_command(max(0, step + ahead), sent_ns=time.time_ns(), **fields)
+
+
 @drives_on()
 def garbage_feedback(rig: Rig, number: int) -> Try:
     """10,000 random and mutated feedback messages."""
-    feedback = Feedback(
-        vehicle="mock", session=_FOREIGN, episode=0, step=0, mode="drive", action=[0.1],
-        speed_mps=1.0, self_braking=False, faults=[], sent_ns=time.time_ns(),
-    )  # fmt: skip
-    _put_garbage(rig, "feedback", feedback, number)
+    _put_garbage(rig, "feedback", make_feedback(0, session=_FOREIGN), number)
     return Try()
 
 
 @drives_on(_COUNTED, counted="simulator", flows=False)
 def garbage_health(rig: Rig, number: int) -> Try:
     """10,000 random and mutated health messages."""
-    wait_until(lambda: rig.probe.health, "a health message")
-    return _put_garbage(rig, "health", rig.probe.health[-1], number)
+    wait_until(lambda: rig.timeline.health, "a health message")
+    return _put_garbage(rig, "health", rig.timeline.health[-1], number)
 
 
 def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
@@ -168,63 +173,23 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     return Try(rejected=sent)
 
 
-def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
-    """Yield (reason, payload) of states that must be rejected, around the newest step."""
-    state, (name, *_) = noisy_state(step + 1, task), task.observation
-    large, small = ({**state.observation, name: bytes(n)} for n in (wire.MAX_PAYLOAD_BYTES, 3))
-    valid = encode(state)
-    yield "malformed", valid[: len(valid) // 2]
-    yield "malformed", without(valid, "observation")
-    yield "oversized", with_fields(valid, observation=large)
-    yield "schema", with_fields(valid, schema=1)
-    yield "observation", with_fields(valid, observation=small)
-    yield "not_finite", with_fields(valid, speed_mps=float("nan"))
-    yield "duplicate", encode(noisy_state(step, task))
-    yield "stale", encode(noisy_state(step - 1, task))
-    # From another time of day is no reason: the next one is good whatever its clock says.
-
-
-def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
-    """Make a drive command to the newest state, or to one ``ahead`` of it."""
-    session, episode, step = rig.timeline.commands[-1].place
-    middle = [0.45 * one.low + 0.55 * one.high for one in rig.task.action]
-    command = Command(
-        session=session, episode=episode, step=max(0, step + ahead), mode="drive", action=middle,
-        policy_id="0" * 64, received_ns=time.time_ns(), inference_ns=1, sent_ns=time.time_ns(),
-    )  # fmt: skip
-    return msgspec.structs.replace(command, **changes)
-
-
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
     """Yield ``count`` mutations, the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
     names = sorted(msgspec.msgpack.decode(valid))
-
-    def below(limit: int) -> int:
-        return int(generator.integers(limit))
-
     for _ in range(count):
-        match below(7):
-            case 0:
-                yield generator.bytes(below(_LONGEST_RANDOM))
-            case 1:
-                data = bytearray(valid)
-                for _ in range(1 + below(4)):
-                    data[below(len(data))] ^= 1 << below(8)
-                yield bytes(data)
-            case 2:
-                yield valid[: below(len(valid))]
-            case 3:
-                yield valid + generator.bytes(1 + below(_SPLICED))
-            case 4:  # a stretch of it replaced by a random one of another length
-                begin, end = sorted((below(len(valid)), below(len(valid))))
-                yield valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
-            case _:
-                name = names[below(len(names))]
-                if below(2):
-                    yield without(valid, name)
-                else:
-                    yield with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
+        kind, name = generator.integers(4), names[generator.integers(len(names))]
+        begin, end = sorted(generator.integers(len(valid), size=2))
+        if kind == 0:  # a stretch of it replaced by a random one of another length
+            yield valid[:begin] + generator.bytes(int(generator.integers(512))) + valid[end:]
+        elif kind == 1:  # bits flipped, or cut off
+            data = bytearray(valid[: end + 1])
+            data[begin] ^= 1 << generator.integers(8)
+            yield bytes(data)
+        elif kind == 2:
+            yield without(valid, name)
+        else:
+            yield with_fields(valid, **{name: _ABSURD[generator.integers(len(_ABSURD))]})
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:

@@ -1,4 +1,4 @@
-"""What is seen of a drive and when, on the wire and on the CAN bus.
+"""What stands between the two ends of a drive, and what is seen there: Zenoh, TCP and CAN.
 
 Times are monotonic seconds: that clock is one for all processes of a machine, so the times of the
 probe, of the edge runtime's log and of the simulated vehicle can be taken from one another.
@@ -6,11 +6,12 @@ probe, of the edge runtime's log and of the simulated vehicle can be taken from 
 
 from __future__ import annotations
 
+import contextlib
 import math
-import statistics
+import socket
+import threading
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -32,10 +33,14 @@ REACTION_LIMIT_S = 2 * TASK.control_period_s + 0.05
 """After the last good state a safe stop is out, or the other end brakes by itself."""
 RECOVERY_LIMIT_S = 1.0
 """From the end of the fault to the first drive command, with no vehicle attached."""
+SET_POINT, STATUS, SPEED = HEARD = (0x111, 0x211, 0x221)
+_LOOPBACK = "127.0.0.1"
+_CHUNK_BYTES = 4096  # Small, so that a throttled relay hands over bit by bit
+_STATE_BYTES = 20
+"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
+(then 47 bytes for each are on the link)."""
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
-HEARD = (0x111, 0x211, 0x221)  # Set-points, the chassis's state, its speed
-_POLL_S = 0.1
 
 
 class CommandSeen(NamedTuple):
@@ -49,54 +54,59 @@ class CommandSeen(NamedTuple):
     reason: str
 
 
-class ModeSeen(NamedTuple):
-    """A change of mode in the edge runtime's log."""
-
-    seen_s: float
-    mode: str
-    reason: str
-
-
 @dataclass
 class DriveTimeline:
-    """Events in order of arrival. Threads only append; a reader sees whole entries."""
+    """Events in order of arrival. Threads only append."""
 
-    states: dict[Place, float] = field(default_factory=dict)
-    """When the probe saw each acceptable state."""
+    states: dict[Place, float] = field(default_factory=dict)  # Each that a policy may answer
     flow_s: list[float] = field(default_factory=list)
     """When the states of the drive itself came: gaps in it are the machine's, or the fault's."""
     commands: list[CommandSeen] = field(default_factory=list)
-    modes: list[ModeSeen] = field(default_factory=list)
     feedback: list[tuple[float, wire.Feedback]] = field(default_factory=list)
-    unreadable: int = 0
-    """Commands that no receiver would take: outside their limits, or no commands at all."""
+    health: list[wire.Health] = field(default_factory=list)
+    unreadable: int = 0  # Commands that no receiver would take
 
+    def note_state(self, state: wire.State, seen_s: float) -> None:
+        """Note a state that a policy may answer."""
+        self.states.setdefault((state.session, state.episode, state.step), seen_s)
+        self.flow_s.append(seen_s)
 
-def unsafe_commands(
-    commands: Iterable[CommandSeen], states: Mapping[Place, float], task: Task = TASK
-) -> list[str]:
-    """Return what is wrong with each unsafe command.
+    def longest_gap_s(self, begin_s: float, end_s: float) -> float:
+        """Return the longest time without a command, s."""
+        return longest_gap_s([c.seen_s for c in self.commands], begin_s, end_s)
 
-    A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or that
-    was to be rejected, and later than the reaction limit after the state that it answers.
-    """
-    found, limit_s = [], REACTION_LIMIT_S + later_s(task)
-    for command in commands:
-        if command.mode != DRIVE:
-            continue
-        state_s = states.get(command.place)
-        ranges = zip(command.action, task.action, strict=False)
-        inside = all(one.low <= value <= one.high for value, one in ranges)
-        if len(command.action) != len(task.action) or not inside:
-            found.append(f"{command.place}: action {command.action}")
-        elif state_s is None:
-            found.append(f"{command.place}: answers no acceptable state")
-        else:
+    def stops_between(self, begin_s: float, end_s: float) -> list[str]:
+        """Return a line for each reason of the safe stops in between, where it was to drive on."""
+        seen = (c for c in self.commands if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP)
+        return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
+
+    def drives_between(self, begin_s: float, end_s: float = math.inf) -> list[str]:
+        """Return a line where it drove in between, before it was re-armed."""
+        drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in self.commands)
+        return ["was told to drive before it was re-armed"] if drove else []
+
+    def unsafe_commands(self, task: Task = TASK) -> list[str]:
+        """Return what is wrong with each unsafe command.
+
+        A ``drive`` is unsafe outside the task's ranges, in answer to a state that nobody sent or
+        that was to be rejected, and later than the reaction limit after the state that it answers.
+        """
+        limit_s = REACTION_LIMIT_S + later_s(task)
+        found = [f"{self.unreadable} commands that nobody would take"] * bool(self.unreadable)
+        for command in self.commands:
+            if command.mode != DRIVE:
+                continue
+            state_s = self.states.get(command.place)
+            ranges = zip(command.action, task.action, strict=False)
+            inside = all(one.low <= value <= one.high for value, one in ranges)
+            if len(command.action) != len(task.action) or not inside:
+                found.append(f"{command.place}: action {command.action}")
+            elif state_s is None:
+                found.append(f"{command.place}: answers no acceptable state")
             # The edge's clock may have been stepped ahead: nothing is sent after it is seen.
-            age_s = min(command.sent_s, command.seen_s) - state_s
-            if age_s > limit_s:
+            elif (age_s := min(command.sent_s, command.seen_s) - state_s) > limit_s:
                 found.append(f"{command.place}: its state was {age_s:.3f} s old")
-    return found
+        return found
 
 
 def later_s(task: Task) -> float:
@@ -108,29 +118,6 @@ def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> flo
     """Return the longest stretch within [begin, end] without an event, s."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
     return max(after - before for before, after in pairwise(inside))
-
-
-def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float) -> list[str]:
-    """Return a line for each reason of the safe stops in between, where it was to drive on."""
-    seen = [c for c in list(commands) if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
-    return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
-
-
-def drives_between(
-    commands: Iterable[CommandSeen], begin_s: float, end_s: float = math.inf
-) -> list[str]:
-    """Return a line where it drove in between, before it was re-armed."""
-    drove = any(begin_s < c.seen_s < end_s and c.mode == DRIVE for c in list(commands))
-    return ["was told to drive before it was re-armed"] if drove else []
-
-
-def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:
-    """Return minimum, median and maximum in ms; None of nothing."""
-    values_ms = sorted(value_s * 1e3 for value_s in values_s)
-    if not values_ms:
-        return None
-    found = {"min": values_ms[0], "median": statistics.median(values_ms), "max": values_ms[-1]}
-    return {name: round(value_ms, 1) for name, value_ms in found.items()}
 
 
 class Probe:
@@ -146,10 +133,9 @@ class Probe:
         connect: str | None,
         vehicle_id: str,
         timeline: DriveTimeline,
-        stack: ExitStack,
+        stack: contextlib.ExitStack,
     ) -> None:
-        self.timeline = timeline
-        self.health: list[wire.Health] = []
+        self._timeline = timeline
         session = stack.enter_context(open_session(listen=listen, connect=connect, mode="router"))
         self._publishers: dict[str, zenoh.Publisher] = {}
         for topic in ("state", "command", "health", "feedback"):
@@ -166,27 +152,103 @@ class Probe:
     def put(self, topic: str, payload: bytes) -> None:
         self._publishers[topic].put(payload)
 
-    def note_state(self, state: wire.State, seen_s: float) -> None:
-        """Note a state that a policy may answer."""
-        self.timeline.states.setdefault((state.session, state.episode, state.step), seen_s)
-        self.timeline.flow_s.append(seen_s)
-
     def _hear(self, topic: str, sample: zenoh.Sample) -> None:
         seen_s, offset_ns = time.monotonic(), time.time_ns() - time.monotonic_ns()
+        timeline = self._timeline
         match DECODERS[topic](bytes(sample.payload)):
             case wire.State() as state:
-                self.note_state(state, seen_s)
+                timeline.note_state(state, seen_s)
             case wire.Command() as told:
                 place = (told.session, told.episode, told.step)
                 sent_s = (told.sent_ns - offset_ns) * 1e-9
                 seen = CommandSeen(seen_s, sent_s, place, told.mode, told.action, told.reason)
-                self.timeline.commands.append(seen)
+                timeline.commands.append(seen)
             case wire.Feedback() as feedback:
-                self.timeline.feedback.append((seen_s, feedback))
+                timeline.feedback.append((seen_s, feedback))
             case wire.Health() as health:
-                self.health.append(health)
+                timeline.health.append(health)
             case _:
-                self.timeline.unreadable += topic == "command"
+                timeline.unreadable += topic == "command"
+
+
+class Relay:
+    """Passes TCP on from ``endpoint`` to ``target``, an endpoint of this machine."""
+
+    def __init__(self, target: str) -> None:
+        self.last_state_s = -math.inf  # When the last bytes of a state went to whoever connected
+        self._target = (_LOOPBACK, int(target.rpartition(":")[2]))
+        self._flowing = threading.Event()
+        self._flowing.set()
+        self._is_cut = False
+        self._bytes_per_s = math.inf
+        self._lock = threading.Lock()
+        self._open: list[socket.socket] = []
+        self._listener = socket.create_server((_LOOPBACK, 0))
+        self.endpoint = f"tcp/{_LOOPBACK}:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Break every connection and refuse new ones; what was under way is lost."""
+        with self._lock:
+            self._is_cut = True
+            while self._open:
+                _shut(self._open.pop())
+
+    def stall(self) -> None:
+        """Keep the connections and hold what comes, as a radio link that repeats does."""
+        self._flowing.clear()
+
+    def throttle(self, bytes_per_s: float) -> None:
+        """Hand no more to whoever connected; what is not handed over yet waits."""
+        self._bytes_per_s = bytes_per_s
+
+    def restore(self) -> None:
+        """Pass all on again; what was held comes at once."""
+        self._is_cut, self._bytes_per_s = False, math.inf
+        self._flowing.set()
+
+    def close(self) -> None:
+        self._flowing.set()
+        self.cut()
+        _shut(self._listener)
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                self._join(self._listener.accept()[0])
+
+    def _join(self, near: socket.socket) -> None:
+        with self._lock:
+            try:
+                if self._is_cut:
+                    raise ConnectionError
+                far = socket.create_connection(self._target, timeout=1.0)
+            except OSError:
+                near.close()
+                return
+            far.settimeout(None)
+            self._open += [near, far]
+        for pair in ((near, far, False), (far, near, True)):
+            threading.Thread(target=self._pump, args=pair, daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
+        with contextlib.suppress(OSError):
+            sink.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            while data := source.recv(_CHUNK_BYTES):
+                self._flowing.wait()
+                if to_caller:
+                    time.sleep(len(data) / self._bytes_per_s)
+                sink.sendall(data)
+                if to_caller and len(data) > _STATE_BYTES:
+                    self.last_state_s = time.monotonic()
+        _shut(source)
+        _shut(sink)
+
+
+def _shut(end: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        end.shutdown(socket.SHUT_RDWR)
+    end.close()
 
 
 class BusFrame(NamedTuple):
@@ -204,11 +266,11 @@ class CanMonitor(can.Listener):
         self.heard: list[BusFrame] = []
         self.strange: list[BusFrame] = []  # Not the Hunter's: nobody should send any
         self._bus = open_bus(parse_bus(bus))
-        self._notifier = can.Notifier(self._bus, [self], timeout=_POLL_S)
+        self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 
-    def of(self, can_id: int, since_s: float = float("-inf")) -> list[BusFrame]:
+    def of(self, can_id: int, since_s: float = -math.inf) -> list[BusFrame]:
         """Return the frames of an identifier since a moment, in order."""
-        return [one for one in list(self.heard) if one.can_id == can_id and one.seen_s > since_s]
+        return [one for one in self.heard if one.can_id == can_id and one.seen_s > since_s]
 
     def close(self) -> None:
         self._notifier.stop()
@@ -224,4 +286,4 @@ class CanMonitor(can.Listener):
             self.strange.append(heard)
 
     def on_error(self, exc: Exception) -> None:
-        """What a socket cannot unpack is no frame."""
+        """Ignore what a socket cannot unpack: it is no frame."""

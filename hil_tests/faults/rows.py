@@ -1,8 +1,8 @@
-"""Faults of both ends, and of the link between them.
+"""The table of faults, and its rows of both ends and of the link between them.
 
-A new row is a function that takes a driving rig and the number of its try, does the fault once,
-undoes it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it
-puts it into ROWS. Faults of messages and of a Hunter have files of their own; `run.py` names them.
+A row is a function that takes a driving rig and the number of its try, does the fault once, undoes
+it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it puts it
+into ROWS. Faults of messages and of a Hunter have files of their own; `run.py` names them.
 
 The last rows are of a drive with ride-through of RIDE_S. While no state or no command comes, the
 last command's plan is played: through what is shorter, nothing brakes. What is longer brakes,
@@ -18,39 +18,107 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from bridge.recording import Recording, heard_of
-from edge_runtime.wire import SAFE_STOP, State, decode_state
+from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
-from hil_tests.faults.observe import REACTION_LIMIT_S, drives_between, stops_between
+from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, Relay
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig
-from hil_tests.faults.table import GAP, Try, drives_on, fault
-from hil_tests.processes import Process, wait_until
+from hil_tests.processes import wait_until
 from hil_tests.testing.policies import T
+
+
+@dataclass(frozen=True)
+class Try:
+    """One fault, done and undone.
+
+    ``reaction_s``: from the last good state or feedback to the safe stop on the wire (in the log
+    where the wire is cut), or from the last drive command to the simulator's own brake; where the
+    drive goes on the longest gap between commands; None where nothing was to react.
+    ``recovery_s``: from the fault's end to the first drive command; None where none is due.
+    """
+
+    reaction_s: float | None = None
+    recovery_s: float | None = None
+    reason: str = ""
+    wrong: list[str] = field(default_factory=list)  # What was not as expected, beside the times
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+
+DoFault = Callable[[Rig, int], Try]
+"""Called with a rig that drives and the number of the try, which is its seed, too."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table of faults."""
+
+    name: str
+    done: str
+    expected: str
+    run: DoFault
+    reaction_limit_s: float | None = REACTION_LIMIT_S
+    recovery_limit_s: float | None = RECOVERY_LIMIT_S
+    rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
+    policy: str = "given"  # ``given``, or one of `run.POLICIES`.
+    flows: bool = False
+    """Whether the simulator's states go on through the fault: where they do not, the machine stood
+    still, and the try is done again (and counted as disturbed)."""
+    alone: bool = False  # Whether it needs the machine for itself
+    goes_on: bool = False  # Whether the drive goes on through the fault
+    counted: Literal["", "edge", "simulator"] = ""
+    """Who must have counted just the messages that a try sent to be rejected. The simulator tells
+    when the drive has ended: each try then has a rig of its own."""
+
+
+ROWS: list[Row] = []
+
+
+def fault(
+    expected: str, name: str = "", done: str = "", **options: Any
+) -> Callable[[DoFault], DoFault]:
+    """Put a function into the table, under its name and docstring or ``name`` and ``done``.
+
+    ``options`` are those of `Row`.
+    """
+
+    def add(run: DoFault) -> DoFault:
+        said = done or " ".join((run.__doc__ or "").split()).rstrip(".")
+        ROWS.append(Row(name or run.__name__, said, expected, run, **options))
+        return run
+
+    return add
+
+
+def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
+    """Put a fault into the table through which the drive goes on.
+
+    The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
+    rejected.
+    """
+    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True}
+    return fault(expected, **{**through, **options})
+
 
 LASTS_S = 1.0
 STALLED_S = 0.6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once. A
 T of more than 0.24 s needs a longer one."""
-SLOWED_S = 0.5
-STARVED_S = 2.0
 SETTLED_S = 0.5
 """So long the drive is steady first: a vehicle may lag behind what it was asked before."""
-FULL_AT_BYTES = 200_000
-"""Several of the recorder's chunks: noise compresses badly, and its copies for viewers are text."""
-RECORDED_S = 2.5
-MOST_LOST_S = 1.0
+_FULL_AT_BYTES = 200_000  # Several of the recorder's chunks
 _CANNOT_WRITE = 1  # Exit status of a recorder that cannot write
 _FEWEST_STATES = 5
 _EXPECT_OWN = "simulator brakes by itself: no_command"
 _EXPECT_BOTH = "both ends stop, each by itself"
-_TO_BRAKE = "last drive command to the simulator's brake"
-_THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
+_EXPECT_STOP = "edge sends safe_stop: no_fresh_state"
 
 
 def at_any_phase(number: int) -> None:
@@ -62,7 +130,7 @@ def sleep_until(time_s: float) -> None:
     time.sleep(max(0.0, time_s - time.monotonic()))
 
 
-@fault(_EXPECT_OWN, _TO_BRAKE)
+@fault(_EXPECT_OWN)
 def edge_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the edge runtime; a new one."""
     begin_s = time.monotonic()
@@ -73,7 +141,7 @@ def edge_killed(rig: Rig, number: int) -> Try:
     return Try(reaction_s, rig.recovered_after_s(ended_s), "no_command")
 
 
-@fault(_EXPECT_OWN, _TO_BRAKE, flows=True)
+@fault(_EXPECT_OWN, flows=True)
 def edge_stopped(rig: Rig, number: int) -> Try:
     """Edge runtime stopped for 1 s and continued."""
     begin_s = time.monotonic()
@@ -83,121 +151,110 @@ def edge_stopped(rig: Rig, number: int) -> Try:
     ended_s = time.monotonic()
     rig.edge.send(signal.SIGCONT)
     recovered_s = rig.recovered_after_s(ended_s)
-    # What piled up meanwhile is not driven on.
-    return Try(reaction_s, recovered_s, "no_command", wrong=rig.must_stop_first(ended_s))
+    return Try(reaction_s, recovered_s, "no_command", wrong=_stopped_first(rig, ended_s))
 
 
-@fault("edge sends safe_stop: no_fresh_state", "last state at the probe to safe_stop on the wire")
+def _stopped_first(rig: Rig, since_s: float) -> list[str]:
+    """Return a line where what piled up meanwhile was driven on."""
+    modes = (c.mode for c in rig.timeline.commands if c.sent_s > since_s)
+    return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
+
+
+@fault(_EXPECT_STOP)
 def simulator_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the simulator; a new one."""
-    begin_s = time.monotonic()
+    begin_s, states = time.monotonic(), rig.timeline.states
     rig.simulator.kill()
     stop = rig.stop_command(begin_s)
-    last_s = rig.last_state_s(before_s=stop.seen_s)
-    known = set(rig.timeline.states)
+    last_s, known = rig.last_state_s(before_s=stop.seen_s), len(states)
     rig.simulator = rig.start_simulator()
-    new = wait_until(lambda: set(rig.timeline.states) - known, "the new simulator's states")
-    ended_s = min(rig.timeline.states[place] for place in new)
+    ended_s = wait_until(lambda: [*states.values()][known:], "the new simulator's states")[0]
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
-def link_cut(rig: Rig, number: int) -> Try:
-    """TCP cut for 1 s and restored."""
-    begin_s, drive_s = time.monotonic(), rig.last_drive_s()
-    rig.relay.cut()
-    last_s = rig.relay.last_state_s
-    stop = rig.logged_stop(begin_s)
-    brake_s = rig.own_brake_s(begin_s) - max(drive_s, rig.last_drive_s())
-    sleep_until(begin_s + LASTS_S)
-    ended_s = time.monotonic()
-    rig.relay.restore()
-    recovered_s = rig.recovered_after_s(ended_s)
-    figures = {"simulator brakes, ms": brake_s * 1e3}
-    return Try(stop.seen_s - last_s, recovered_s, stop.reason, figures=figures)
-
-
-@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "relay"})
-def link_stalled(rig: Rig, number: int) -> Try:
-    """TCP held for 0.6 s, then all at once."""
+def _link_fails(fail: Callable[[Relay], None], lasts_s: float, rig: Rig, number: int) -> Try:
+    """Judge that both ends stop, and that nothing that was held up is driven on."""
     begin_s = time.monotonic()
-    rig.relay.stall()
-    stop = rig.logged_stop(begin_s)
+    fail(rig.relay)
+    stop_s, reason = rig.logged_stop(begin_s)
     last_s = rig.relay.last_state_s
-    sleep_until(begin_s + max(STALLED_S, 2.5 * rig.period_s))  # longer than silence
+    rig.own_brake_s(begin_s)
+    sleep_until(begin_s + max(lasts_s, 2.5 * rig.period_s))  # longer than silence
     ended_s = time.monotonic()
     rig.relay.restore()
-    recovered_s = rig.recovered_after_s(ended_s)
-    return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=rig.must_stop_first(ended_s))
+    recovered_s, wrong = rig.recovered_after_s(ended_s), _stopped_first(rig, ended_s)
+    return Try(stop_s - last_s, recovered_s, reason, wrong)
 
 
-@fault(
-    _EXPECT_BOTH, "last state at the router to safe_stop in the edge's log",
-    rig={"between": "router"},
-)  # fmt: skip
+for _name, _done, _fail, _for_s in (
+    ("link_cut", "TCP cut for 1 s and restored", Relay.cut, LASTS_S),
+    ("link_stalled", "TCP held for 0.6 s, then all at once", Relay.stall, STALLED_S),
+):
+    relayed = fault(_EXPECT_BOTH, _name, _done, rig={"between": "relay"})
+    relayed(partial(_link_fails, _fail, _for_s))
+
+
+@fault(_EXPECT_BOTH, rig={"between": "router"})
 def router_restarted(rig: Rig, number: int) -> Try:
     """SIGKILL to the router; a new one."""
     begin_s = time.monotonic()
     rig.router.kill()
-    stop = rig.logged_stop(begin_s)
+    stop_s, reason = rig.logged_stop(begin_s)
     rig.router = rig.start_router()
     ended_s = rig.router.wait_for_line("ready")
-    reaction_s = stop.seen_s - rig.last_state_s(before_s=begin_s)
-    return Try(reaction_s, rig.recovered_after_s(ended_s), stop.reason)
+    reaction_s = stop_s - rig.last_state_s(before_s=begin_s)
+    return Try(reaction_s, rig.recovered_after_s(ended_s), reason)
+
+
+_STEPS = (signal.SIGUSR1, signal.SIGUSR2)  # An hour ahead, and back
 
 
 @drives_on()
 def clock_stepped_edge(rig: Rig, number: int) -> Try:
     """Edge's wall clock 1 h ahead and back."""
-    _step(rig.edge, number)
+    rig.edge.send(_STEPS[number % 2])
     time.sleep(LASTS_S)
     return Try()
 
 
-@fault("edge sends safe_stop: no_fresh_state", "the step to safe_stop on the wire")
+@fault(_EXPECT_STOP)
 def clock_stepped_simulator(rig: Rig, number: int) -> Try:
     """Simulator's wall clock 1 h ahead or back: no stamp is believed before the stop."""
     begin_s = time.monotonic()
-    _step(rig.simulator, number)
+    rig.simulator.send(_STEPS[number % 2])
     stop = rig.stop_command(begin_s)
     return Try(stop.seen_s - begin_s, rig.recovered_after_s(stop.seen_s), stop.reason)
 
 
-def _step(process: Process, number: int) -> None:
-    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
-
-
-@fault(
-    "edge sends safe_stop: inference_too_long",
-    "last answered state at the probe to safe_stop on the wire",
-    flows=True, alone=True,
-)  # fmt: skip
+@fault("edge sends safe_stop: inference_too_long", flows=True, alone=True)
 def slow_inference(rig: Rig, number: int) -> Try:
     """Inference of about 2.5 T for 0.5 s."""
-    begin_s = time.monotonic()
+    begin_s, states = time.monotonic(), rig.timeline.states
     rig.switch(SLOW, "")
     stop = rig.stop_command(begin_s)
-    last_s = rig.last_answered_s(stop.seen_s)
-    sleep_until(begin_s + SLOWED_S)
+    before = [c for c in rig.timeline.commands if c.seen_s < stop.seen_s]
+    last_s = max(states.get(c.place, 0.0) for c in before if c.mode == DRIVE)
+    sleep_until(begin_s + 0.5)
     rig.switch(SLOW, None)
-    ended_s = time.monotonic()
-    return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
+    return Try(stop.seen_s - last_s, rig.recovered_after_s(time.monotonic()), stop.reason)
 
 
-@fault("drives on or safe_stop", GAP, alone=True)
+@fault("drives on or safe_stop", alone=True)
 def cpu_starved(rig: Rig, number: int) -> Try:
     """Two spinning processes for each core, 2 s."""
     begin_s = time.monotonic()
     words = [sys.executable, "-c", "while True: pass"]
     spinners = [subprocess.Popen(words) for _ in range(2 * (os.cpu_count() or 1))]
-    time.sleep(STARVED_S)
+    time.sleep(2.0)
     ended_s = time.monotonic()
     for spinner in spinners:
         spinner.kill()
         spinner.wait()
     recovered_s = rig.recovered_after_s(ended_s)
-    stops = sum(begin_s < m.seen_s < ended_s and m.mode == SAFE_STOP for m in rig.timeline.modes)
-    return Try(rig.longest_gap(begin_s, ended_s), recovered_s, figures={"safe stops": stops})
+    return Try(rig.timeline.longest_gap_s(begin_s, ended_s), recovered_s)
+
+
+_MOCKED: Any = {"rig": {"vehicle": MOCK}, "policy": "steady"}
 
 
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
@@ -214,9 +271,9 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(VEHICLE, None)
     time.sleep(LASTS_S)
-    wrong = drives_between(rig.timeline.commands, stop.seen_s)
+    wrong = rig.timeline.drives_between(stop.seen_s)
     wrong += [] if said else [f"the log does not say vehicle_{word}"]
-    return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong=wrong)
+    return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong)
 
 
 for _word, _done, _after_s in (
@@ -226,18 +283,17 @@ for _word, _done, _after_s in (
     ("self_braking", "vehicle says that it brakes by itself while it is to drive", 0.1),
 ):
     fault(
-        "edge sends safe_stop: vehicle_fault; stays until re-armed",
-        "last good feedback at the probe to safe_stop on the wire",
-        name=f"vehicle_{_word}", done=_done, rig={"vehicle": MOCK}, policy="steady", flows=True,
-        reaction_limit_s=REACTION_LIMIT_S + _after_s,
+        "edge sends safe_stop: vehicle_fault; stays until re-armed", f"vehicle_{_word}", _done,
+        **_MOCKED, flows=True, reaction_limit_s=REACTION_LIMIT_S + _after_s,
     )(partial(_vehicle_is, _word))  # fmt: skip
 
 
-@fault("nothing; then waits for a re-arm", "none", reaction_limit_s=None, policy="steady",
+@fault("nothing; then waits for a re-arm", reaction_limit_s=None, policy="steady",
        rig={"vehicle": MOCK, "sender": True})  # fmt: skip
 def vehicle_fault_between_episodes(rig: Rig, number: int) -> Try:
     """Emergency stop pressed for 1 s after the end of an episode."""
-    rig.sender.end_episode()
+    rig.sender.running.clear()
+    rig.sender.send_next(final=True)
     time.sleep(SETTLED_S)
     rig.switch(VEHICLE, "estop")
     time.sleep(LASTS_S)
@@ -246,12 +302,11 @@ def vehicle_fault_between_episodes(rig: Rig, number: int) -> Try:
     since_s = time.monotonic()
     rig.sender.running.set()
     time.sleep(LASTS_S)
-    wrong = drives_between(rig.timeline.commands, since_s)
-    return Try(None, rig.drive_again(), "vehicle_fault", wrong=wrong)
+    wrong = rig.timeline.drives_between(since_s)
+    return Try(None, rig.drive_again(), "vehicle_fault", wrong)
 
 
-@fault("stands; stays until an enable succeeds", "none", reaction_limit_s=None, policy="steady",
-       rig={"vehicle": MOCK})  # fmt: skip
+@fault("stands; stays until an enable succeeds", reaction_limit_s=None, **_MOCKED)
 def vehicle_not_enabled(rig: Rig, number: int) -> Try:
     """Vehicle at fault; the driver's `enable` raises at the re-arm."""
     rig.switch(VEHICLE, "lying")
@@ -261,11 +316,11 @@ def vehicle_not_enabled(rig: Rig, number: int) -> Try:
     rig.rearm()
     rearmed_s = time.monotonic()
     time.sleep(LASTS_S)
-    moved = [f.speed_mps for seen_s, f in rig.timeline.feedback if seen_s > rearmed_s]
-    wrong = [f"it moves at {max(moved)} m/s"] if max(moved) > 0.0 else []
+    most_mps = max(f.speed_mps for seen_s, f in rig.timeline.feedback if seen_s > rearmed_s)
+    wrong = [f"it moves at {most_mps} m/s"] if most_mps > 0.0 else []
     wrong += [] if rig.timeline.commands[-1].mode == SAFE_STOP else ["it is told to drive"]
     rig.switch(VEHICLE, None)
-    return Try(None, rig.drive_again(), "vehicle_fault", wrong=wrong)
+    return Try(None, rig.drive_again(), "vehicle_fault", wrong)
 
 
 @drives_on("recorder says so and ends; the recording is readable; drives on")
@@ -273,30 +328,26 @@ def disk_full(rig: Rig, number: int) -> Try:
     """Disk full while recording."""
     recorder, path = rig.start_recorder()
     # No file may grow beyond a limit: the same failing write as on a full disk.
-    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
-    status = recorder.wait()
-    wrong = _too_few(states_in(path))
-    if status != _CANNOT_WRITE:
-        wrong.append(f"status {status}: {recorder.lines[-1:]}")
-    if not any("error: recording" in line for _, line in recorder.lines):
-        wrong.append(f"it does not say so: {recorder.lines[-1:]}")
-    return Try(wrong=wrong)
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (_FULL_AT_BYTES, _FULL_AT_BYTES))
+    status, said = recorder.wait(), recorder.errors
+    told = status == _CANNOT_WRITE and "error: recording" in said
+    wrong = [] if told else [f"it ended with status {status} and said {said[-200:]!r}"]
+    return Try(wrong=wrong + _too_few(states_in(path)))
 
 
 @drives_on("at most 1 s of the recording is lost; drives on")
 def recorder_killed(rig: Rig, number: int) -> Try:
     """SIGKILL to the recorder."""
     recorder, path = rig.start_recorder()
-    time.sleep(RECORDED_S)
+    time.sleep(2.5)
     sent = len(rig.timeline.states)
     recorder.kill()
     states, places = states_in(path), list(rig.timeline.states)
     last = (states[-1].session, states[-1].episode, states[-1].step) if states else None
     lost = sent - 1 - places.index(last) if last in places else sent
     lost_s = max(0, lost) * rig.period_s
-    wrong = _too_few(states)
-    wrong += [f"{lost_s:.1f} s lost"] if lost_s > MOST_LOST_S + rig.period_s / 2 else []
-    return Try(wrong=wrong, figures={"lost, s": lost_s})
+    wrong = [f"{lost_s:.1f} s lost"] if lost_s > 1.0 + rig.period_s / 2 else []
+    return Try(wrong=wrong + _too_few(states))
 
 
 def states_in(path: Path) -> list[State]:
@@ -319,110 +370,94 @@ _VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
 def _link_slows(periods: float, rig: Rig, number: int) -> Try:
     """Judge that it stops though states go on coming, and that no late one is driven on."""
     time.sleep(SETTLED_S)
-    begin_s, task = time.monotonic(), rig.task
-    entries = task.observation.values()
+    begin_s, entries = time.monotonic(), rig.task.observation.values()
     state_bytes = sum(math.prod(e.shape) * np.dtype(e.dtype).itemsize for e in entries)
     rig.relay.throttle(state_bytes / (periods * rig.period_s))
-    stop = rig.logged_stop(begin_s)
+    stop_s, reason = rig.logged_stop(begin_s)
     time.sleep(LASTS_S)
-    late = drives_between(rig.timeline.commands, stop.seen_s)
+    late = rig.timeline.drives_between(stop_s)
     rig.relay.restore()
     ended_s = time.monotonic()
     recovered_s = rig.drive_again() if rig.has_vehicle else rig.recovered_after_s(ended_s)
-    return Try(None, recovered_s, stop.reason, wrong=late)
+    return Try(None, recovered_s, reason, late)
 
 
 for _name, _periods, _rig in (
     ("link_slow", 1.4, {}), ("ride_link_slow", 1.4, _VEHICLE), ("ride_link_slower", 4.0, _VEHICLE),
 ):  # fmt: skip
-    fault("edge sends safe_stop: no_fresh_state", "none", _name,
+    fault(_EXPECT_STOP, _name,
           f"TCP slower than the states: one comes each {_periods:g} T, ever later",
           reaction_limit_s=None, policy="steady",
           rig={**_rig, "between": "relay"})(partial(_link_slows, _periods))  # fmt: skip
 
 
-@fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
+@fault("rides: nobody brakes", reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
 def ride_states_lost(rig: Rig, number: int) -> Try:
     """No states for 0.4 s."""
-    time.sleep(SETTLED_S)
-    begin_s = time.monotonic()
-    rig.simulator.send(signal.SIGSTOP)
-    sleep_until(begin_s + SHORT_S)
-    rig.simulator.send(signal.SIGCONT)
-    return _rode(rig, begin_s)
+    pause = partial(rig.simulator.send, signal.SIGSTOP)
+    return _rides(rig, pause, partial(rig.simulator.send, signal.SIGCONT))
 
 
-@fault("rides: nobody brakes", GAP, reaction_limit_s=_LATER_S, policy="steady",
+@fault("rides: nobody brakes", reaction_limit_s=_LATER_S, policy="steady",
        rig={**_VEHICLE, "between": "relay"})  # fmt: skip
 def ride_link_stalled(rig: Rig, number: int) -> Try:
     """TCP held for 0.4 s, both ways, then all at once."""
+    return _rides(rig, rig.relay.stall, rig.relay.restore)
+
+
+def _rides(rig: Rig, fail: Callable[[], None], restore: Callable[[], None]) -> Try:
+    """Judge that nobody brakes through a short outage, and that it drives on."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
-    rig.relay.stall()
+    fail()
     sleep_until(begin_s + SHORT_S)
-    rig.relay.restore()
-    return _rode(rig, begin_s)
-
-
-def _rode(rig: Rig, begin_s: float) -> Try:
-    """Judge that nobody braked since a moment and that it drives on."""
+    restore()
     recovered_s = rig.recovered_after_s(time.monotonic())
-    end_s = time.monotonic() + SETTLED_S
-    sleep_until(end_s)
+    time.sleep(SETTLED_S)
+    end_s = time.monotonic()
     braked_s = [at_s for at_s, on in rig.brakes() if on]
     braked_s += [at_s for at_s, feedback in rig.timeline.feedback if feedback.self_braking]
-    wrong = stops_between(rig.timeline.commands, begin_s, end_s)
+    wrong = rig.timeline.stops_between(begin_s, end_s)
     wrong += ["braked by itself"] * any(begin_s < at_s < end_s for at_s in braked_s)
-    return Try(rig.longest_gap(begin_s, end_s), recovered_s, wrong=wrong)
+    return Try(rig.timeline.longest_gap_s(begin_s, end_s), recovered_s, wrong=wrong)
 
 
-def _nothing(rig: Rig) -> float:
-    return rig.last_state_s(before_s=time.monotonic())
-
-
-def _vehicle_lies(rig: Rig) -> float:
-    rig.switch(VEHICLE, "lying")
-    return time.monotonic()
-
-
-def _is_ended(rig: Rig) -> float:
-    rig.edge.send(signal.SIGTERM)
-    return time.monotonic()
-
-
-def _stops(reason: str, do: Callable[[Rig], float], rig: Rig, number: int) -> Try:
+def _stops(reason: str, do: Callable[[Rig], Any] | None, rig: Rig, number: int) -> Try:
     """Judge that it stops for what is done while it rides, and stays stopped."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
     rig.simulator.send(signal.SIGSTOP)
     sleep_until(begin_s + RIDING_S)
-    since_s = do(rig)
+    now_s = time.monotonic()
+    since_s = now_s if do else rig.last_state_s(before_s=now_s)
+    if do:
+        do(rig)
     stop = rig.stop_command(begin_s)
     rig.simulator.send(signal.SIGCONT)
     rig.switch(VEHICLE, None)
     time.sleep(LASTS_S)
-    wrong = drives_between(rig.timeline.commands, stop.seen_s)
+    wrong = rig.timeline.drives_between(stop.seen_s)
     wrong += [f"stopped for {stop.reason}"] * (stop.reason != reason)
-    if do is _is_ended:
+    if reason == "runtime_ended":
         rig.edge.wait()
         rig.edge = rig.start_edge()
         rig.edge.wait_for_line("ready")
     else:
         rig.rearm()
     rig.wait_until_driving()
-    return Try(stop.seen_s - since_s, None, stop.reason, wrong=wrong)
+    return Try(stop.seen_s - since_s, None, stop.reason, wrong)
 
 
 for _name, _done, _reason, _do, _limit_s in (
-    ("too_long", "no states for longer than it may ride", "no_fresh_state", _nothing, _LATER_S),
+    ("too_long", "no states for longer than it may ride", "no_fresh_state", None, _LATER_S),
     ("vehicle_fault", "vehicle reports what cannot be while it is ridden", "vehicle_fault",
-     _vehicle_lies, REACTION_LIMIT_S),
-    ("ended", "edge runtime ended while it rides; a new one", "runtime_ended", _is_ended,
-     REACTION_LIMIT_S),
+     lambda rig: rig.switch(VEHICLE, "lying"), REACTION_LIMIT_S),
+    ("ended", "edge runtime ended while it rides; a new one", "runtime_ended",
+     lambda rig: rig.edge.send(signal.SIGTERM), REACTION_LIMIT_S),
 ):  # fmt: skip
-    fault(f"edge sends safe_stop: {_reason}; stays stopped", "cause to safe_stop on the wire",
-          f"ride_{_name}", _done, reaction_limit_s=_limit_s, recovery_limit_s=None, rig=_VEHICLE,
+    fault(f"edge sends safe_stop: {_reason}; stays stopped", f"ride_{_name}", _done,
+          reaction_limit_s=_limit_s, recovery_limit_s=None, rig=_VEHICLE,
           policy="steady")(partial(_stops, _reason, _do))  # fmt: skip
-fault("simulator brakes by itself: no_command", "last drive command to the simulator's brake",
-      "ride_edge_killed", "SIGKILL to the edge runtime, which the simulator rides out; a new one",
+fault(_EXPECT_OWN, "ride_edge_killed",
+      "SIGKILL to the edge runtime, which the simulator rides out; a new one",
       reaction_limit_s=_LATER_S, rig={"ride_s": RIDE_S})(edge_killed)  # fmt: skip

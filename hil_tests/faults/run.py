@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 import math
+import statistics
 import tempfile
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.manifest import Task
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
-from hil_tests.faults.observe import (
-    later_s,
-    longest_gap_s,
-    spread_ms,
-    stops_between,
-    unsafe_commands,
-)
+from hil_tests.faults.observe import later_s, longest_gap_s
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import at_any_phase
-from hil_tests.faults.table import Row, Try
-from hil_tests.processes import POLICY, in_parallel, trusting
+from hil_tests.faults.rows import Row, Try, at_any_phase
+from hil_tests.processes import POLICY, trusting
 from hil_tests.testing.policies import TASK, write_policy
 
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-
-
-# Made for the rows that name them: the kind and value of `write_policy`.
-POLICIES = {
-    "steady": ("constant", 0.6),
-    "full": ("constant", 1.0),
-    # Brightness is its pedal: full throttle on white frames, the brake on all others.
-    "mean": ("mean", 0.0),
-}
+POLICIES = {"steady": ("constant", 0.6), "full": ("constant", 1.0), "mean": ("mean", 0.0)}
+"""Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
+frames, the brake on all others."""
 
 
 @dataclass
@@ -51,8 +39,6 @@ class Outcome:
     unsafe: list[str] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
     disturbed: int = 0  # Tries in which the machine itself stood still, done again
-    failures: list[str] = field(default_factory=list)
-    """Tries that came to no end: what should have come was not seen."""
 
 
 def run_faults(
@@ -69,91 +55,74 @@ def run_faults(
     themselves run after the others. Raises UserError where the policy does not load.
     """
     given = load_policy(policy, public_key, allow_unsigned=True).manifest
+    ended = threading.Event()  # No more tries are begun
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
-        work = Path(folder)
         policies = {"given": trusting(policy, public_key)}
-        for kind in {row.policy for row in chosen} & set(POLICIES):
-            write_policy(work / f"{kind}.onnx", *POLICIES[kind])
-            policies[kind] = trusting(work / f"{kind}.onnx", None)
-        outcomes: dict[str, Outcome] = {}
-        ended = threading.Event()
+        for kind, made in POLICIES.items():
+            path = Path(folder, f"{kind}.onnx")
+            write_policy(path, *made)
+            policies[kind] = trusting(path, None)
 
-        def do(row: Row) -> Outcome:
-            task = _task_of(row, given)
-            return run_row(row, policies[row.policy], task, work, tries, on_try, ended)
+        def do(row: Row) -> dict[str, Any]:
+            task, outcome = given if row.policy == "given" else TASK, Outcome()
+            while len(outcome.tries) < tries and not ended.is_set():
+                place = Path(tempfile.mkdtemp(dir=folder))
+                try:
+                    rig = Rig(policies[row.policy], place, task, **row.rig)
+                except (OSError, UserError) as error:  # as where this machine has no multicast
+                    outcome.tries.append(Try(wrong=[str(error)]))
+                    break
+                use_rig(row, rig, outcome, tries, on_try, ended)
+            return report_row(row, outcome, later_s(task))
 
+        found: dict[str, dict[str, Any]] = {}
         for alone in (False, True):
             rows = [row for row in chosen if row.alone == alone]
-            at_once = 1 if alone else jobs
-            in_parallel(do, rows, at_once, lambda row, found: outcomes.update({row.name: found}),
-                        ended)  # fmt: skip
-    found = [report_row(row, outcomes[row.name], later_s(_task_of(row, given))) for row in chosen]
+            with ThreadPoolExecutor(1 if alone else jobs) as pool:
+                try:
+                    found.update(zip((row.name for row in rows), pool.map(do, rows), strict=True))
+                except BaseException:  # ^C, too
+                    ended.set()
+                    raise
+    reports = [found[row.name] for row in chosen]
     return {
         "tries": tries,
-        "rows": found,
-        "crashes": sum(len(row["crashes"]) for row in found),
-        "unsafe_commands": sum(len(row["unsafe"]) for row in found),
-        "passed": all(row["passed"] for row in found),
+        "rows": reports,
+        "crashes": sum(len(row["crashes"]) for row in reports),
+        "unsafe_commands": sum(len(row["unsafe"]) for row in reports),
+        "passed": all(row["passed"] for row in reports),
     }
 
 
-def _task_of(row: Row, given: Task) -> Task:
-    """Return what the row's policy is made for: only ``given`` ones may differ from `TASK`."""
-    return given if row.policy == "given" else TASK
-
-
-def run_row(
+def use_rig(
     row: Row,
-    trust: Sequence[str],
-    task: Task,
-    work: Path,
+    rig: Rig,
+    outcome: Outcome,
     tries: int,
     on_try: Callable[[str], None],
     ended: threading.Event,
-) -> Outcome:
-    """Do all tries of a row, each rig in a directory in ``work``; one that hangs is replaced.
-
-    Once the campaign has ``ended``, no more are begun.
-    """
-    outcome, number = Outcome(), 0
-    while number < tries and not ended.is_set():
-        try:
-            started = Rig(trust, Path(tempfile.mkdtemp(dir=work)), task, **row.rig)
-        except (OSError, UserError) as error:  # as where this machine has no multicast
-            outcome.failures.append(f"try {number}: {error}")
-            break
-        with started as rig:
-            going = True
-            while going and number < tries:
-                disturbed = outcome.disturbed
-                going = _try(row, rig, number, outcome) and row.counted != "simulator"
-                if outcome.disturbed == disturbed:
-                    number += 1
-                    on_try(row.name)
-            seen = rig.timeline
-            outcome.unsafe += unsafe_commands(seen.commands, seen.states, task)
-            if seen.unreadable:
-                outcome.unsafe.append(f"{seen.unreadable} commands that nobody would take")
-        outcome.crashes += rig.crashes
-    return outcome
-
-
-def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
-    """Do a row once; return whether the rig can be used again."""
-    try:
-        rig.wait_until_driving()
-        at_any_phase(number)
-        begin_s = time.monotonic()
-        done = do_fault(row, rig, number)
-    except (OSError, UserError) as error:  # a time-out, or a process that is gone
-        outcome.failures.append(f"try {number}: {error}")
-        return False
-    gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
-    if row.flows and gap_s > STALLED_PERIODS * rig.period_s and outcome.disturbed < MOST_DISTURBED:
-        outcome.disturbed += 1
-    else:
-        outcome.tries.append(done)
-    return True
+) -> None:
+    """Do tries of a row with a rig until all are done, or it hangs or cannot be used again."""
+    with rig:
+        usable = True
+        while usable and len(outcome.tries) < tries and not ended.is_set():
+            number, begin_s = len(outcome.tries), time.monotonic()
+            try:
+                rig.wait_until_driving()
+                at_any_phase(number)
+                begin_s = time.monotonic()
+                done, usable = do_fault(row, rig, number), row.counted != "simulator"
+            except (OSError, UserError) as error:  # a time-out, or a process that is gone
+                done, usable = Try(wrong=[f"try {number}: {error}"]), False
+            gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
+            stalled = row.flows and gap_s > STALLED_PERIODS * rig.period_s
+            if stalled and usable and outcome.disturbed < MOST_DISTURBED:
+                outcome.disturbed += 1
+                continue
+            outcome.tries.append(done)
+            on_try(row.name)
+        outcome.unsafe += rig.timeline.unsafe_commands(rig.task)
+    outcome.crashes += rig.crashes
 
 
 def do_fault(row: Row, rig: Rig, number: int) -> Try:
@@ -168,12 +137,11 @@ def do_fault(row: Row, rig: Rig, number: int) -> Try:
     if row.counted == "edge":
         counted = rig.edge_counts() - before
     if row.counted == "simulator":
-        rig.end_drive()  # It writes its counts at its end.
-        counted = rig.simulator_counts()
+        counted = rig.end_counts()
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
     # Safe stops come as steadily as drives: the gaps alone would not tell.
-    wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *done.wrong]
-    gap_s = rig.longest_gap(begin_s, end_s)
+    wrong += [*rig.timeline.stops_between(begin_s, end_s), *done.wrong]
+    gap_s = rig.timeline.longest_gap_s(begin_s, end_s)
     return replace(done, reaction_s=gap_s, rejected=dict(counted), wrong=wrong)
 
 
@@ -183,28 +151,35 @@ def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, An
     For another T than 0.1 s a reaction may take ``later_s`` longer, which is the difference of 2 T,
     and a recovery that of the five states that it takes.
     """
-    times: dict[str, Any] = {}
-    for kind, plural, factor in (("reaction", "reactions", 1.0), ("recovery", "recoveries", 2.5)):
-        limit_s = getattr(row, f"{kind}_limit_s")
-        limit_s = None if limit_s is None else limit_s + factor * later_s
-        found = [getattr(t, f"{kind}_s") for t in outcome.tries]
-        found_s = [value_s for value_s in found if value_s is not None]
-        times[f"{kind}_ms"] = spread_ms(found_s)
-        times[f"{kind}_limit_ms"] = None if limit_s is None else round(limit_s * 1e3, 1)
-        times[f"{plural}_late"] = sum(limit_s is not None and s > limit_s for s in found_s)
+    times = {
+        **_times("reaction", "reactions", outcome, row.reaction_limit_s, later_s),
+        **_times("recovery", "recoveries", outcome, row.recovery_limit_s, 2.5 * later_s),
+    }
     late = times["reactions_late"] + times["recoveries_late"]
-    wrong = [*outcome.failures, *(text for t in outcome.tries for text in t.wrong)]
-    names = {name for t in outcome.tries for name in t.figures}
+    wrong = [text for each in outcome.tries for text in each.wrong]
     return {
-        **{name: getattr(row, name) for name in ("name", "done", "expected", "measured")},
-        "tries": len(outcome.tries) + len(outcome.failures),
+        **{name: getattr(row, name) for name in ("name", "done", "expected")},
+        "tries": len(outcome.tries),
         "disturbed": outcome.disturbed,
         **times,
-        "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
-        "rejected": dict(sum((Counter(t.rejected) for t in outcome.tries), Counter())),
-        "figures": {n: max(t.figures.get(n, -math.inf) for t in outcome.tries) for n in names},
+        "reasons": dict(Counter(each.reason for each in outcome.tries if each.reason)),
+        "rejected": dict(sum((Counter(each.rejected) for each in outcome.tries), Counter())),
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,
         "passed": not (late or wrong or outcome.unsafe or outcome.crashes),
+    }
+
+
+def _times(
+    kind: str, plural: str, outcome: Outcome, limit_s: float | None, later_s: float
+) -> dict[str, Any]:
+    most_ms = math.inf if limit_s is None else round((limit_s + later_s) * 1e3, 1)
+    found = [getattr(each, f"{kind}_s") for each in outcome.tries]
+    found_ms = [round(value_s * 1e3, 1) for value_s in found if value_s is not None]
+    figures: dict[str, Any] = {"min": min, "median": statistics.median, "max": max}
+    return {
+        f"{kind}_ms": {name: of(found_ms) for name, of in figures.items()} if found_ms else None,
+        f"{kind}_limit_ms": None if limit_s is None else most_ms,
+        f"{plural}_late": sum(value_ms > most_ms for value_ms in found_ms),
     }

@@ -24,15 +24,13 @@ def call(capsys: Any, *arguments: object, package: str = "trainer") -> tuple[int
     """Run ``python -m PACKAGE`` in this process; return exit status, stdout and stderr."""
     main = importlib.import_module(f"{package}.__main__").main
     status = exit_status(main, [str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
+    return status, *capsys.readouterr()
 
 
 def refusal(capsys: Any, *arguments: object, package: str = "trainer") -> str:
     """Return the one line with which a command ends that is given bad input."""
     status, out, err = call(capsys, *arguments, package=package)
     assert (status, out, len(err.strip().splitlines())) == (2, "", 1), err
-    assert "Traceback" not in err
     return err
 
 
@@ -40,13 +38,3 @@ def run_command(*arguments: str, cwd: Path | None = None) -> subprocess.Complete
     """Run ``python -m edge_runtime`` in a process of its own to its end."""
     command = [sys.executable, "-m", "edge_runtime", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=cwd, check=False)
-
-
-def render_table(events: Any, states: Any, after: Callable[[Any, Any], Any]) -> str:
-    """Render a table of transitions as a README has it: a row for each event, a column a state."""
-    rows = [
-        ["event", *(f"in {state.value}" for state in states)],
-        *([event.value, *(after(state, event).value for state in states)] for event in events),
-    ]
-    first, *others = (f"| {' | '.join(row)} |" for row in rows)
-    return "\n".join((first, "|---" * len(rows[0]) + "|", *others))

@@ -1,41 +1,32 @@
-"""Simulators and recorders as processes, recordings in process, and damage to recordings."""
+"""The processes of a drive, and the simulator's end of the wire in the test."""
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import json
-import subprocess
-import sys
-from collections.abc import Iterator, Sequence
+import queue
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+import zenoh
 
-from bridge.__main__ import main
-from bridge.environments import describe, make_environment
-from bridge.fork import ForkedDrive, RecordedEpisode
-from bridge.messages import Origin
-from bridge.recording import RecordingWriter
-from bridge.report import EpisodeResult
-from edge_runtime.policy import load_policy
-from edge_runtime.reach import free_endpoint
-from hil_tests.processes import Process, wait_until
-from hil_tests.testing.commands import exit_status
-from hil_tests.testing.edge import start_edge
-from hil_tests.testing.policies import write_policy
+from edge_runtime import wire
+from edge_runtime.link import ask
+from edge_runtime.transport import open_session
+from edge_runtime.wire import Command, Feedback, Health, State
+from hil_tests.processes import PATIENCE_S, Process, wait_until
+from hil_tests.testing.messages import make_state
+from hil_tests.testing.policies import T, write_policy
 
-TOY = "hil_tests.testing.environments:BridgeToy-v0"
-SHORT_TOY = "hil_tests.testing.environments:BridgeToyShort-v0"
-SLOW_TOY = "hil_tests.testing.environments:BridgeToySlow-v0"
-
-
+TOY, SHORT_TOY, SLOW_TOY = (
+    f"hil_tests.testing.environments:{name}-v0"
+    for name in ("BridgeToy", "BridgeToyShort", "BridgeToySlow")
+)
 LEFT_TURN = Path(__file__).parents[1] / "recordings" / "left_turn.mcap"
-
-
-def bridge_status(arguments: list[str]) -> int:
-    return exit_status(main, arguments)
 
 
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
@@ -45,80 +36,104 @@ def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
     return path
 
 
+def run_edge(*arguments: str, **options: Any) -> Process:
+    """Start ``python -m edge_runtime run``, and wait until it is ready."""
+    return Process("edge_runtime", "run", *arguments, ready="ready ", **options)
+
+
+def start_edge(endpoint: str, policy: object, *arguments: str) -> Process:
+    """Start an edge runtime with an unsigned test policy, and wait until it is ready."""
+    trust = ("--policy", str(policy), "--allow-unsigned")
+    return run_edge(*trust, "--connect", endpoint, *arguments)
+
+
 def start_simulate(endpoint, out, env, *options, **more) -> Process:
     fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
     return Process("bridge", *fixed, *options, **more)
-
-
-def start_record(endpoint: str, path: Path, *options: str) -> Process:
-    """Start ``python -m bridge record``, and wait until there is a recording."""
-    run = Process("bridge", "record", "--out", str(path), "--connect", endpoint, *options)
-    # A file is made before its first bytes are in it.
-    wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin", 100.0)
-    return run
-
-
-def record_drive(
-    folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = (), **more: Any
-) -> Path:
-    """Record a drive of the three processes; its report is ``report.json`` beside it."""
-    endpoint, path = free_endpoint(), folder / "drive.mcap"
-    simulating = ("--wait-edge-s", "100", *options)
-    with (
-        start_simulate(endpoint, folder / "report.json", env, *simulating, **more) as simulator,
-        start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5") as recorder,
-        start_edge(endpoint, policy, *edge),
-    ):
-        assert simulator.wait(200.0) == 0, simulator.errors
-        assert recorder.wait() == 0, recorder.errors
-    return path
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[RecordingWriter]:
-    with contextlib.closing(RecordingWriter(path)) as writer:
-        yield writer
-        writer.finish()
-
-
-def record_in_process(
-    path: Path, env: str, policy: Path, seed: int, latency: str, condition: str = "nominal"
-) -> EpisodeResult:
-    """Record a drive in lock-step as the processes would, without them."""
-    origin = Origin(
-        session="s", environment=env, condition=condition, seed=seed, standing=False,
-        clock="lockstep", loop="policy", latency=latency,
-    )  # fmt: skip
-    environment = make_environment(env, condition)
-    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
-    with writing(path) as out:
-        loaded = load_policy(policy, allow_unsigned=True)
-        return ForkedDrive(nothing, environment, 0, loaded, out=out).run()
 
 
 def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def rerun(*arguments: str) -> str:
-    command = [sys.executable, "-m", "rerun_cli", *arguments]
-    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
+class Simulator:
+    """The simulator's end of the wire: a router that sends states and keeps what comes back."""
 
+    def __init__(self, endpoint: str, vehicle_id: str = "hunter01") -> None:
+        self.endpoint, self.vehicle_id = endpoint, vehicle_id
+        self.commands: queue.Queue[Command] = queue.Queue()
+        self.health: list[Health] = []
+        self.feedback: list[Feedback] = []
+        self.steps = itertools.count()
+        self._session = open_session(listen=endpoint, mode="router")
+        self.alive = threading.Event()
+        alive, tokens = wire.key(vehicle_id, "alive"), self._session.liveliness()
+        self._subscribers = [tokens.declare_subscriber(alive, self._note_alive, history=True)]
+        for topic, decode, keep in (
+            ("command", wire.decode_command, self.commands.put),
+            ("health", wire.decode_health, self.health.append),
+            ("feedback", wire.decode_feedback, self.feedback.append),
+        ):
+            hear = partial(self._keep, decode, keep)
+            key = wire.key(vehicle_id, topic)
+            self._subscribers.append(self._session.declare_subscriber(key, hear))
 
-def chunks(path: Path) -> list[ChunkIndex]:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    return summary.chunk_indexes
+    def wait_for_edge(self) -> None:
+        assert self.alive.wait(PATIENCE_S), "no edge runtime came"
+        wait_until(lambda: self.health, "a health message")
 
+    def send(self, state: Any, key: str = "") -> None:
+        """Publish a State, or bytes as they are; all arrive, on however busy a machine."""
+        payload = state if isinstance(state, bytes) else wire.encode(state)
+        key = key or wire.key(self.vehicle_id, "state")
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
-def flip(path: Path, at: int, count: int = 4) -> None:
-    data = bytearray(path.read_bytes())
-    data[at : at + count] = bytes(byte ^ 0xFF for byte in data[at : at + count])
-    path.write_bytes(data)
+    def ask(self, state: State, timeout_s: float = PATIENCE_S) -> Command:
+        """Send a state and wait for the command that answers it, dropping all before."""
+        self.send(state)
+        end_s = time.monotonic() + timeout_s
+        while True:
+            command = self.commands.get(timeout=max(0.001, end_s - time.monotonic()))
+            place = (command.session, command.episode, command.step)
+            if place == (state.session, state.episode, state.step):
+                return command
 
+    def drive_until(
+        self, holds: Callable[[], Any], what: str, rearms: bool = False, **changes: Any
+    ) -> None:
+        """Answered states at 10 Hz; an operator beside it re-arms where that is asked."""
 
-def flip_chunk(path: Path, number: int) -> None:
-    """Damage what the chunk holds, so that its checksum is wrong."""
-    index = chunks(path)[number]
-    flip(path, index.chunk_start_offset + index.chunk_length // 2)
+        def does_after_a_state() -> Any:
+            self.ask(make_state(next(self.steps), **changes))
+            if rearms and self.health[-1].needs_rearm:
+                self.query("rearm")
+            time.sleep(T)
+            return holds()
+
+        wait_until(does_after_a_state, what)
+
+    def next_command(self) -> Command:
+        return self.commands.get(timeout=PATIENCE_S)
+
+    def drain(self) -> list[Command]:
+        return [self.commands.get_nowait() for _ in range(self.commands.qsize())]
+
+    def query(self, topic: str) -> dict[str, Any]:
+        """The status or rearm query, as an operator's command asks it."""
+        return ask(self.endpoint, self.vehicle_id, topic)
+
+    def __enter__(self) -> Simulator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._session.close()
+
+    def _keep(self, decode: Callable, keep: Callable, sample: Any) -> None:
+        message = decode(bytes(sample.payload))
+        assert not isinstance(message, wire.Rejection), message
+        keep(message)
+
+    def _note_alive(self, sample: Any) -> None:
+        (self.alive.set if str(sample.kind).endswith("PUT") else self.alive.clear)()

@@ -13,14 +13,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import helper, numpy_helper
 
-from edge_runtime.manifest import (
-    MANIFEST_KEY,
-    Action,
-    Car,
-    Entry,
-    Manifest,
-    Task,
-)
+from edge_runtime.manifest import MANIFEST_KEY, Action, Car, Entry, Manifest, Task
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
@@ -110,19 +103,14 @@ _ANSWERS = {
 
 
 def _graph(text: str, kind: str, value: float, n_actions: int) -> onnx.GraphProto:
-    weights: dict[str, np.ndarray] = {
-        "value": np.array([value], np.float32),
-        "zero": np.array([0.0], np.float32),
-        "ten": np.array(10.0, np.float32),
-        "faint": np.array(1e-20, np.float32),
-        "half_range": np.array([127.5], np.float32),
-        "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
-        "ones": np.ones((1, n_actions), np.float32),
-        "last_axis": np.array([1], np.int64),
-    }
-    graph = onnx.parser.parse_graph(
+    constants = {
+        "value": [value], "zero": [0.0], "ten": 10.0, "faint": 1e-20, "half_range": [127.5],
+        "fault_brightness": [FAULT_BRIGHTNESS], "ones": [[1.0] * n_actions],
+    }  # fmt: skip
+    text = (
         text
-        or f"""test_{kind} (uint8[batch, 2, 45, 80] frames) => (float[batch, {n_actions}] action) {{
+        or f"""test_{kind} (uint8[batch, 2, 45, 80] frames)
+        => (float[batch, {n_actions}] action) {{
             pixels = Cast<to = 1>(frames)
             mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
             {_ANSWERS[kind]}
@@ -130,7 +118,8 @@ def _graph(text: str, kind: str, value: float, n_actions: int) -> onnx.GraphProt
             action = Mul(column, ones)
         }}"""
     )
-    graph.initializer.extend(
-        numpy_helper.from_array(array, name) for name, array in weights.items()
-    )
+    graph = onnx.parser.parse_graph(text)
+    arrays = {name: np.array(number, np.float32) for name, number in constants.items()}
+    arrays["last_axis"] = np.array([1], np.int64)
+    graph.initializer.extend(numpy_helper.from_array(each, name) for name, each in arrays.items())
     return graph

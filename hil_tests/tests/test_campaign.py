@@ -1,4 +1,5 @@
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from bridge.outcomes import GOAL, TRUNCATED, UNKNOWN
 from edge_runtime.cli import run_cli
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests import sweep
+from hil_tests import campaign
 from hil_tests.__main__ import main
 from hil_tests.drivers import Drivers
 from hil_tests.faults.rig import free_bus
@@ -20,8 +21,8 @@ from trainer.environments import make_environment
 from trainer.evaluation import EpisodeResult, drive_episodes
 from trainer.util import kept
 
-DELAY = sweep.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
-JITTER = sweep.Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms", "{}")
+DELAY = campaign.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms")
+JITTER = campaign.Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms")
 
 
 @pytest.mark.parametrize(
@@ -37,25 +38,14 @@ JITTER = sweep.Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "
 def test_the_budget_is_the_largest_value_up_to_which_all_hold(delay, jitter, limits):
     shares = zip((*DELAY.specs, *JITTER.specs), (*delay, *jitter), strict=True)
     rows = {spec: {"success": {"value": share}} for spec, share in shares}
-    found = sweep.budget([DELAY, JITTER], rows, 0.98, "a policy")
+    found = campaign.budget([DELAY, JITTER], rows, 0.98, "a policy")
     assert tuple(found["limits"].values()) == limits
-    assert found["up_to_the_largest_tested"] == {"delay": False, "jitter": limits[1] == 9}
     assert f"{limits[0]} ms of delay" in found["sentence"]
-    assert ("no jitter" in found["sentence"]) == (limits[1] is None)
-
-
-def test_a_row_has_wilsons_interval():
-    drives = [
-        EpisodeResult(n, "goal" if n < 8 else "collision", 20.0, 1.0, 2.0, None, None, 20)
-        for n in range(10)
-    ]
-    wanted = {"value": 0.8, "low": 0.49016, "high": 0.94331}
-    assert sweep.make_row("s", drives)["success"] == pytest.approx(wanted, abs=1e-5)
 
 
 def test_a_campaign_of_networks_is_the_drive_in_process(tmp_path, monkeypatch, capsys):
-    few = sweep.Axis("delay", "delay", "ms", (0, 300), "delay={}ms", "none", "{} of delay")
-    monkeypatch.setattr("hil_tests.campaign.NETWORK_AXES", (few,))
+    few = campaign.Axis("delay", "delay", "ms", (0, 300), "delay={}ms")
+    monkeypatch.setattr(campaign, "AXES", (few,))
     monkeypatch.chdir(tmp_path)  # The default policy is the repository's.
     out = tmp_path / "r.json"
     arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "1", "--out", str(out)]
@@ -64,9 +54,8 @@ def test_a_campaign_of_networks_is_the_drive_in_process(tmp_path, monkeypatch, c
     env, driver = make_environment("left_turn"), OnnxDriver(Path(kept(str(POLICY))))
     for spec, row in found["rows"].items():
         wanted = drive_episodes(env, driver, range(2), latency=parse_spec(spec))
-        distances = [each["distance_m"] for each in row["per_episode"]]
-        assert distances == [each.distance_m for each in wanted]
-    assert (tmp_path / found["figures"]["success"]).stat().st_size > 10_000
+        assert row["outcomes"] == Counter(each.outcome for each in wanted)
+    assert (tmp_path / "r_success.png").stat().st_size > 10_000
     assert found["budget"]["sentence"] in capsys.readouterr().out
     assert found["budget"]["sentence"] in out.with_suffix(".md").read_text()
 

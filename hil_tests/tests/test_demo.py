@@ -5,16 +5,14 @@ import pytest
 from hil_tests import demo
 from hil_tests.__main__ import main
 
-SMALL = (
-    "--steps", "60", "--human-episodes", "5", "--human-minutes", "0.001", "--runs", "1",
-    "--minutes", "1",
-)  # fmt: skip
+SMALL = ("--steps", "60", "--runs", "1", "--minutes", "1")
+HUMAN = ("--episodes", 5, "--max-minutes", 0.001, "--refining-updates", 10)
 
 
 @pytest.mark.timeout(400)
 def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "SETTINGS", ("batch_size=8", "evaluation_runs=1"))
-    monkeypatch.setattr(demo, "REFINING_UPDATES", 10)
+    monkeypatch.setattr(demo, "HUMAN", HUMAN)
     words = ["demo", "--out", str(tmp_path / "demo"), *SMALL]
     first = main(words)
     # A policy of sixty steps may well drive badly (status 1); anything else is a fault.
@@ -22,7 +20,7 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     shown = capsys.readouterr().out
     made = {path.name for path in (tmp_path / "demo").iterdir()}
     assert made >= {
-        "left_turn.onnx", "left_turn.onnx.sig", "learning_curve.png", "drive.rrd",
+        "left_turn.onnx", "left_turn.onnx.sig", "drive.rrd",
         "in_process.json", "wire.json", "wire_latency.json", "keys", "run", "human",
     }  # fmt: skip
     names = ("in_process", "wire", "wire_latency")
@@ -35,7 +33,7 @@ def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, mon
     # What the second one does with its policy is what the first one did: only its commands count.
     commands = []
     monkeypatch.setattr(demo, "run_command", lambda *words: commands.append(words[:2]))
-    monkeypatch.setattr(demo.Demo, "_simulate", lambda *_: commands.append(("simulate",)))
+    monkeypatch.setattr(demo, "drive_shown", lambda *_: commands.append(("simulate",)))
     assert main(words) == first
     assert "is kept" in capsys.readouterr().out
     assert commands == [("trainer", "evaluate"), *[("simulate",)] * 3]

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from deploy.__main__ import main as deploy
@@ -13,7 +12,6 @@ from deploy.bundle import build_installer
 from edge_runtime.reach import free_endpoint
 from hil_tests import doctor
 from hil_tests.__main__ import main
-from hil_tests.bench_loop import compare
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.commands import exit_status
 from hil_tests.testing.drives import read, start_simulate
@@ -21,32 +19,28 @@ from hil_tests.testing.drives import read, start_simulate
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_basics_work_where_the_tests_run(capsys):
-    assert main(["doctor", "--only", "basics"]) == 0
-    assert "  missing  " not in capsys.readouterr().out
-    assert "a frame went" in doctor._can_over_udp()
-
-
-def test_without_packages_it_still_runs_and_says_what_is_missing():
+def test_without_packages_the_doctor_still_runs_and_says_what_is_missing():
     # -S: no site-packages, as in a fresh clone.
-    command = [sys.executable, "-S", "-m", "hil_tests", "doctor", "--only", "basics"]
+    command = [sys.executable, "-S", "-m", "hil_tests", "doctor"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (1, "")
-    assert "  ok       Python: 3." in done.stdout
-    assert done.stdout.endswith("missing: packages, loopback\n")
+    assert "  ok       Python: " in done.stdout
+    assert "\nmissing: packages" in done.stdout
 
 
 def test_whatever_a_check_raises_is_a_missing_ability(monkeypatch, capsys):
     def broken():
         raise ImportError("libsomething.so:\n no such file")
 
-    for group, status in ((doctor.BASICS, 1), ("vehicle", 0)):
-        ability = doctor.Ability(group, "thing", broken, "no driving", "buy one")
-        monkeypatch.setattr(doctor, "ABILITIES", [ability])
+    assert "a frame went" in doctor._can_over_udp()
+    basics = [ability for ability in doctor.ABILITIES if ability.is_basic]
+    for is_basic, status in ((True, 1), (False, 0)):
+        ability = doctor.Ability("thing", broken, "no driving", "buy one", is_basic)
+        monkeypatch.setattr(doctor, "ABILITIES", [*basics, ability])
         assert main(["doctor"]) == status
         said = capsys.readouterr().out
         assert "missing  thing: libsomething.so: no such file\n" in said
-        assert "get it: buy one\n" in said
+        assert said.endswith("\nmissing: thing\n")
 
 
 VEHICLE = "hunter01"
@@ -97,19 +91,6 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
     assert episode["answered_states"] > 0
     assert set(episode["rejected"]) <= {"stale", "foreign_session"}  # a busy machine's
     assert not opt.exists()
-
-
-def test_ratios_have_an_interval_that_widens_where_blocks_differ():
-    floor = [np.arange(1.0, 101.0)] * 4
-    result = compare([block * 1.2 for block in floor], floor)
-    assert result["p50"]["floor"] == pytest.approx(50.5)
-    for row in result.values():
-        assert [row["ratio"], *row["interval"]] == pytest.approx([1.2] * 3)
-    generator = np.random.default_rng(0)
-    floor = [generator.uniform(1, 2, 50) for _ in range(8)]
-    ours = [block * factor for block, factor in zip(floor, np.linspace(1, 2, 8), strict=True)]
-    low, high = compare(ours, floor)["p50"]["interval"]
-    assert 1.0 < low < compare(ours, floor)["p50"]["ratio"] < high < 2.0
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,6 @@ from bridge.messages import Origin
 from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.testing.environments import odd
 from trainer import environments, evaluate, export, train
 from trainer.__main__ import main
 from trainer.drivers import OnnxDriver, constant_driver, load_driver
@@ -49,6 +48,7 @@ from trainer.person.recording import Recorder, read_steps
 from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import encode_view
+from trainer.tests.odd import odd
 from trainer.tests.rover import CAMERA, ROVER, Rover
 from trainer.training.delayed import DelayedVehicle
 from trainer.view import ShownStep, sitting_entries

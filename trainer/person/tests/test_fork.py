@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from bridge.fork import RecordedEpisode, read_episode
+from bridge.tests.recordings import record_in_process
 from hil_tests.testing.commands import call
-from hil_tests.testing.drives import record_in_process
 from hil_tests.testing.policies import write_policy
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold
