@@ -5,12 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 MUTATION := .venv-mutation
 MUTATION_STAMP := $(MUTATION)/.installed
-CONTAINER := .venv-container
-CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-board lint format lint-container bench \
+.PHONY: help install doctor pictures demo test test-ray test-board lint format bench \
 	bench-quick bench-loop recording mutate lock clean
 
 help:  ## this list
@@ -55,14 +53,6 @@ lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer \
 	  hil_tests/__init__.py hil_tests/__main__.py hil_tests/doctor.py
 
-$(CONTAINER_STAMP): requirements/container.txt
-	$(PYTHON) -m venv $(CONTAINER)
-	$(CONTAINER)/bin/python -m pip install --quiet --requirement requirements/container.txt
-	@touch $@
-
-lint-container: $(CONTAINER_STAMP)  ## hadolint over the Dockerfile of the edge runtime
-	$(CONTAINER)/bin/hadolint deploy/container/Dockerfile
-
 format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -102,4 +92,4 @@ lock: $(STAMP)  ## rewrite the lock from what is installed
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
 clean:  ## remove caches and the virtual environments; trained runs stay
-	rm -rf $(VENV) $(MUTATION) $(CONTAINER) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(MUTATION) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache

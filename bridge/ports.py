@@ -318,7 +318,7 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "settings from a file of `python -m deploy router`, in the place of other options"
+    config = "settings from a file for zenohd, in the place of other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 

@@ -1,5 +1,1 @@
-"""Installs, upgrades and undoes releases on the board, with Python 3.8's standard library alone.
-
-`deploy bundle` packs this folder as `install.pyz`, with the few modules of `edge_runtime` that it
-imports.
-"""
+"""The installer on the board: Python 3.8 and its standard library alone."""

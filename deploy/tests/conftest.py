@@ -2,15 +2,16 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bundle import build_edge_wheel
-from deploy.tests.boards import Board, Workshop
+from deploy.bundle import TARGETS
+from deploy.tests.boards import HERE, Board, Workshop
 
 
 @pytest.fixture(scope="session")
-def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+def workshop(tmp_path_factory: pytest.TempPathFactory):
     """Bundles of the real edge runtime for this computer."""
-    folder = tmp_path_factory.mktemp("workshop")
-    return Workshop(folder, build_edge_wheel(folder / "wheel"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TARGETS, "here", HERE)
+        yield Workshop(tmp_path_factory.mktemp("workshop"))
 
 
 @pytest.fixture

@@ -12,42 +12,47 @@ import time
 from pathlib import Path
 
 from deploy.installer import __main__ as installer
-from deploy.installer.layout import CONFIG, CURRENT, LAUNCHER
-from deploy.installer.systemd import HealthLimits, Systemd, UnhealthyError
+from deploy.installer.release import CONFIG, CURRENT, LAUNCHER
+from deploy.installer.systemd import Systemd, UnhealthyError
+
+READY_S, SETTLE_S = 8.0, 0.8
 
 
 class ProcessService(Systemd):
     """Runs the runtime itself, without a trial, and forgets to start it again."""
 
     def __init__(self, service: object, root: Path) -> None:
-        super().__init__(root)
         self._current = root / CURRENT
         self._pid, self._log = root / "state/pid", root / "state/log"
 
     def group(self) -> int:
         return os.getgid()
 
-    def try_release(self, folder: Path, policy_id: str, limits: HealthLimits) -> None:
-        pass
-
     def prepare(self, folder: Path) -> None:
         pass
 
-    def start(self, limits: HealthLimits) -> None:
+    try_release = prepare
+
+    def start(self) -> None:
+        folder = self._current.resolve()
+        command = [
+            "env",
+            "--default-signal",
+            "setsid",
+            str(folder / LAUNCHER),
+            "run",
+            "--config",
+            CONFIG,
+        ]
         with open(self._log, "wb") as log:
-            run = subprocess.Popen(
-                [self._current / LAUNCHER, "run", "--config", CONFIG], cwd=self._current.resolve(),
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-            )  # fmt: skip
+            run = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
         self._pid.write_text(str(run.pid))
-        end_s = time.monotonic() + limits.within_s
-        while "ready " not in self._log.read_text():
+        end_s = time.monotonic() + READY_S
+        while "ready " not in self._log.read_text() and time.monotonic() < end_s and self.pid():
             time.sleep(0.05)
-            if self.pid() is None or time.monotonic() > end_s:
-                raise UnhealthyError("the service does not get ready")
-        time.sleep(limits.settle_s)
-        if self.pid() is None:
-            raise UnhealthyError("the service ended")
+        time.sleep(SETTLE_S)
+        if self.pid() is None or "ready " not in self._log.read_text():
+            raise UnhealthyError("the service does not stay up")
 
     def stop(self) -> None:
         while (pid := self.pid()) is not None:
@@ -55,14 +60,13 @@ class ProcessService(Systemd):
                 os.kill(pid, signal.SIGTERM)
             time.sleep(0.02)
 
+    remove = stop
+
     def describe(self) -> str:
         return "stopped" if self.pid() is None else "active"
 
-    def remove(self) -> None:
-        self.stop()
-
     def pid(self) -> int | None:
-        """The process while it lives, and is no zombie of ours."""
+        """The process while it lives."""
         try:
             pid = int(self._pid.read_text())
             state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]

@@ -1,31 +1,22 @@
+"""Bundles, and `deploy push` with ssh, scp and sudo that work on this computer."""
+
 import contextlib
 import hashlib
 import os
-import re
 import shutil
 import stat
+import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
 from deploy import bundle as bundle_module
 from deploy.__main__ import main
-from deploy.bundle import (
-    ROOT,
-    TARGETS,
-    build_edge_wheel,
-    build_installer,
-    gather,
-    lock_path,
-    make_bundle,
-    pip,
-)
-from deploy.installer.verify import read_bundle
-from deploy.tests.boards import HERE
+from deploy.bundle import build_edge_wheel, build_installer, gather
+from deploy.installer.release import Releases, read_bundle, read_public_key
 from edge_runtime.config import load_config
 from edge_runtime.util import UserError
-from hil_tests.testing.commands import exit_status
+from hil_tests.testing.commands import exit_status, refusal
 
 
 @pytest.fixture(scope="module")
@@ -37,34 +28,23 @@ def party(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def driver(tmp_path_factory):
-    """The wheel of the example's vehicle."""
-    folder = tmp_path_factory.mktemp("driver")
-    built = shutil.ignore_patterns("build", "*.egg-info")  # What pip left would be packed, too.
-    source = shutil.copytree(ROOT / "examples/my_vehicle", folder / "source", ignore=built)
-    pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(source))
-    return next(folder.glob("*.whl"))
-
-
 def test_the_same_inputs_give_the_same_bytes_and_others_another_version(workshop, tmp_path):
-    again = build_edge_wheel(tmp_path)
-    assert again.read_bytes() == workshop.edge_wheel.read_bytes()
+    assert build_edge_wheel() == workshop.edge_wheel.read_bytes()
     assert build_installer() == build_installer()
-    inputs = workshop.inputs()
-    one, two = (make_bundle(inputs, HERE, tmp_path / folder) for folder in ("one", "two"))
-    assert one.path.read_bytes() == two.path.read_bytes()
+    (one, same), (two, _) = (workshop.make(out=tmp_path / folder) for folder in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes()
     changed = (workshop.make(0.2), workshop.make(wheels=[workshop.edge_wheel]))
-    assert len({made.manifest.version for made in (one, two, *changed)}) == 3
+    assert len({same.version, *(manifest.version for _, manifest in changed)}) == 3
 
 
-def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, driver, tmp_path):
-    config = tmp_path / "c.toml"
-    config.write_text('connect = "tls/10.0.0.1:7447"\nvehicle = "rover"\n')
+def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_path):
+    config, driver = tmp_path / "c.toml", tmp_path / "my_vehicle-0.1.0-py3-none-any.whl"
+    config.write_text('connect = "tls/10.0.0.1:7447"\narmed_at_start = true\nvehicle = "rover"\n')
+    shutil.copy(workshop.host, driver)
     wheels = [workshop.edge_wheel, driver]
-    made = workshop.make(tls=party / "edge-hunter01", config=config, wheels=wheels)
-    _, contents = read_bundle(str(made.path), workshop.public_key.read_bytes())
-    assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
+    path, _ = workshop.make(tls=party / "edge-hunter01", config=config, wheels=wheels)
+    _, contents = read_bundle(path, read_public_key(workshop.public_key))
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert contents.keys() == {
         "manifest.json", "install.pyz", "config.toml", "policy.onnx",
         "policy.onnx.sig", "policy.pub", "tls/ca.pem", "tls/cert.pem", "tls/key.pem",
@@ -73,110 +53,91 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, driver,
     }  # fmt: skip
     assert b"never to leave" not in b"".join(contents.values())
     assert workshop.key.read_bytes() not in contents.values()
-    settings = tmp_path / "board.toml"
-    settings.write_bytes(contents["config.toml"])
-    read_back = load_config(settings, {})
-    names = ("connect", "vehicle", "policy", "tls", "hold", "armed_at_start")
+    (tmp_path / "board.toml").write_bytes(contents["config.toml"])
+    read_back = load_config(tmp_path / "board.toml", {})
+    names = ("connect", "vehicle", "policy", "tls", "hold", "is_armed_at_start")
     assert [getattr(read_back, name) for name in names] == [
-        "tls/10.0.0.1:7447", "rover", "policy.onnx", "tls", "../../state/hold", False,
+        "tls/10.0.0.1:7447", "rover", "policy.onnx", "tls/", "../../state/hold", False,
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "name"),
     [
-        *('policy = "other.onnx"', 'hold = "x"', "allow_unsigned = true", "no toml"),
-        'vehicle = "mock"\narmed_at_start = true',
-        'connect = "tls/10.0.0.1:7447"',  # without certificates
-        'vehicle = "carts:Cart"',  # in no wheel
-        '[vehicle]\ndriver = "hunter"\nhunter.bus = "can0"',
+        *(('policy = "other.onnx"', ""), ('hold = "x"', ""), ("allow_unsigned = true", "")),
+        *(("no toml", ""), ('connect = "tls/10.0.0.1:7447"', "")),  # without certificates
+        *(('connect = "tls/10.0.0.1:7447"', name) for name in ("edge-other", "simulator-hunter01")),
     ],
 )
-def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text):
+def test_settings_and_certificates_that_do_not_hold_are_refused(
+    workshop, party, tmp_path, text, name
+):
     config = tmp_path / "c.toml"
     config.write_text(text)
     with pytest.raises(UserError):
-        workshop.make(config=config)
-
-
-@pytest.mark.parametrize("name", ["edge-other", "simulator-hunter01", "ca"])
-def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path, name):
-    (tmp_path / "c.toml").write_text('connect = "tls/10.0.0.1:7447"\n')
-    with pytest.raises(UserError):
-        workshop.make(tls=party / name, config=tmp_path / "c.toml")
+        workshop.make(config=config, tls=party / name if name else None)
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        *("--wheels /dev/null/wheels", "--policy {unsigned}", "--public-key {other}"),
-        *("--key {public}", "--tls nowhere", "--with {unfit}"),
-    ],
+    "wrong", ["policy unsigned.onnx", "public-key 0.2.pub", "key keys/policy.pub", "with {unfit}"]
 )
-def test_a_mistake_is_one_line_and_nothing_is_written(workshop, tmp_path, capsys, wrong):
-    inputs, other, out = workshop.inputs(0.1), workshop.inputs(0.2), tmp_path / "out"
-    unfit = tmp_path / "host-1.0-cp38-cp38-manylinux_2_35_aarch64.whl"
-    shutil.copy(workshop.host, unfit)
-    unsigned = shutil.copy(inputs.policy, tmp_path / "unsigned.onnx")
-    names = {"unsigned": unsigned, "unfit": unfit}
-    names |= {"other": other.public_key, "public": workshop.public_key}
-    words = ["bundle", "--target", "jetpack5", "--policy", inputs.policy, "--key", inputs.key]
-    words += ["--public-key", inputs.public_key, "--out", out, *wrong.format(**names).split()]
-    assert exit_status(main, list(map(str, words))) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    assert not out.exists()
+def test_a_mistake_is_one_line_and_nothing_is_written(workshop, capsys, wrong, monkeypatch):
+    monkeypatch.chdir(workshop.folder)
+    shutil.copy(workshop.inputs(0.1).policy, "unsigned.onnx")
+    workshop.inputs(0.2)
+    unfit = shutil.copy(workshop.host, "host-1.0-cp38-cp38-manylinux_2_35_aarch64.whl")
+    words = "bundle --target jetpack5 --policy 0.1.onnx --key keys/policy.key --public-key 0.1.pub"
+    more = f"--out out --{wrong.format(unfit=unfit)}"
+    refusal(capsys, *words.split(), *more.split(), package="deploy")
+    assert not Path("out").exists()
 
 
-def test_a_bundle_that_is_not_finished_leaves_no_signature_and_no_key(
-    workshop, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(os, "replace", Mock(side_effect=KeyboardInterrupt("now")))
-    with pytest.raises(KeyboardInterrupt):
-        make_bundle(workshop.inputs(), HERE, tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-LOCKED = re.compile(r"(?m)^([\w.-]+)==([\w.]+) --hash=sha256:[0-9a-f]{64}$")
-
-
-@pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
-def test_every_target_is_locked_by_hash_and_the_twin_has_the_boards_versions(target):
-    lock = LOCKED.findall(lock_path(target).read_text())
-    names = {name for name, _ in lock}
-    assert {"numpy", "onnxruntime", "eclipse-zenoh", "msgspec", "cryptography", "tomli"} <= names
-    if target.name == "jetpack5":
-        assert lock == LOCKED.findall(lock_path(TARGETS["linux-x86_64"]).read_text())
-
-
-EMPTY = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-
-
+@pytest.mark.parametrize("content", [None, b"changed"])
 def test_a_full_folder_needs_no_network_and_another_hash_is_not_taken(
-    workshop, tmp_path, monkeypatch
+    workshop, tmp_path, monkeypatch, content
 ):
-    def without_network(*words: str) -> None:
-        if "--no-index" not in words:
-            raise UserError("no network")
-        pip(*words)
-
-    monkeypatch.setattr(bundle_module, "pip", without_network)
-    lock, wheel = tmp_path / "lock.txt", workshop.edge_wheel
-    for digest, holds in ((hashlib.sha256(wheel.read_bytes()).hexdigest(), True), (EMPTY, False)):
-        lock.write_text(f"# a lock\n\nphil-edge-runtime==0.1.0 --hash=sha256:{digest}\n")
-        with contextlib.nullcontext() if holds else pytest.raises(UserError, match="no network"):
-            found = gather(HERE, lock, wheel.parent, tmp_path / digest)
-    assert [path.name for path in found] == [wheel.name]
-
-
-def test_a_lock_is_written_anew_with_the_hash_of_what_comes(tmp_path, monkeypatch):
-    lock = tmp_path / "lock.txt"
-    lock.write_text(f"# a lock\na==2 --hash=sha256:{'0' * 64}\n")
+    lock, kept, place = (tmp_path / name for name in ("lock.txt", "here", "place"))
+    kept.mkdir()
+    shutil.copy(workshop.host, kept)
+    digest = hashlib.sha256(content or workshop.host.read_bytes()).hexdigest()
+    lock.write_text(f"# a lock\n\nhost==1.0 --hash=sha256:{digest}\n")
+    monkeypatch.setattr(bundle_module, "KEPT_WHEELS", tmp_path)
     monkeypatch.setattr(bundle_module, "lock_path", lambda target: lock)
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("PIP_RETRIES", "0")
+    with pytest.raises(UserError) if content else contextlib.nullcontext():
+        gather("here", str(place))
+    assert [path.name for path in place.glob("*")] == ([] if content else [workshop.host.name])
 
-    def pip_download(*words: str) -> None:
-        assert words[-1] == "a==2"
-        Path(words[words.index("--dest") + 1], "a-2-py3-none-any.whl").write_bytes(b"")
 
-    monkeypatch.setattr(bundle_module, "pip", pip_download)
-    assert main(["lock", "jetpack5"]) == 0
-    assert lock.read_text() == f"# a lock\na==2 --hash=sha256:{EMPTY}\n"
+PROGRAMS = {
+    "ssh": 'for last; do :; done; cd "$FAR" && exec sh -c "$last"',
+    "scp": """while [ "$1" != -- ]; do shift; done; shift; for last; do :; done
+        for path; do [ "$path" = "$last" ] || cp "$path" "$FAR/${last#*:}"; done""",
+    "sudo": f'shift 2; exec {sys.executable} "$@" --root "$FAR/opt"',
+}
+
+
+def test_a_push_installs_a_bundle_of_any_name(workshop, tmp_path, monkeypatch, capfd):
+    """The far computer's home is a folder here."""
+    (made, manifest), bundle = workshop.make(), tmp_path / "two words;id.tar"
+    home = tmp_path / "far"
+    for name, text in PROGRAMS.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("FAR", str(home))
+    Path(f"{bundle}.sig").write_bytes(Path(f"{made}.sig").read_bytes())
+    words = ["push", "phil@board", str(bundle), "--trust", str(workshop.public_key)]
+    bundle.write_bytes(made.read_bytes() + b"x")
+    assert exit_status(main, words) == 2  # The board would refuse it.
+    bundle.write_bytes(made.read_bytes())
+    capfd.readouterr()
+    assert main([*words, "--dry-run"]) == 0
+    printed = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == ["ssh", "scp", "ssh"]
+    assert main(words) != 0  # There is no such computer yet.
+    home.mkdir()
+    assert main(words) == 0
+    assert [path.name for path in home.iterdir()] == ["opt"]  # The bundle may hold a private key.
+    assert Releases(str(home / "opt")).linked("current") == manifest.version

@@ -316,15 +316,12 @@ def test_a_forged_token_of_another_vehicle_ends_no_edge(parties, tmp_path):
     assert "another" not in edge.errors
 
 
-def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path):
-    endpoint, found, out = free_endpoint("tls"), [], tmp_path / "r.json5"
-    listed = tmp_path / "fleet.txt"
-    listed.write_text(f"# the yard\n{VEHICLES[1]}  # at the gate\n")
-    words = ["--listen", endpoint, "--tls", str(parties / "router"), "--out", str(out)]
-    words += ["--vehicle-id", VEHICLES[0], "--vehicles", str(listed)]
-    assert deploy(["router", *words]) == 0
+def test_a_vehicle_at_a_router_hears_only_its_own(parties):
+    endpoint, found = free_endpoint("tls"), []
+    words = ["--listen", endpoint, "--tls", str(parties / "router")]
+    words += [f"--vehicle-id={each}" for each in VEHICLES]
     with (
-        Process("bridge", "router", "--config", str(out), ready="ready"),
+        Process("bridge", "router", *words, ready="ready"),
         contextlib.ExitStack() as opened,
     ):
         edge, *simulators = (

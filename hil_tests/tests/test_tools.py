@@ -49,7 +49,7 @@ VEHICLE = "hunter01"
 @pytest.mark.board
 @pytest.mark.timeout(600)
 def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path):
-    """The versions of the jetpack5 bundle as in a container, as `deploy/README.md` says."""
+    """The versions of the jetpack5 bundle on Python 3.8."""
     found = [*Path.home().glob(".pyenv/versions/3.8*/bin/python"), shutil.which("python3.8")]
     if os.geteuid() != 0 or found[0] is None:
         pytest.skip("it needs root and a Python 3.8, on PATH or of pyenv")
