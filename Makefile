@@ -57,12 +57,12 @@ format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## speed, the learner beside Stable-Baselines3: tables, and JSON in results/bench
+bench: $(STAMP)  ## speed of learner, environments and training, as JSON in results/bench
 	for threads in 1 2; do \
 		$(BIN)/python -m trainer bench --threads $$threads --out $(BENCH)/threads_$$threads.json || exit; \
 	done
 
-bench-quick: $(STAMP)  ## a look at the same: a table only
+bench-quick: $(STAMP)  ## a look at the same
 	$(BIN)/python -m trainer bench --quick --threads 1
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start

@@ -23,7 +23,6 @@ from typing import Any
 import gymnasium
 import msgspec
 import numpy as np
-from gymnasium.envs.registration import load_env_creator, namespace
 from gymnasium.spaces import Box, Dict
 from PIL import Image
 
@@ -44,7 +43,7 @@ CONDITIONS = {
     "variant": "more vehicles, and other types of them",
     "dense": "closer and less even traffic",
 }
-PLUGIN_GROUP, ROOT = "gymnasium.envs", "__root__"
+PLUGIN_GROUP = "gymnasium.envs.__root__"
 PLAIN = "observation"  # The entry's name where an environment observes one array
 RENDERED = "rgb_array"
 
@@ -57,33 +56,33 @@ def scenarios() -> dict[str, str]:
 def make_environment(name: str, condition: str = NOMINAL) -> Environment:
     """Make the environment of a scenario word, a gymnasium id or ``module:id``.
 
-    Another condition than the nominal one is passed as the keyword ``scene``. An environment that
-    can draw itself gets ``render_mode="rgb_array"``.
+    Another condition than the nominal one is passed as the keyword ``scene``, and
+    ``render_mode="rgb_array"`` to a constructor that takes it.
 
     Raises UserError for an unknown name, or a module that does not import.
     """
+    level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR
     try:
-        words = importlib.metadata.entry_points(group=SCENARIO_GROUP, name=name)
         # Loading a scenario's word imports the module that registers it.
+        words = importlib.metadata.entry_points(group=SCENARIO_GROUP, name=name)
         environment_id = next((str(each.load()) for each in words), name)
-        _load_plugin(environment_id)
-        options = {} if condition == NOMINAL else {"scene": condition}
-        modes = _metadata(environment_id).get("render_modes") or ()
-        drawn = {"render_mode": RENDERED} if RENDERED in modes else {}
+        _register(environment_id)
+        options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
         try:
-            return _OneLine(_make_quietly(environment_id, **options, **drawn))
-        except TypeError as error:
-            if "render_mode" not in str(error):  # Not every constructor takes it
-                raise
-            return _OneLine(_make_quietly(environment_id, **options))
+            made = gymnasium.make(environment_id, render_mode=RENDERED, **options)
+        except Exception:  # Not every constructor takes it
+            made = gymnasium.make(environment_id, **options)
+        return _OneLine(made)
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported
         what = f"{type(error).__name__}: {error}".splitlines()[0]
         hint = f"use {', '.join(sorted(scenarios()))}, a gymnasium id, or module:id"
         raise UserError(f"no environment {name!r}: {what} ({hint})") from error
+    finally:  # Gymnasium's advice to its author would stand before our one line.
+        gymnasium.logger.min_level = level
 
 
 class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Reports in one line what a foreign environment raises while it drives or draws."""
+    """Reports in one line what a foreign environment raises while it drives."""
 
     def reset(self, **options: Any) -> Any:
         return self._do(self.env.reset, **options)
@@ -91,14 +90,9 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         return self._do(self.env.step, np.array(action))  # It may write into its copy
 
-    def render(self) -> Any:
-        return self._do(self.env.render)
-
     def close(self) -> None:
-        try:
-            self._do(self.env.close)
-        except UserError as error:  # A fault here must not cost what was driven
-            print(error, file=sys.stderr)
+        with contextlib.suppress(Exception):  # A fault here must not cost what was driven
+            self.env.close()
 
     def _do(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         try:
@@ -112,55 +106,21 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UserError(f"environment {name_of(self)} failed in {what}") from error
 
 
-def _make_quietly(environment_id: str, **options: Any) -> Environment:
-    """Make it without Gymnasium's advice to its author, which would stand before our one line."""
-    level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR
-    try:
-        return gymnasium.make(environment_id, **options)
-    finally:
-        gymnasium.logger.min_level = level
+def _register(environment_id: str) -> None:
+    """Let installed packages register an id that is not known yet.
 
-
-def _metadata(environment_id: str) -> dict[str, Any]:
-    """Return the metadata of the environment's class, before one is made."""
-    module, _, plain_id = environment_id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    creator: Any = gymnasium.spec(plain_id).entry_point
-    creator = load_env_creator(creator) if isinstance(creator, str) else creator
-    found = getattr(creator, "metadata", None)
-    return found if isinstance(found, dict) else {}  # A wrapper's is a property of each object
-
-
-def _load_plugin(environment_id: str) -> None:
-    """Let an installed package register the id, as Gymnasium did by itself before 1.0.
-
-    Such a package declares an entry point of the group ``gymnasium.envs``: its name is the
-    namespace of its ids (ROOT: none), its value a function that registers them, or (highway-env) a
-    module. The id may also be that of a scenario.
+    It may be that of a scenario, or one of a package that registers its ids by an entry point for
+    Gymnasium, as highway-env does.
     """
     if ":" in environment_id or environment_id in gymnasium.registry:
         return
-    wanted = environment_id.rpartition("/")[0]
-    known = importlib.metadata.entry_points
-    for plugin in (
-        *known(group=PLUGIN_GROUP, name=wanted or ROOT),
-        *known(group=f"{PLUGIN_GROUP}.{wanted or ROOT}"),
-    ):
-        register = plugin.load()
-        with namespace(wanted) if wanted else contextlib.nullcontext():
-            if callable(register):
-                register()
-    failures = []
-    for scenario in known(group=SCENARIO_GROUP):
-        if environment_id in gymnasium.registry:
-            return
-        try:
+    for scenario in importlib.metadata.entry_points(group=SCENARIO_GROUP):
+        with contextlib.suppress(Exception):  # It may be of another package
             scenario.load()
-        except (Exception, SystemExit) as error:  # It may be of another package
-            failures.append(f"{scenario.value}: {type(error).__name__}: {error}")
-    if failures and environment_id not in gymnasium.registry:
-        raise UserError(f"nobody registers it; these scenarios fail: {', '.join(failures)}")
+    for plugin in importlib.metadata.entry_points(group=PLUGIN_GROUP):
+        register = plugin.load()
+        if callable(register):
+            register()
 
 
 def describe(
@@ -230,19 +190,17 @@ def _actions(environment: Environment, name: str) -> list[Action]:
         raise UserError(f"environment {name!r} acts in {space}; the wire carries a Box with bounds")
     low, high = space.low.ravel().tolist(), space.high.ravel().tolist()
     count = len(low)
-    said: dict[str, Any] = {
-        "action_names": offered(environment, "action_names")
-        or [f"action_{n}" for n in range(count)],
-        "action_meanings": offered(environment, "action_meanings") or [""] * count,
-        "action_units": offered(environment, "action_units") or [""] * count,
-        "brake_action": known_stops(environment) or [None] * count,
+    columns = {
+        "name": offered(environment, "action_names", [f"action_{n}" for n in range(count)]),
+        "meaning": offered(environment, "action_meanings", [""] * count),
+        "unit": offered(environment, "action_units", [""] * count),
+        "stop": known_stops(environment) or [None] * count,
     }
-    for key, values in said.items():
+    for key, values in columns.items():
         if len(values) != count:
-            raise UserError(f"environment {name!r}: {key} has {len(values)} entries, not {count}")
-    fields = ("name", "meaning", "unit", "stop", "low", "high")
-    rows = zip(*said.values(), low, high, strict=True)
-    return [Action(**dict(zip(fields, row, strict=True))) for row in rows]
+            raise UserError(f"environment {name!r}: {len(values)} of {key}, and {count} actions")
+    rows = zip(*columns.values(), low, high, strict=True)
+    return [Action(**dict(zip((*columns, "low", "high"), row, strict=True))) for row in rows]
 
 
 def known_stops(environment: Environment) -> list[float | None] | None:
@@ -295,7 +253,8 @@ def scene_of(environment: Environment) -> dict[str, Any] | None:
 
 def picture_of(environment: Environment) -> bytes:
     """Return a JPEG of what ``render()`` shows; empty for an environment that does not draw."""
-    if environment.render_mode != RENDERED:
+    modes = environment.metadata.get("render_modes") or ()
+    if environment.render_mode != RENDERED or RENDERED not in modes:
         return b""
     shown = io.BytesIO()
     Image.fromarray(np.asarray(environment.render())).save(shown, "JPEG")
@@ -349,10 +308,6 @@ class Adapter:
         press = offered(self.env, "press_brake")
         if callable(press):
             press(pressed)
-
-    def scene(self) -> dict[str, Any] | None:
-        """Return the scene from above in metres; None where the environment has none."""
-        return scene_of(self.env)
 
 
 def _fitting(observation: Mapping[str, Any], name: str, entry: Entry) -> np.ndarray:

@@ -22,8 +22,8 @@ from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_json
 from hil_tests.campaign import draw_axes
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
-from trainer.drivers import load_driver
 from trainer.environments import make_environment
+from trainer.evaluation import load_driver
 from trainer.person.tests.browser import (
     PERSON_DRIVES,
     POLICY_DRIVES,

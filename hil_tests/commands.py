@@ -5,8 +5,8 @@ import argparse
 from bridge.environments import NOMINAL
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
+from trainer.__main__ import add_scenario
 from trainer.environments import CONDITIONS
-from trainer.options import add_scenario
 
 
 @command(

@@ -18,11 +18,9 @@ from bridge.network import LatencySpec
 from bridge.outcomes import TIMEOUT, TRUNCATED, UNKNOWN
 from bridge.report import EpisodeResult
 from edge_runtime.util import UserError
-from trainer.drivers import load_driver, located
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes, trained_in
-from trainer.options import set_threads
-from trainer.util import cores, die_with_parent
+from trainer.evaluation import drive_episodes, load_driver, located, trained_in
+from trainer.util import cores, die_with_parent, set_threads
 
 
 class Drivers(ProcessPoolExecutor):

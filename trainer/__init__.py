@@ -19,14 +19,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Evaluation", "Export", "Run", "evaluate", "export", "train"]
 _PLACES = {
-    "trainer.training.command": ("Run", "train"),
-    "trainer.evaluation": ("Evaluation", "evaluate"),
-    "trainer.policy_file": ("Export", "export"),
+    **dict.fromkeys(("Run", "train"), "trainer.training.command"),
+    **dict.fromkeys(("Evaluation", "evaluate"), "trainer.evaluation"),
+    **dict.fromkeys(("Export", "export"), "trainer.policy_file"),
 }
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _PLACES.items():
-        if name in names:
-            return getattr(import_module(module), name)
+    if name in _PLACES:
+        return getattr(import_module(_PLACES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

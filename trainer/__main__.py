@@ -1,21 +1,315 @@
-"""``python -m trainer``: train, evaluate, export, and all else that a learner needs."""
+"""``python -m trainer``: its commands, their options, and where what runs them is.
 
+That loads torch, matplotlib or rerun, which take seconds; ``--help`` need not wait for them.
+"""
+
+import argparse
+import ast
+import inspect
+import re
 import sys
+import textwrap
+from itertools import pairwise
+from typing import Any
 
-from edge_runtime.cli import program, run_cli
+from bridge.environments import scenarios
+from bridge.fork import add_place
+from bridge.network import GRAMMAR
+from edge_runtime import cli
+from edge_runtime.cli import add_public_key, command, program, run_cli
+from trainer.environments import CONDITIONS
+from trainer.experiments import plan
+from trainer.human import FIELDS, HumanModelConfig
+from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.person import HUMANS, add_person
+from trainer.training.config import (
+    CURVE_FILE,
+    DEFAULTS,
+    EXTENT,
+    MOST_THREADS,
+    PRESETS,
+    SETTINGS,
+    TYPED,
+    RunConfig,
+)
+from trainer.util import DEVICES, PERIOD_S, kept
+
+Group = argparse.ArgumentParser | argparse._ArgumentGroup
+
+
+@command(
+    "trainer.training.command:run",
+    "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
+    "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
+    "python -m trainer train --human web --rerun mine.rrd --out runs/mine",
+    "python -m trainer train --set    # lists the settings",
+)
+def train(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_argument_group("what to train")
+    add = what.add_argument
+    add_scenario(what)
+    rows = f"learning algorithm: {', '.join(ALGORITHMS)}; of an installed package; or module:ROW"
+    add("--algorithm", default=DEFAULTS.algorithm, metavar="NAME", help=rows)
+    add_seed(what)
+    add_fields(what, DEFAULTS, *EXTENT)
+    start = "settings to start from: this project's, or those printed in the paper"
+    add("--preset", choices=list(PRESETS), default="ours", help=start)
+    file = "read options and settings from this file, such as the config.toml of a run; options "
+    file += "on the command line win; --preset and --algorithm may not change a setting in it"
+    add("--config", metavar="F.toml", help=file)
+    change = "change a setting; may be repeated; --set alone lists all settings with their "
+    change += "defaults and meanings"
+    add("--set", action=_Set, nargs="?", default=[], metavar="NAME=VALUE", help=change)
+    add(
+        "--period", action=_Set, dest="set", default=[], metavar="SECONDS",
+        type=lambda text: f"period_s={cli.positive_number(text)}",
+        help="control period, the seconds of a step (default: the environment's own, else from"
+        f" its render_fps, else {PERIOD_S})",
+    )  # fmt: skip
+    add_latency(what, "simulated network between policy and vehicle, also in validation")
+    guide = parser.add_argument_group("who guides")
+    whose = f"expert|module:Class|HUMAN_DIR|{'|'.join(HUMANS)}"
+    known = "who takes over from the policy: the environment's scripted expert, module:Class of "
+    known += "another expert, a model trained by `trainer human`, or you, in the browser"
+    guide.add_argument("--human", default=DEFAULTS.human, metavar=whose, help=known)
+    add_person(parser)
+    how = parser.add_argument_group("the run")
+    how.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
+    on = "go on from the last checkpoint in RUN_DIR, with the options that the run had"
+    how.add_argument("--resume", action="store_true", help=on)
+    add_time_limit(how, "stop at the end of the episode in which this time is over")
+    add_device(how)
+    add_threads(how)
+    shown = "show the training in the rerun viewer: spawn opens a window, serve a page on this "
+    shown += "machine, F.rrd is a file to write"
+    how.add_argument("--rerun", metavar="spawn|serve|F.rrd", help=shown)
+    for action in parser._actions:
+        if action.dest in TYPED:  # Only what is typed wins over a config file.
+            action.help = f"{action.help} (default: {action.default})"
+            action.default = argparse.SUPPRESS
+
+
+class _Set(argparse.Action):
+    """Collects ``--set NAME=VALUE``; ``--set`` alone lists the settings."""
+
+    def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
+        if value is None:
+            said = meanings(RunConfig) | meanings(LearnerConfig)
+            for name, default in SETTINGS.items():
+                print(f"{f'{name}={default}':<35} {said.get(name, '')}")
+            parser.exit()
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+@command(
+    "trainer.person.session:run",
+    "python -m trainer drive --out runs/drives",
+    "python -m trainer drive --from drive.mcap --at 3s --out runs/drives",
+)
+def drive(parser: argparse.ArgumentParser) -> None:
+    add_scenario(parser, "what was recorded")
+    add = parser.add_argument
+    device = "how you drive: in the browser, with keyboard, touch, gamepad or wheel"
+    add("--human", "--device", dest="human", choices=HUMANS, default=HUMANS[0], help=device)
+    driver = "policy that drives until you take over, as in `trainer evaluate` (default: none)"
+    add("--policy", metavar="POLICY", help=driver)
+    add_public_key(parser)
+    forked = "repeat this recorded drive until --at in each episode, and drive on from there"
+    add("--from", dest="recording", metavar="F.mcap", type="path", help=forked)
+    add_place(parser)
+    out = "directory of the recordings; each sitting adds one"
+    add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
+    number = "number of episodes (default: no end)"
+    add("--episodes", type=cli.positive, metavar="N", help=number)
+    add_seed(parser, " of the episodes, which are others in every sitting")
+    add_person(parser)
+    add_threads(parser)
+
+
+@command(
+    "trainer.human.model:run",
+    "python -m trainer human --scenario left_turn --out runs/human",
+    "python -m trainer human --from runs/drives --out runs/me",
+)
+def human(parser: argparse.ArgumentParser) -> None:
+    add_scenario(parser)
+    add = parser.add_argument
+    add("--out", required=True, metavar="HUMAN_DIR", type="path", help="directory of the model")
+    add_seed(parser)
+    add_fields(parser, HumanModelConfig(), *FIELDS)
+    person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
+    person += "their directories, or such a training run (default: imitate the scripted expert)"
+    add("--from", dest="recordings", nargs="+", metavar="RECORDING", type="path", help=person)
+    last = "begin no episode after this time; the refining steps are reduced in proportion"
+    add_time_limit(parser, last)
+    add_threads(parser)
+
+
+@command(
+    "trainer.evaluation:run",
+    "python -m trainer evaluate runs/phil_1 --runs 50 --out result.json",
+    "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
+)
+def evaluate(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    policy = "an .onnx file, a RUN_DIR, a HUMAN_DIR, expert, module:Class of another expert, or "
+    policy += "constant:ACTION, one action from -1 to 1 throughout"
+    add("policy", metavar="POLICY", help=policy)
+    add_public_key(parser)
+    add_scenario(parser, "what the policy was trained in")
+    scenes = "; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items())
+    scenes = scenes.replace("%", "%%")
+    add("--condition", choices=CONDITIONS, default="nominal", help=scenes)
+    add_latency(parser, "simulated network between policy and vehicle")
+    count = "number of episodes"
+    add("--runs", type=cli.positive, default=50, metavar="N", help=count)
+    add_seed(parser, " of the first episode; each next episode has one more")
+    out = "write the report and the results of each episode to this file; do not print it"
+    add("--out", metavar="R.json", type="path", help=out)
+
+
+@command(
+    "trainer.policy_file:run",
+    "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key",
+)
+def export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="directory of a training run")
+    add_scenario(parser, "what the run was trained in")
+    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
+    parser.add_argument("--key", metavar="KEY", help="private key (PEM) that signs the policy")
+
+
+@command(
+    "trainer.bench:run",
+    "python -m trainer bench --threads 2 --out b.json",
+)
+def bench(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
+    parser.add_argument("--quick", action="store_true", help="take few rounds: a look only")
+    add_threads(parser)
+
+
+@command(
+    "trainer.experiments.command:run",
+    "python -m trainer experiment status",
+    "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
+    "python -m trainer experiment guidance --max-minutes 60",
+)
+def experiment(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("what is computed").add_argument
+    words = (
+        f"compute the missing runs of {', '.join(plan.EXPERIMENTS)} or all (the paper's), or of "
+        "the guidance table, and write the page; status (of guidance): count the finished runs; "
+        "report: write the paper's page from the runs that there are; typical: write the curves "
+        "that the coach of the cockpit shows"
+    )
+    known = [*plan.EXPERIMENTS, *plan.WORDS, *plan.STUDIES]
+    add("names", nargs="+", metavar="NAME", choices=known, help=words)
+    seeds = "trainings of each algorithm in each setting"
+    add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
+    one = f"compute this task only (default: all; {', '.join(plan.FOREIGN)}: of guidance)"
+    add("--scenario", choices=[*plan.SCENARIOS, *plan.FOREIGN], help=one)
+    quick = "train for a few steps, in RUNS/quick: a trial whose numbers mean nothing"
+    add("--quick", action="store_true", help=quick)
+    how = parser.add_argument_group("how it is computed")
+    jobs = "processes of one thread each; 0: one for each core"
+    how.add_argument("--jobs", type=cli.not_negative, default=0, metavar="N", help=jobs)
+    ray = "compute on a Ray cluster instead of this machine: HOST:PORT, auto or local"
+    how.add_argument("--ray", metavar="ADDRESS", help=ray)
+    add_device(how)
+    last = "stop every run after its next episode once this time is over; the same command resumes"
+    add_time_limit(how, last)
+    where = parser.add_argument_group("where it is kept")
+    results = "tables, figures and page (default: results/paper, or results/guidance; typical: the "
+    results += "directory of both, results)"
+    where.add_argument("--results", metavar="DIR", help=results)
+    runs = "checkpoints and actors (default: runs/paper, or runs/guidance)"
+    where.add_argument("--runs", metavar="DIR", help=runs)
+    models, place = "holds a human model: DIR/left_turn, DIR/congestion", "results/humans/paper"
+    where.add_argument("--humans", default=kept(place), metavar="DIR", help=models)
+
+
+@command(
+    "trainer.training.metrics:run",
+    "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
+)
+def plot(parser: argparse.ArgumentParser) -> None:
+    runs = "directory of a training run; several are drawn thinly, and their mean"
+    parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
+    out = f"the picture (default: RUN_DIR/{CURVE_FILE})"
+    parser.add_argument("--out", metavar="F.png", help=out)
+
+
+def add_scenario(parser: Group, known: str = "") -> None:
+    """Add ``--scenario``; ``known`` says in words where it comes from if not given."""
+    what = f"environment: {', '.join(scenarios())}, a gymnasium id, or module:id"
+    what += f" (default: {known}, else left_turn)" if known else ""
+    default = None if known else "left_turn"
+    parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
+
+
+def add_seed(parser: Group, what: str = "") -> None:
+    said = f"random seed{what}"
+    parser.add_argument("--seed", type=cli.not_negative, default=0, metavar="N", help=said)
+
+
+def add_threads(parser: Group) -> None:
+    said = "processor threads for PyTorch; 0: its own default"
+    kind = cli.whole_number(0, MOST_THREADS)
+    parser.add_argument("--threads", type=kind, default=0, metavar="N", help=said)
+
+
+def add_latency(parser: Group, what: str) -> None:
+    said = f"{what}: {GRAMMAR}".replace("%", "%%")
+    parser.add_argument("--latency", metavar="SPEC", default="none", help=said)
+
+
+def add_time_limit(parser: Group, what: str) -> None:
+    text = f"{what} (default: no limit)"
+    parser.add_argument("--max-minutes", type=cli.positive_number, metavar="MIN", help=text)
+
+
+def add_fields(parser: Group, config: Any, *names: str) -> None:
+    """Add an option for each named field of a config, which itself checks the ranges."""
+    said = meanings(type(config))
+    for name in names:
+        option, default = f"--{name.replace('_', '-')}", getattr(config, name)
+        how: dict[str, Any] = {"type": cli.not_negative, "default": default, "metavar": "N"}
+        if isinstance(default, bool):
+            how = {"action": "store_true"}
+        parser.add_argument(option, help=said[name].removeprefix("whether "), **how)
+
+
+def meanings(config: type) -> dict[str, str]:
+    """Return the first sentence of each field's docstring, by the field's name."""
+    (made,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    assert isinstance(made, ast.ClassDef)
+    found = {}
+    for field, text in pairwise(made.body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            assert isinstance(field.target, ast.Name)
+            docstring = " ".join(ast.literal_eval(text.value).replace("``", "").split())
+            sentence = re.split(r"\. (?=[A-Z(])|\.$", docstring)[0]
+            is_word = sentence[1:2].islower() or sentence[1:2] == " "
+            found[field.target.id] = sentence[0].lower() + sentence[1:] if is_word else sentence
+    return found
+
+
+def add_device(parser: Group) -> None:
+    said = "device of the neural networks"
+    parser.add_argument("--device", choices=DEVICES, default=DEVICES[0], help=said)
+
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("trainer.commands:train", "train a policy with human guidance"),
-    "drive": ("trainer.commands:drive", "drive yourself, or take over from a policy; recorded"),
-    "human": ("trainer.commands:human", "train the human model from interventions (DAgger)"),
-    "evaluate": ("trainer.commands:evaluate", "drive test episodes and report how well it does"),
-    "export": ("trainer.commands:export", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.commands:plot", "draw the learning curve of a run"),
-    "view": ("trainer.commands:view", "show recorded sittings in rerun"),
-    "bench": ("trainer.commands:bench", "measure learner, environments and training beside peers"),
-    "experiment": ("trainer.commands:experiment", "run the paper's experiments or another table"),
+    "train": ("trainer.__main__:train", "train a policy with human guidance"),
+    "drive": ("trainer.__main__:drive", "drive yourself, or take over from a policy; recorded"),
+    "human": ("trainer.__main__:human", "train the human model from interventions (DAgger)"),
+    "evaluate": ("trainer.__main__:evaluate", "drive test episodes and report how well it does"),
+    "export": ("trainer.__main__:export", "write a run's actor as the file that a board drives"),
+    "plot": ("trainer.__main__:plot", "draw the learning curve of a run"),
+    "bench": ("trainer.__main__:bench", "measure learner, environments and training"),
+    "experiment": ("trainer.__main__:experiment", "run the paper's experiments or another table"),
 }
-
 
 main = program(
     "python -m trainer",

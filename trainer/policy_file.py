@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from bridge.policy_file import make_policy, write_policy
 from edge_runtime.files import check_writable
 from edge_runtime.policy import open_network, policy_id_of
-from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError, name_in_file, read_json
-from trainer.drivers import load_actor
 from trainer.environments import entries_of, make_environment, task_of
+from trainer.evaluation import load_actor
 from trainer.learner.networks import Actor
 from trainer.training.config import CONFIG_FILE, period_of
 
@@ -39,6 +38,15 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{arguments.out}: {signed}, policy_id {made.policy_id}")
     print(f"torch and onnxruntime differ by at most {made.max_difference:.1e}")
     return 0
+
+
+@dataclass(frozen=True)
+class Export:
+    """A policy file's bytes, and the largest difference of onnxruntime from torch."""
+
+    model: bytes
+    policy_id: str
+    max_difference: float
 
 
 def export(
@@ -58,55 +66,38 @@ def export(
     scenario = scenario or getattr(run, "scenario", None)
     # Absolute: a simulator may change the working directory.
     file, run = Path(out).absolute(), Path(run).absolute()
-    key_file = None if key is None else Path(key).absolute()
+    key = None if key is None else Path(key).absolute()
     if file.suffix != ".onnx":
         raise UserError(f"--out {file}: a policy file's name ends in .onnx")
     check_writable(file)
-    if key_file:
-        read_signing_key(key_file)
     config = read_json(run / CONFIG_FILE, "run config")
     named = str(config.get("scenario"))
     scenario = scenario or name_in_file(named, f"{run} was trained in", "--scenario")
     with closing(make_environment(scenario, period_s=period_of(config))) as env:
         actor, label = load_actor(run, env)
         made = export_policy(actor, label, config, env)
-    write_policy(made.model, file, key_file)
+    write_policy(made.model, file, key)
     return made
 
 
-@dataclass(frozen=True)
-class Export:
-    """A policy file's bytes, and the largest difference of onnxruntime from torch."""
-
-    model: bytes
-    policy_id: str
-    max_difference: float
-
-
 def export_policy(
-    actor: Actor, label: dict[str, Any], training: dict[str, Any], env: Any = None
+    actor: Actor, label: dict[str, Any], training: dict[str, Any], env: Any
 ) -> Export:
     """Convert an actor, describe it in a manifest, and compare torch with onnxruntime.
 
-    ``label`` has ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run; the manifest
-    holds its whole config (``training``). ``env`` is that scenario, by default a new one.
-
-    Raises UserError: the two differ.
+    ``label`` has ``algorithm``, ``seed`` and ``episode`` of the run; the manifest holds its whole
+    config (``training``). Raises UserError: the two differ.
     """
-    env = env or make_environment(label["scenario"], period_s=period_of(training))
     network = _InOwnUnits(actor, env.action_range).eval()
-    observations = real_observations(env, PARITY_OBSERVATIONS)
-    task = task_of(env)
+    observations, task = real_observations(env, PARITY_OBSERVATIONS), task_of(env)
     entries = entries_of(observations, next(iter(task.observation)))
-    revision = training.get("source_revision", "unknown")
     about = {"seed": label["seed"], "episodes": label["episode"], "config": training}
-    about |= {"source_revision": revision}
+    about["source_revision"] = training.get("source_revision", "unknown")
     model = make_policy(_to_onnx(network, entries), task, label["algorithm"], about)
     difference = parity(network, model, entries)
     allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
     if not difference < allowed:
-        differ = f"{difference:.1e} (allowed: {allowed:.1e})"
-        raise UserError(f"onnxruntime and torch differ by {differ}")
+        raise UserError(f"onnxruntime and torch differ by {difference:.1e}, over {allowed:.1e}")
     return Export(model, policy_id_of(model), difference)
 
 
@@ -127,13 +118,11 @@ class _InOwnUnits(torch.nn.Module):
         return self.low + (action + 1.0) * self.reach if self.scaled else action
 
 
-def real_observations(driven: Any, count: int, seed: int = 0) -> NDArray[Any]:
-    """Collect observations [count, ...] by driving an environment, or a scenario, at random."""
-    env = make_environment(driven) if isinstance(driven, str) else driven
-    random = np.random.default_rng(seed)
-    size = env.action_space.shape
-    observation, _ = env.reset(seed=seed)
+def real_observations(env: Any, count: int) -> NDArray[Any]:
+    """Collect observations [count, ...] by driving at random."""
+    random, size = np.random.default_rng(0), env.action_space.shape
     seen: list[NDArray[Any]] = []
+    observation, _ = env.reset(seed=0)
     action = np.zeros(size, np.float32)
     while len(seen) < count:
         seen.append(observation)
@@ -141,7 +130,7 @@ def real_observations(driven: Any, count: int, seed: int = 0) -> NDArray[Any]:
         action = np.clip(action + random.normal(0.0, 0.3, size), -1, 1).astype(np.float32)
         observation, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
-            observation, _ = env.reset(seed=seed + len(seen))
+            observation, _ = env.reset(seed=len(seen))
     return np.stack(seen)
 
 

@@ -11,10 +11,9 @@ import os
 import platform
 import signal
 import subprocess
-import sys
 import time
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from enum import IntEnum
@@ -28,6 +27,7 @@ from edge_runtime.files import check_writable, make_directory, try_to_lock_file,
 from edge_runtime.util import UserError, open_regular
 
 PERIOD_S = 0.1  # Of an environment that does not say how long a step is
+DEVICES = ("cpu", "cuda")
 CPU_INFO = Path("/proc/cpuinfo")
 WRITTEN = ("results/paper", "results/guidance")
 """The experiments' own output. Human models, which decide trainings, count as source."""
@@ -151,10 +151,8 @@ def held(directory: Path, patience_s: float = 0.0) -> Iterator[bool]:
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use, where the system tells; else all."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @contextmanager
@@ -214,3 +212,39 @@ def processor_model() -> str:
         if line.startswith("model name") and (name := line.partition(":")[2].strip()):
             return name
     return platform.processor() or platform.machine()
+
+
+def deadline_s(minutes: float | None, clock: Callable[[], float] = time.monotonic) -> float:
+    """Return when the minutes are over, by ``clock``; infinity without a limit."""
+    return math.inf if minutes is None else clock() + 60.0 * minutes
+
+
+def check_device(device: str) -> None:
+    """Raise UserError unless the learner can compute there."""
+    import torch
+
+    if device not in DEVICES:
+        raise UserError(f"device must be one of {', '.join(DEVICES)}: {device}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("no CUDA device is available; use --device cpu")
+
+
+def set_threads(count: int) -> None:
+    """Limit PyTorch's threads; 0 leaves them alone."""
+    if count:
+        import torch
+
+        torch.set_num_threads(count)
+
+
+@contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """Limit PyTorch's threads within a block."""
+    import torch
+
+    before = torch.get_num_threads()
+    set_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

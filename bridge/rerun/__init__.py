@@ -1,7 +1,7 @@
-"""What all rerun views share: their colours, ``bridge view``'s options, and where a view goes.
+"""Colours of all views, options of ``bridge view``, and where a view goes: window, page or file.
 
-It goes to a window, a local web page, or a file. Window and page are rerun's viewer as a process of
-its own, on loopback: by itself it would bind all interfaces.
+Window and page are rerun's viewer as a process of its own, on loopback: by itself it would bind all
+interfaces.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import argparse
 import colorsys
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -25,7 +24,7 @@ from urllib.parse import quote
 
 from edge_runtime.cli import command, sigterm_as_interrupt, whole_number
 from edge_runtime.files import check_writable, make_directory
-from edge_runtime.reach import check_port_is_free, free_endpoint
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
@@ -54,7 +53,7 @@ SPREAD = 150 / 360
 
 
 def shades(colour: Colour, count: int) -> list[Colour]:
-    """Return ``count`` colours whose hues go on from ``colour``, the first of them."""
+    """Return ``count`` colours whose hues go on from ``colour``, which is the first."""
     hue, light, saturation = colorsys.rgb_to_hls(*(part / 255 for part in colour))
     hues = (hue + SPREAD * number / count for number in range(count))
     turned = [colorsys.hls_to_rgb(each % 1.0, light, saturation) for each in hues]
@@ -64,24 +63,19 @@ def shades(colour: Colour, count: int) -> list[Colour]:
 LOOPBACK = "127.0.0.1"
 START_S = 30.0  # Until a viewer listens, at most
 LOOK_S = 0.05
-LEAST_FREE_BYTES = 1 << 20
 WRITE_S = 60.0  # Until a disk has taken what was drawn, at most
 FLUSH_S = 5.0  # Until a viewer has taken what was drawn, at most
 END_S = 1.0  # Until a viewer that takes no more has ended, at most
-GRPC_PORT, WEB_PORT, FOXGLOVE_PORT = 9876, 9090, 8765  # Foxglove looks at its port first
+FOXGLOVE_PORT = 8765  # Foxglove looks at this port first
 SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
 
 class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
     """The viewer has ended, hangs, or never came."""
 
-    def __init__(self, why: str) -> None:
-        super().__init__(f"viewer gone: {why}")
-        self.why = why
-
 
 @command(
-    "bridge.rerun.wire_view:run",
+    "bridge.rerun.draw:run",
     "python -m bridge view --serve",
     "python -m bridge view --save drive.rrd --wait-s 60",
     "python -m bridge view drive.mcap --save drive.rrd",
@@ -92,34 +86,25 @@ def view(parser: argparse.ArgumentParser) -> None:
 
     text = "show this recording of bridge record, instead of listening"
     parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
-    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
-    port: dict[str, Any] = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
-    add_sink(parser).add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **port)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    add_options(parser, "--vehicle-id", default=None, help=text)
-
-
-def add_sink(parser: argparse.ArgumentParser) -> Any:
-    """Add ``--spawn``, ``--serve`` and ``--save F.rrd``, kept as ``sink``; return their group.
-
-    ``--port`` of the page stands beside it.
-    """
     where = parser.add_mutually_exclusive_group()
     page, window = "serve a web page on this machine's loopback only", "open a rerun window"
     for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
         where.add_argument(f"--{kind}", dest="sink", action="store_const", const=kind, help=text)
     text = "write a recording instead of showing it"
     where.add_argument("--save", dest="sink", metavar=f"F{SUFFIX}", help=text)
-    text = "of --serve: the page's port, and N + 1 for its data"
-    text += f" (default: {WEB_PORT} and {GRPC_PORT}, or two that are free)"
+    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
+    number: Any = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
+    where.add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **number)
+    text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-    return where
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def has_display() -> bool:
-    """Whether a window can be opened here; on Linux the environment says so."""
-    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    """Return whether a window can be opened here."""
+    return any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def check_sink(sink: str | None, port: int | None = None) -> str:
@@ -130,13 +115,14 @@ def check_sink(sink: str | None, port: int | None = None) -> str:
     sink = sink or SPAWN
     if port is not None and sink != SERVE:
         raise UserError(f"--port is that of a page: --{SERVE}")
-    if sink == SERVE:
-        _page_ports(port)
-    elif sink.endswith(SUFFIX):
+    for each in () if port is None else (port, port + 1):
+        if _answers(each):
+            raise UserError(f"port {each} is in use; name another --port")
+    if sink.endswith(SUFFIX):
         return str(check_writable(sink))
-    elif sink != SPAWN:
+    if sink not in (SPAWN, SERVE):
         raise UserError(f"{sink!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
-    elif not has_display():
+    if sink == SPAWN and not has_display():
         raise UserError("no display for a window here: serve a page, or save a file")
     return sink
 
@@ -148,9 +134,7 @@ def open_sink(
     """Open a recording that goes to a window (``spawn``), a page (``serve``) or a file.
 
     ``application`` keeps layouts of different kinds apart. A window stays open afterwards; a page
-    is served until then, at ``port`` if it is given. SIGTERM raises KeyboardInterrupt meanwhile,
-    unless the command has another use for it: the file is to be finished, the server to be ended.
-    Raise ViewerGone where the viewer ends, hangs, or never comes.
+    is served until then, at ``port`` if it is given. ViewerGone where the viewer ends or hangs.
     """
     import rerun as rr
 
@@ -175,47 +159,41 @@ def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -
     make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        # rerun's writer waits for ever for a disk that was full when it began.
-        if shutil.disk_usage(target.parent).free < LEAST_FREE_BYTES:
-            raise UserError(f"cannot write {path}: no space left on the device")
         recording.save(temporary, default_blueprint=blueprint)
+        yield
         try:
-            yield
-        finally:
-            try:
-                recording.flush(timeout_sec=WRITE_S)
-            except RuntimeError as error:
-                raise UserError(f"cannot write {path}: {error}") from None
-            recording.disconnect()  # Writes the footer.
-            if not (target.exists() and sys.exc_info()[1]):  # No part takes a whole one's place.
-                os.replace(temporary, target)
+            recording.flush(timeout_sec=WRITE_S)
+        except RuntimeError as error:
+            raise UserError(f"cannot write {path}: {error}") from None
+        recording.disconnect()  # Writes the footer.
+        os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def _shown(
-    recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint, page_port: int | None
+    recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint, port: int | None
 ) -> Iterator[None]:
     """Draw for a window or a page; ViewerGone where it does not last."""
-    ports = _page_ports(page_port) if kind == SERVE else (free_port(),)
-    data = str(ports[-1])
-    page = ["--serve-web", "--web-viewer-port", str(ports[0])]
-    options = page if kind == SERVE else ["--expect-data-soon"]
-    viewer = Viewer([*options, "--port", data], ports)
+    page, data = (port, port + 1) if port else (free_port(), free_port())
+    serving = ["--serve-web", "--web-viewer-port", str(page)]
+    options = serving if kind == SERVE else ["--expect-data-soon"]
+    ports = [page, data] if kind == SERVE else [data]
+    viewer = Viewer([*options, "--port", str(data)], ports)
     try:
         url = f"rerun+http://{LOOPBACK}:{data}/proxy"
         recording.connect_grpc(url, default_blueprint=blueprint)
         if kind == SERVE:
-            print(f"open http://{LOOPBACK}:{ports[0]}/?url={quote(url, safe='')}", flush=True)
+            print(f"open http://{LOOPBACK}:{page}/?url={quote(url, safe='')}", flush=True)
         try:
             yield
         finally:
             flush(recording)
     except ViewerGone as gone:
-        why = viewer.last_words(END_S) or gone.why
+        why = viewer.last_words(END_S)
         viewer.end()  # Where it hangs, rerun would wait for it for ever.
-        raise ViewerGone(why) from None
+        raise ViewerGone(why or str(gone)) from None
     finally:
         recording.disconnect()
         if kind == SERVE:
@@ -235,10 +213,9 @@ class Viewer:
         end_s = time.monotonic() + START_S
         try:
             while not all(map(_answers, ports)):
-                words = self.last_words()
+                words = self.last_words(LOOK_S)
                 if words or time.monotonic() > end_s:
                     raise ViewerGone(words or f"it does not listen after {START_S:.0f} s")
-                time.sleep(LOOK_S)
         except BaseException:
             self.end()
             raise
@@ -249,33 +226,19 @@ class Viewer:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
-    def last_words(self, wait_s: float = 0.0) -> str:
+    def last_words(self, wait_s: float) -> str:
         """Return why it has ended; an empty text if it is still running after ``wait_s``."""
         try:
             self._process.wait(wait_s)
         except subprocess.TimeoutExpired:
             return ""
         self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").split("\n")
-        words = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
-        return words[-1] if words else "it was closed"
-
-
-def _page_ports(port: int | None) -> tuple[int, int]:
-    """The ports of a page and of its data; UserError where those that were asked for are taken."""
-    ports = (WEB_PORT, GRPC_PORT) if port is None else (port, port + 1)
-    for each in ports:
-        try:
-            check_port_is_free(f"tcp/{LOOPBACK}:{each}")
-        except UserError:
-            if port is not None:
-                raise UserError(f"port {each} is in use; name another --port") from None
-            return free_port(), free_port()  # Another view has the usual ones.
-    return ports
+        _, error, last = self._said.read().decode(errors="replace").rpartition("Error: ")
+        return last.strip() if error else "it was closed"
 
 
 def free_port() -> int:
-    """A port that is not in use, and not returned to this process again soon."""
+    """Return a port that is not in use."""
     return int(free_endpoint().rpartition(":")[2])
 
 

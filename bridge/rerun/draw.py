@@ -1,29 +1,69 @@
-"""What the views of a drive (``wire_view``) and of a training (``trainer.view``) share.
+"""The adapter from a drive to rerun, and ``python -m bridge view``, which shows the wire by it.
 
 A `Canvas` draws lines, states, pictures and the road from above; the functions after it lay views
-out. Metres; y grows downwards, as in the scene. Cars are lines: rerun cannot turn its flat boxes.
+out, also those of a training (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
+are lines: rerun cannot turn its flat boxes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.messages import Point, SeenCar, SeenScene
-from bridge.rerun import APPLIED, GLASS, GOAL, GROUND, MARKING, PATH, ROAD, Colour, shades
+from bridge.inbound import BRAKE_PERIODS
+from bridge.messages import (
+    DECODERS,
+    Heard,
+    Pace,
+    Point,
+    Scene,
+    SeenCar,
+    SeenScene,
+    decode,
+    images_of,
+    is_picture,
+)
+from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.rerun import (
+    APPLIED,
+    GLASS,
+    GOAL,
+    GROUND,
+    LOOPBACK,
+    MARKING,
+    PATH,
+    POLICY,
+    ROAD,
+    SERVE,
+    SUFFIX,
+    Colour,
+    check_sink,
+    open_sink,
+    shades,
+)
+from edge_runtime import wire
+from edge_runtime.cli import sigterm_as_interrupt
+from edge_runtime.link import link_words
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.util import UserError, counted
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
-MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
+MARGIN_M = 8.0  # Ground shown beyond the path
 CAMERA = "camera"  # From here the road is seen
-NEAR_M = 20.0  # Cars farther from the path than this do not widen the view
+MOST_LINES = 16  # Numbers of an observation that a plot can show
 PICTURE_INTERVAL_S = 0.1
 """Ten pictures a second, as many as a control period of ours makes, are plenty for an eye."""
-Bounds = tuple[tuple[float, float], tuple[float, float]]  # Ranges of x and y, m
 WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
 """The whole time axis; without it rerun scrolls the axis with the cursor."""
 
@@ -31,21 +71,26 @@ WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeB
 class Canvas:
     """Draws on a recording at the time that ``stand_at`` has set; used by one thread.
 
-    ``lines``: path of each line that is there from the start -> its colour.
+    ``states``: path of each state -> the colours of its values. ``layout`` lays out the views; its
+    scene fixes the ground shown, if there is one.
     """
 
-    def __init__(self, recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
-        self.recording, self.log = recording, recording.log
-        self._colours, self._names = lines, {path: [_name(path)] for path in lines}
-        self._ground: object = None
-        for path, colour in lines.items():
-            self.style(path, [colour], self._names[path])
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        layout: Callable[[SeenScene | None], rrb.Blueprint],
+        states: Mapping[str, Mapping[str, Colour]],
+    ) -> None:
+        self.recording, self.log, self._layout = recording, recording.log, layout
+        self._states, self._ground = dict.fromkeys(states, ""), object()
+        for path, of in states.items():
+            names, colours = list(of), list(of.values())
+            shown = rr.StateConfiguration(values=names, labels=names, colors=colours)
+            self.log(path, shown, static=True)
 
-    def stand_at(self, steps: Mapping[str, int], seconds: Mapping[str, float] = {}) -> None:
-        """Set the time, by timeline, of all that is drawn next."""
-        self.recording.reset_time()
-        for timeline, step in steps.items():
-            self.recording.set_time(timeline, sequence=step)
+    def stand_at(self, step: int, **seconds: float) -> None:
+        """Set the time of all that is drawn next: the step, and seconds by timeline."""
+        self.recording.set_time("step", sequence=step)
         for timeline, time_s in seconds.items():
             self.recording.set_time(timeline, duration=time_s)
 
@@ -53,36 +98,53 @@ class Canvas:
         """Draw the newest value of a line, or of each of several lines at one path."""
         self.log(path, rr.Scalars(values))
 
-    def style(self, path: str, colours: Sequence[Colour], names: Sequence[str]) -> None:
-        """Give the lines at a path their colours and names."""
-        style = rr.SeriesLines(colors=colours, names=names, widths=[2.0] * len(names))
-        self.log(path, style, static=True)
+    def style(self, path: str, colour: Colour, names: Sequence[str]) -> None:
+        """Name the lines at one path, and give them shades of a colour."""
+        colours, widths = shades(colour, len(names)), [2.0] * len(names)
+        self.log(path, rr.SeriesLines(colors=colours, names=names, widths=widths), static=True)
 
-    def name_actions(self, path: str, names: Sequence[str]) -> None:
-        """Tell several actions at one path apart by their names and by shades of its colour."""
-        shown = [f"{_name(path)} {name}" for name in names] if len(names) > 1 else [_name(path)]
-        if self._names[path] != shown:
-            self._names[path] = shown
-            self.style(path, shades(self._colours[path], len(names)), shown)
+    def state(self, path: str, value: str) -> None:
+        """Draw a state where it changes."""
+        if self._states[path] != value:
+            self._states[path] = value
+            self.log(path, rr.StateChange(state=value))
 
-    def lanes(self, path: str, colours: Mapping[str, Colour]) -> None:
-        """Declare the states that may be logged at a path, and their colours."""
-        names = list(colours)
-        lanes = rr.StateConfiguration(values=names, labels=names, colors=list(colours.values()))
-        self.log(path, lanes, static=True)
-
-    def status(self, lines: Sequence[str]) -> None:
+    def status(self, *lines: str) -> None:
         """Replace the text that says how things stand; empty lines are left out."""
         text = "\n\n".join(filter(None, lines))
         self.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
-    def is_new_ground(self, ground: object) -> bool:
-        """Whether another ground is to be shown than the one of the last call."""
-        before, self._ground = self._ground, ground
-        return before != ground
+    def observation(self, entries: Mapping[str, np.ndarray]) -> None:
+        """Draw what the policy sees: its pictures, the newest last, and the first numbers."""
+        for name, array in entries.items():
+            if (images := images_of(array)) is None:
+                self.scalar(f"observation/{name}", *array.ravel()[:MOST_LINES])
+                continue
+            for place, image in zip(("now", "before"), images[::-1], strict=False):
+                model = rr.ColorModel.L if image.shape[-1] == 1 else rr.ColorModel.RGB
+                self.log(f"frames/{place}", rr.Image(image, color_model=model))
 
-    def draw_ground(self, scene: SeenScene) -> None:
-        """Draw what does not move: roads, path and goal."""
+    def road(self, scene: SeenScene | None, picture: Any, ego_colour: Colour) -> None:
+        """Draw the road from above, or the picture in its place; lay out anew for a new ground."""
+        ground = (scene.roads, scene.path, scene.goal) if scene else ()
+        if self._ground != ground:
+            self._ground = ground
+            self.log("road", rr.Clear(recursive=True))
+            self.recording.send_blueprint(self._layout(scene))
+            if scene:
+                self._draw_ground(scene)
+        if scene is None:
+            self.log("road/picture", picture)
+            return
+        self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene), 0.0]))
+        for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
+            cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
+            half_m = [car.width_m / 2 for car in cars]
+            bodies, screens = ([line(car) for car in cars] for line in (body, windscreen))
+            self._strips(f"road/{name}/body", bodies, colour, half_m, order=3.0)
+            self._strips(f"road/{name}/glass", screens, GLASS, 0.3, order=4.0)
+
+    def _draw_ground(self, scene: SeenScene) -> None:
         self._strips("road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
         self._strips("road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
         self._strips("road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
@@ -90,122 +152,358 @@ class Canvas:
             look: Any = {"colors": [GOAL], "radii": [0.9], "labels": ["goal"], "draw_order": 2.0}
             self.log("road/goal", rr.Points2D([scene.goal], **look))
 
-    def draw_cars(self, scene: SeenScene, bounds: Bounds, ego_colour: Colour) -> None:
-        """Draw the cars; the view moves to above the ego car where that has left the bounds."""
-        self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene, bounds), 0.0]))
-        for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
-            cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
-            half_m = [car.width_m / 2 for car in cars]
-            for part, shade, radius_m, order in (
-                ("body", colour, half_m, 3.0),
-                ("outline", GLASS, 0.1, 4.0),
-                ("glass", GLASS, 0.3, 5.0),
-            ):
-                strips = [shapes_of(car)[part] for car in cars]
-                self._strips(f"road/{name}/{part}", strips, shade, radius_m, order)
-
     def _strips(self, path: str, strips: Any, colour: Colour, radii_m: Any, order: float) -> None:
         drawn = rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order)
         self.log(path, drawn)
 
 
-def _name(path: str) -> str:
-    return path.rpartition("/")[2].replace("_", " ")
+def bounds_of(scene: SeenScene) -> list[tuple[float, float]]:
+    """Return the x and y ranges (m) that show the path, or the cars where there is none."""
+    places = scene.path or [(car.x, car.y) for car in scene.vehicles] or [(0.0, 0.0)]
+    return [(min(at) - MARGIN_M, max(at) + MARGIN_M) for at in zip(*places, strict=True)]
 
 
-def shapes_of(car: SeenCar) -> dict[str, list[Point]]:
-    """A car's lines: its outline, the windscreen, which tells front from back, and the body.
-
-    The body is an axis that fills the outline when it is drawn as wide as the car (round ends).
-    """
-    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
-
-    def placed(*points: Point) -> list[Point]:
-        return [(car.x + a * cos - b * sin, car.y + a * sin + b * cos) for a, b in points]
-
-    ahead, aside = car.length_m / 2, car.width_m / 2
-    reach = max(0.0, ahead - aside)
-    box = [(ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside), (ahead, aside)]
-    return {
-        "body": placed((-reach, 0.0), (reach, 0.0)),
-        "outline": placed(*box),
-        "glass": placed((0.4 * ahead, -0.7 * aside), (0.4 * ahead, 0.7 * aside)),
-    }
-
-
-def view_bounds(scene: SeenScene) -> Bounds:
-    """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
-    cars = [(car.x, car.y) for car in scene.vehicles]
-    ranges = []
-    for axis, margin in enumerate(MARGIN_M):
-        known = [point[axis] for point in scene.path or cars] or [0.0]
-        low, high = min(known), max(known)
-        near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
-        ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
-    return ranges[0], ranges[1]
-
-
-def away_m(scene: SeenScene, bounds: Bounds) -> list[float]:
-    """Return how far (x, y) the ego car is from the bounds' middle; [0, 0] where it is inside."""
+def away_m(scene: SeenScene) -> list[float]:
+    """Return how far (x, y) the ego car is from the view's middle; [0, 0] where it is inside."""
+    bounds = bounds_of(scene)
     for ego in (car for car in scene.vehicles if car.ego):
         place = list(zip((ego.x, ego.y), bounds, strict=True))
-        if not all(low <= at <= high for at, (low, high) in place):
+        if scene.path and not all(low <= at <= high for at, (low, high) in place):
             return [at - (low + high) / 2 for at, (low, high) in place]
     return [0.0, 0.0]
 
 
-class Plot(NamedTuple):
-    """One plot of a layout."""
-
-    origin: str
-    title: str
-    limits: tuple[float, float] | None = None  # Of the y axis; None: as the values need
+def body(car: SeenCar) -> list[Point]:
+    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
+    reach = max(0.0, (car.length_m - car.width_m) / 2)
+    return [_placed(car, -reach, 0.0), _placed(car, reach, 0.0)]
 
 
-def plot_view(plot: Plot, shown: rrb.TimeRange = WHOLE) -> rrb.TimeSeriesView:
-    """The view of a plot; ``shown`` is the part of the time axis."""
-    limits = None if plot.limits is None else rrb.ScalarAxis(range=plot.limits)
-    axes: Any = {"axis_x": rrb.TimeAxis(view_range=shown), "axis_y": limits}
-    legend = rrb.Corner2D.LeftTop
-    return rrb.TimeSeriesView(origin=plot.origin, name=plot.title, plot_legend=legend, **axes)
+def windscreen(car: SeenCar) -> list[Point]:
+    """Return the line that tells front from back."""
+    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
+    return [_placed(car, ahead, -aside), _placed(car, ahead, aside)]
+
+
+def _placed(car: SeenCar, ahead: float, aside: float) -> Point:
+    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
+    return car.x + ahead * cos - aside * sin, car.y + ahead * sin + aside * cos
+
+
+def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
+    """Make the view of a plot."""
+    legend, axis = rrb.Corner2D.LeftTop, rrb.TimeAxis(view_range=WHOLE)
+    return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend, axis_x=axis)
 
 
 def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
-    """The view of states over time."""
+    """Make the view of states over time."""
     axis = rrb.TimeAxis(view_range=WHOLE)
     return rrb.StateTimelineView(origin=origin, name=title, time_view=axis)
 
 
-def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
-    """The road from above; the ground shown is fixed by ``scene`` (None: as rerun sees fit)."""
-    look: dict[str, Any] = {"name": name, "background": list(GROUND)}
-    if scene is None:
+def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
+    """Make the view from above: of the scene's path, moving on with a car that leaves it."""
+    look: dict[str, Any] = {"name": "From above", "background": list(GROUND)}
+    if scene is None or not scene.path:
         return rrb.Spatial2DView(origin="road", **look)
-    x_range, y_range = view_bounds(scene)
+    x_range, y_range = bounds_of(scene)
     bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     return rrb.Spatial2DView(origin=CAMERA, contents="/road/**", visual_bounds=bounds, **look)
 
 
-def sees_view(frames: bool = True, array: str = "") -> rrb.Horizontal:
-    """What the policy sees (two frames, else a large ``array``, else lines), and the status."""
-    seen: list[Any] = [plot_view(Plot("observation", "Policy sees"))]
+def sees_view(frames: bool = True) -> rrb.Horizontal:
+    """Show what the policy sees (two frames, or lines), and the status."""
+    seen: list[Any] = [plot_view("observation", "Policy sees")]
     if frames:
         view = rrb.Spatial2DView
         times = {"before": "t-1", "now": "t"}.items()
         seen = [view(origin=f"frames/{at}", name=f"Policy sees {t}") for at, t in times]
-    elif array:
-        seen = [rrb.TensorView(origin=f"observation/{array}", name=f"Policy sees: {array}")]
     now = rrb.TextDocumentView(origin="status", name="Now")
-    return rrb.Horizontal(*seen, now, column_shares=[1, 1, 1] if frames else [2, 1])
+    return rrb.Horizontal(*seen, now)
 
 
 def two_columns(
     left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
 ) -> rrb.Blueprint:
-    """Two columns and nothing else open, along ``timeline``."""
+    """Lay out two columns and nothing else open, along ``timeline``."""
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=column_shares),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=timeline),
     )
+
+
+PLOTS = (
+    ("action", "Command: asked and achieved"),
+    ("speed", "Speed, m/s: of the simulated car and of the vehicle"),
+    ("latency", "Latency, ms: round trip, and its parts"),
+    ("link", "Link each way: mean delay and jitter, ms; loss, %"),
+    ("rejected", "Messages rejected so far, by either side"),
+)
+"""From top to bottom."""
+ACTIONS = {"action/asked": POLICY, "action/achieved": APPLIED}
+NO_COMMAND, NO_REASON = "no command", "-"
+MODES = {DRIVE: POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
+STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
+Place = tuple[str, int, int]  # Session, episode and step of a state
+REMEMBERED_STATES = 64  # Whose times are kept, for the latency of their commands
+INFO, WARN = rr.TextLogLevel.INFO, rr.TextLogLevel.WARN
+
+
+def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
+    """Lay out the views; ``pictures``: whether the policy sees any."""
+    left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
+    events = rrb.TextLogView(
+        origin="events",
+        name="Events",
+        columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
+    )
+    right = rrb.Vertical(
+        lanes_view("mode", "Mode, and why it does not drive"),
+        *(plot_view(*plot) for plot in PLOTS),
+        events,
+    )
+    return two_columns(left, right, [3, 2], "sim_time")
+
+
+class WireLog:
+    """Draws the messages of one vehicle, its episodes end to end.
+
+    Frames and scenes are drawn no more often than every ``picture_interval_s`` (0: all of them).
+    """
+
+    def __init__(self, recording: rr.RecordingStream, picture_interval_s: float = 0.0) -> None:
+        self.left_out = 0  # Messages that could not be drawn
+        self._canvas = Canvas(recording, self._lay_out, STATES)
+        self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
+        self._task: Task | None = None
+        self._layout: Layout | None = None
+        self._period_s = 0.0  # The control period, as soon as a message tells it
+        self._session = ""  # Of the newest state
+        self._episode: tuple[str, int] | None = None  # The newest one seen
+        self._starts: dict[tuple[str, int], int] = {}
+        """Session and episode -> its first step on the time axis. A viewer may come late."""
+        self._end_step = 0
+        self._mode = self._reason = ""
+        self._heard_command_ns = self._plan_periods = 0
+        self._sent_ns: dict[Place, int] = {}
+        self._answered_ms: dict[Place, float] = {}
+        """From the sending of a state to that of its first command, by the stamps of both."""
+        self._split: Place | None = None
+        """The state whose round trip was drawn in its parts last."""
+        self._health: Health | None = None
+
+    def write(self, heard: Heard) -> None:
+        """Draw one message as it came; a token shows as silence."""
+        if heard.topic not in DECODERS:
+            return
+        message = decode(heard)
+        if isinstance(message, wire.Rejection):
+            self.left_out += 1
+        else:
+            getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
+
+    def write_state(self, state: State, arrived_ns: int) -> None:
+        if state.step:
+            self._period_s = state.sim_time_s / state.step
+        self._session, episode = state.session, (state.session, state.episode)
+        self._stand_at(*episode, state.step)
+        _keep(self._sent_ns, (*episode, state.step), state.sent_ns)
+        layout, due = self._layout, self._frames_pace.due(arrived_ns * 1e-9)
+        if layout and due and not layout.refusal(state.observation):
+            self._canvas.observation(layout.arrays(state.observation))
+        if state.speed_mps is not None:
+            self._canvas.scalar("speed/simulated", state.speed_mps)
+        if self._episode != episode:
+            # For a viewer that comes late, or in a new episode, no command was due before.
+            self._episode, self._heard_command_ns = episode, arrived_ns
+        periods = BRAKE_PERIODS + self._plan_periods
+        silent = arrived_ns - self._heard_command_ns > periods * self._period_s * 1e9
+        # Between two episodes no command is due.
+        if silent and state.step > 0 and not state.final:
+            self._tell(NO_COMMAND, "the simulator brakes by itself", WARN)
+
+    def write_command(self, command: Command, arrived_ns: int) -> None:
+        self._stand_at(command.session, command.episode, command.step)
+        self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
+        self._canvas.scalar("action/asked", *command.action)
+        place = command.session, command.episode, command.step
+        if (sent_ns := self._sent_ns.get(place)) is not None:
+            self._canvas.scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
+            if place not in self._answered_ms:  # A safe stop is repeated for as long as it lasts.
+                _keep(self._answered_ms, place, (command.sent_ns - sent_ns) * 1e-6)
+        self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
+        self._tell(command.mode, command.reason, INFO if command.mode == DRIVE else WARN)
+
+    def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
+        self._canvas.scalar("action/achieved", *feedback.action)
+        self._canvas.scalar("speed/vehicle", feedback.speed_mps)
+
+    def write_health(self, health: Health, _arrived_ns: int) -> None:
+        self._canvas.scalar("rejected/edge", sum(health.rejected.values()))
+        for name, value in health.link.items():
+            self._canvas.scalar(f"link/{name}", value)
+        self._health = health
+        self._draw_status()
+
+    def write_scene(self, scene: Scene, arrived_ns: int) -> None:
+        if scene.task is not None and scene.task != self._task:
+            self._task, self._layout = scene.task, Layout(scene.task)
+            self._period_s = scene.task.control_period_s
+            for path, colour in ACTIONS.items():
+                names = [f"{path[7:]} {action.name}" for action in scene.task.action]
+                self._canvas.style(path, colour, names)
+        session = scene.origin.session if scene.origin else self._session
+        self._stand_at(session, scene.episode, scene.step)
+        if scene.round_trip_ms is not None:
+            self._canvas.scalar("latency/round_trip", scene.round_trip_ms)
+            answered = (session, scene.episode, scene.answered_step or 0)
+            # Every scene tells it until the next one is known.
+            if answered in self._answered_ms and answered != self._split:
+                self._split, answered_ms = answered, self._answered_ms[answered]
+                self._canvas.scalar("latency/downlink", scene.round_trip_ms - answered_ms)
+        self._canvas.scalar("rejected/simulator", sum(scene.rejected.values()))
+        if scene.ridden and self._mode == DRIVE:
+            self._tell(DRIVE, "rides on the plan", WARN)
+        if self._cars_pace.due(arrived_ns * 1e-9):
+            picture = rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
+            road = None if scene.picture else scene
+            self._canvas.road(road, picture, MODES[self._mode or NO_COMMAND])
+
+    def _lay_out(self, scene: SeenScene | None) -> rrb.Blueprint:
+        entries = self._task.observation.values() if self._task else ()
+        return lay_out(scene, not entries or any(map(is_picture, entries)))
+
+    def _stand_at(self, session: str, episode: int, step: int) -> None:
+        step += self._starts.setdefault((session, episode), self._end_step)
+        self._end_step = max(self._end_step, step + 1)
+        self._canvas.stand_at(step, sim_time=step * self._period_s)
+
+    def _tell(self, mode: str, reason: str, level: Any) -> None:
+        """Draw the mode where it changes."""
+        if (mode, reason) == (self._mode, self._reason):
+            return
+        self._mode, self._reason = mode, reason
+        self._canvas.state("mode/mode", mode)
+        self._canvas.state("mode/reason", reason or NO_REASON)
+        text = f"{mode}: {reason}" if reason else mode
+        self._canvas.log("events", rr.TextLog(text, level=level))
+        self._draw_status()
+
+    def _draw_status(self) -> None:
+        lines = [f"# {self._mode or 'waiting'}", self._reason]
+        if (health := self._health) is not None:
+            counts = [f"{name} {count}" for name, count in health.rejected.items() if count]
+            lines += [
+                f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
+                f"states accepted {health.accepted}, rejected: {', '.join(counts) or 'none'}",
+                f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
+                f"link: {link_words(health.link)}",
+            ]
+        self._canvas.status(*lines)
+
+
+def _keep(memory: dict[Place, Any], place: Place, value: Any) -> None:
+    """Remember a value of a state, and forget the oldest."""
+    memory[place] = value
+    if len(memory) > REMEMBERED_STATES:
+        del memory[next(iter(memory))]
+
+
+def run(arguments: Any) -> int:
+    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    if arguments.foxglove and (arguments.port or arguments.recording):
+        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
+    if arguments.foxglove:
+        try:
+            import foxglove
+        except ImportError:
+            raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
+        return _watch(arguments, _served(foxglove, arguments.foxglove))
+    sink = check_sink(arguments.sink, arguments.port)
+    interval_s = 0.0 if sink.endswith(SUFFIX) else PICTURE_INTERVAL_S
+    if arguments.recording is None:
+        _watch(arguments, _drawn(sink, arguments.port, interval_s))
+    else:
+        _show_recording(arguments, sink)
+    if sink.endswith(SUFFIX):
+        print(f"wrote {sink}")
+    return 0
+
+
+def _show_recording(arguments: Any, sink: str) -> None:
+    """Draw all of it; a page is served until somebody interrupts."""
+    from bridge.ports import wait_to_be_told  # It loads zenoh, which a training goes without.
+
+    file = Recording(Path(arguments.recording))
+    heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
+    with _drawn(sink, arguments.port, 0.0) as show:
+        for each in heard:
+            show(each)
+        file.say_trouble()
+        if sink == SERVE:
+            print("all of it is there; ^C ends", flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                wait_to_be_told()
+
+
+@contextlib.contextmanager
+def _drawn(sink: str, port: int | None, interval_s: float) -> Iterator[Callable[[Heard], None]]:
+    with open_sink(sink, "phil_hil", lay_out(None), port) as recording:
+        log = WireLog(recording, interval_s)
+        yield log.write
+    if log.left_out:
+        said = counted(log.left_out, "message")
+        print(f"left out: {said} that cannot be drawn", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
+    """Yield what shows a message in Foxglove; UserError where the port is taken."""
+    from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
+
+    context = foxglove.Context()
+
+    @functools.cache
+    def channel(topic: str, schema: Schema) -> Any:
+        told = foxglove.Schema(name=schema.name, encoding=SCHEMA_ENCODING, data=schema.data)
+        kind: Any = {"message_encoding": ENCODING, "schema": told, "context": context}
+        return foxglove.Channel(topic, **kind)
+
+    def add(topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
+        channel(topic, schema).log(data, log_time=now_ns)
+
+    try:
+        server = foxglove.start_server(name="phil", host=LOOPBACK, port=port, context=context)
+    except RuntimeError as error:
+        raise UserError(f"cannot serve Foxglove at port {port}: {error}") from None
+    try:
+        print(f"open ws://{LOOPBACK}:{port} in Foxglove", flush=True)
+        yield ViewerCopies(add).write
+    finally:
+        server.stop()
+
+
+def _watch(
+    arguments: Any, opened: contextlib.AbstractContextManager[Callable[[Heard], None]]
+) -> int:
+    """Show until there is a reason to stop."""
+    from bridge.ports import open_listener
+    from edge_runtime.transport import tls_for
+
+    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, where)
+    with (
+        sigterm_as_interrupt(),
+        open_listener(where, vehicle_id, arguments.wait_s, tls) as listener,
+        opened as show,
+        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        for heard in filter(None, listener.until_gone(arguments.duration_s)):
+            show(heard)
+    if listener.dropped:
+        print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
+    return 0

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import rerun
 
-from bridge.rerun import free_port
-
 PROGRAM = Path(rerun.__file__).parents[1] / "rerun_cli" / "rerun"
 NO_GPU = "app creation error: The GPU/graphics driver is lacking some abilities"
 KINDS = {
@@ -25,7 +23,7 @@ WINDOWLESS = 'case "$*" in *--serve-web*) ;; *) set -- "$@" --serve-grpc ;; esac
 
 @contextlib.contextmanager
 def in_place(kind, folder, monkeypatch):
-    """Have the viewer be one of these, at ports of its own and with little patience."""
+    """Have the viewer be one of these, with little patience."""
     fake, pids = folder / "rerun", folder / "pids"
     fake.write_text(f"#!/bin/sh\necho $$ >> {pids}\n{WINDOWLESS}\n{KINDS[kind]}\n")
     fake.chmod(0o755)
@@ -34,8 +32,6 @@ def in_place(kind, folder, monkeypatch):
     monkeypatch.setattr("bridge.rerun.FLUSH_S", 1.0)
     if kind == "never listens":
         monkeypatch.setattr("bridge.rerun.START_S", 1.0)
-    for name in ("GRPC_PORT", "WEB_PORT"):
-        monkeypatch.setattr(f"bridge.rerun.{name}", free_port())
     yield
     for pid in pids.read_text().split():
         with contextlib.suppress(ProcessLookupError):  # Windows stay open.

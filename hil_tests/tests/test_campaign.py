@@ -16,9 +16,8 @@ from hil_tests.drivers import Drivers
 from hil_tests.faults.rig import free_bus
 from hil_tests.processes import POLICY, Process, operator, trusting
 from hil_tests.testing.drives import SHORT_TOY, read, start_simulate
-from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
-from trainer.evaluation import EpisodeResult, drive_episodes
+from trainer.evaluation import EpisodeResult, OnnxDriver, drive_episodes
 from trainer.util import kept
 
 DELAY = campaign.Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms")

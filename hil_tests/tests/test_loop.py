@@ -11,9 +11,8 @@ from edge_runtime.cli import run_cli
 from edge_runtime.reach import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.drives import LEFT_TURN, read, start_edge, start_simulate
-from trainer.drivers import OnnxDriver
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluation import OnnxDriver, drive_episodes
 
 CONTRACT_KEYS = """
 scenario condition episodes policy_id seed success_rate collision_rate surviving_distance_m

@@ -24,16 +24,16 @@ from bridge.report import ProgressBar
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
 from trainer import util
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments import plan, report
 from trainer.experiments.compute import BUSY, FAILED, FINISHED, STOPPED, Job, compute
 from trainer.experiments.plan import FOREIGN, REPORT, STATUS, STUDIES, TYPICAL
 from trainer.experiments.records import RECORD_FILE, Store
 from trainer.human import MODEL_FILE
-from trainer.options import check_device, deadline_s
 from trainer.person.coach import TYPICAL_FILE
 from trainer.training.config import CONFIG_FILE
 from trainer.training.metrics import METRICS_FILE
+from trainer.util import check_device, deadline_s
 
 PATIENCE_S = 1.0  # How long a unit may be held before it counts as another process's work
 EXITS = (FINISHED, FAILED, STOPPED, BUSY)

@@ -19,10 +19,19 @@ import torch
 from bridge.outcomes import GOAL
 from edge_runtime.files import write_json
 from edge_runtime.util import read_bytes, read_json
-from trainer import drivers, util
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver
+from trainer import util
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes, drive_together
+from trainer.evaluation import (
+    BEST_FILE,
+    CHECKPOINT_FILE,
+    CONSTANT,
+    constant_driver,
+    drive_episodes,
+    drive_together,
+    is_expert,
+    load_actor,
+    load_driver,
+)
 from trainer.experiments import plan
 from trainer.experiments.plan import TASKS, Line, Study, Unit
 from trainer.experiments.records import (
@@ -158,7 +167,7 @@ def make_record(job: Job) -> Record:
         policy = str(job.run_dir)
     elif unit.algorithm == plan.CONSTANT:
         own = best_constant(unit.scenario, study)
-        policy = f"{drivers.CONSTANT}{own['action']}"
+        policy = f"{CONSTANT}{own['action']}"
     elif unit.algorithm == plan.HUMAN_MODEL:
         policy = str(job.human_model.parent)
     began_s = time.monotonic()
@@ -194,7 +203,7 @@ def drive_tests(unit: Unit, policy: str, study: Study) -> pd.DataFrame:
     for condition in unit.conditions:
         env = make_environment(environment, condition)
         driver: Any = load_driver(policy, env)[0]
-        if drivers.is_expert(policy):  # it has a memory, and drives its own environment only
+        if is_expert(policy):  # it has a memory, and drives its own environment only
             drives = drive_episodes(env, driver, seeds, condition)
         else:
             more = range(min(study.together, study.test_runs) - 1)
@@ -222,7 +231,7 @@ def best_constant(scenario: str, study: Study) -> dict[str, Any]:
     def search(low: float, high: float) -> float:
         for action in np.linspace(low, high, study.search_points).round(3).tolist():
             if action not in worth:
-                results = drive_together(envs, drivers.constant_driver(action).act_together, seeds)
+                results = drive_together(envs, constant_driver(action).act_together, seeds)
                 success = np.mean([result.outcome == GOAL for result in results])
                 worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
         return max(worth, key=lambda action: (*worth[action], -abs(action)))

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from bridge.report import ProgressBar
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
-from trainer import options, util
+from trainer import util
 from trainer.environments import check_trained_in, expert_of, make_environment
 from trainer.human import FIELDS, MODEL_FILE, HumanModelConfig
 from trainer.human.guide import Driver, HumanGuide, steps_held
 from trainer.learner.networks import FRAMES_SPACE, Actor, tensors
-from trainer.person.interface import vector
+from trainer.person import vector
 from trainer.person.recording import find_recordings, read_episodes, read_steps
 from trainer.util import Purpose, claimed, episode_seed, load_torch, random_stream, save_torch
 
@@ -117,7 +117,7 @@ def load_human_model(directory: Path, env: Any) -> tuple[Actor, dict[str, Any]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    options.set_threads(arguments.threads)
+    util.set_threads(arguments.threads)
     if arguments.recordings is not None and arguments.label_every_step:
         raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
     config = HumanModelConfig(**{name: getattr(arguments, name) for name in FIELDS})
@@ -130,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
-    end_s = options.deadline_s(arguments.max_minutes)
+    end_s = util.deadline_s(arguments.max_minutes)
     env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
     shape, space = env.action_space.shape, env.observation_space

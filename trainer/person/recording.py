@@ -9,7 +9,6 @@ says whether the person discarded it. 30 minutes are about 14 MB. Nothing is eve
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ from mcap.stream_reader import MAGIC_SIZE
 from numpy.typing import NDArray
 
 from bridge.outcomes import DISCARDED
-from bridge.recording import Recording, close_torn, new_recording_at
+from bridge.recording import Recording, new_recording_at
 from edge_runtime.util import UserError
-from trainer.person.interface import Amount, Control
+from trainer.person import Amount, Control
 
 TOPIC = "person/step"
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
@@ -92,7 +91,6 @@ class Recorder:
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
         self._file, self._mcap = new_recording_at(self.path)
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
-        self._closed = self._torn = False
         self._last: RecordedStep | None = None
 
     def add(self, step: RecordedStep) -> None:
@@ -110,36 +108,21 @@ class Recorder:
             self.write(msgspec.structs.replace(step, outcome=outcome))
 
     def write(self, step: RecordedStep) -> None:
-        """Write a step, which no kill then takes away. UserError on a full disk."""
+        """Write a step, which no kill then takes away. OSError on a full disk."""
         data, index = msgspec.msgpack.encode(step), self.index
         self.index += 1
-        with self._one_line():
-            self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, index)
-            self._mcap.flush()
+        self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, index)
+        self._mcap.flush()
 
     def close(self) -> None:
         """Write the index and close the file; a sitting without steps leaves none behind."""
-        if self._closed:
+        if self._file.closed:
             return
         self.end_episode(discarded=False)
-        self._closed = True
-        try:
-            if not self._torn:  # An index would tell of a step that the disk did not take.
-                with self._one_line():
-                    self._mcap.finish()
-                    self._file.close()
-        finally:
-            close_torn(self._file)
+        with self._file:
+            self._mcap.finish()
         if self.index == 0:
             self.path.unlink()
-
-    @contextmanager
-    def _one_line(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self._torn = True
-            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
 
 
 def sittings(directory: Path) -> list[Path]:
@@ -172,19 +155,17 @@ def read_steps(path: Path) -> Iterator[RecordedStep]:
     """Yield the steps of a recording, up to its end or to where a kill has cut it off.
 
     An episode that damage has torn is left out: steps are missing, or its end, which says whether
-    the person discarded it. One line says how much. UserError: no such file, or not one of ours.
+    the person discarded it. UserError: no such file, or not one of ours.
     """
-    recording, steps, given = Recording(path), 0, 0
-    for _, drive in groupby(_steps(recording), key=lambda step: step.index - step.step):
-        places = recording.damaged_places
-        episode = list(drive)
+    recording = Recording(path)
+    drives = groupby(_steps(recording), key=lambda step: step.index - step.step)
+    episodes = [list(drive) for _, drive in drives]
+    recording.say_trouble()
+    for episode in episodes:
         follow = [step.step for step in episode] == list(range(len(episode)))
-        ended = episode[-1].outcome or recording.damaged_places == places
-        steps = episode[-1].index + 1
-        if (follow and ended) or not recording.is_damaged:
+        last = episode[-1]
+        if follow and (last.terminated or last.truncated or episode is episodes[-1]):
             yield from episode
-            given += len(episode)
-    recording.say_trouble(f", {given} of {steps} steps" if recording.is_damaged else "")
 
 
 def _steps(recording: Recording) -> Iterator[RecordedStep]:

@@ -18,24 +18,29 @@ from typing import Any, NamedTuple
 import torch
 from numpy.typing import NDArray
 
-from bridge.outcomes import GOAL
 from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError
-from trainer.drivers import TogetherDriver
+from trainer.evaluation import TogetherDriver
 from trainer.human.guide import BY_PERSON, Intervention, Stepped, make_transition
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
+from trainer.person import vector, web
 from trainer.person.coach import Coach, typical_curve
-from trainer.person.interface import open_person, vector
 from trainer.person.recording import DIRECTORY, RecordedStep, Recorder, read_episodes, steps_since
 from trainer.person.session import PacedEnvironment, Sitting
-from trainer.training.config import RunConfig
+from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
 from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_vehicle
-from trainer.util import Purpose, die_with_parent, episode_seed, interrupts_blocked
+from trainer.util import die_with_parent, interrupts_blocked
+
+SCRIPTED = (
+    "guided_share", "guided_until_episode", "guided_until_step", "poor_guidance_share",
+    "late_to_s", "missed_share",
+)  # fmt: skip
+"""Settings of a scripted human."""
 
 
 @contextmanager
@@ -45,7 +50,7 @@ def training_with_person(
     """Open a run with a person as its guide; a resumed one stores what was recorded since."""
     check_settings(config)
     with ExitStack() as stack:
-        person = stack.enter_context(closing(open_person(arguments)))
+        person = stack.enter_context(closing(web.open_cockpit(arguments)))
         make_directory(run_dir)
         env, delayed = make_vehicle(config)
         sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
@@ -99,11 +104,9 @@ def restore_step(training: TrainingRun, step: RecordedStep) -> None:
 
 def _recall(training: TrainingRun, sitting: Sitting) -> None:
     """Tell the sitting of the episodes that the run has driven before it."""
-    period_s = training.env.control_period_s
     before = read_metrics(training.run_dir)[: training.episode]
-    given = spent(before, period_s)
+    given = spent(before, training.env.control_period_s)
     sitting.episode = training.episode
-    sitting.ended = [row["outcome"] for row in before]
     sitting.cost = {
         "human_s": given["human_s"],
         "takeovers": given["takeovers"],
@@ -111,22 +114,16 @@ def _recall(training: TrainingRun, sitting: Sitting) -> None:
     }
     curve = typical_curve(training.config.scenario, training.config.algorithm)
     sitting.coach = Coach(curve, learning=True)
-    sitting.coach.recall(before, period_s)
 
 
 def check_settings(config: RunConfig) -> None:
     """Refuse what a person cannot be a part of; raises UserError."""
     row = find_algorithm(config.algorithm)
-    if not row.guided:
-        raise UserError(f"{config.algorithm} takes no guidance: nobody could take over")
-    if row.asks:
-        raise UserError(f"{config.algorithm} asks a scripted human or its model, and no person yet")
-    if config.guided_share != 1 or config.guided_until_episode or config.guided_until_step:
-        wanted = "guided_share must be 1, guided_until_episode and guided_until_step 0"
-        raise UserError(f"a person watches every episode: {wanted}")
-    if config.poor_guidance_share or config.late_to_s or config.missed_share:
-        wanted = "poor_guidance_share, late_to_s and missed_share must be 0"
-        raise UserError(f"a person's actions are not replaced: {wanted}")
+    if not row.guided or row.asks:
+        raise UserError(f"{config.algorithm} takes no guidance of a person")
+    for name in SCRIPTED:
+        if getattr(config, name) != (default := getattr(DEFAULTS, name)):
+            raise UserError(f"{name} is of a scripted human; with a person it must be {default}")
 
 
 class Candidate(NamedTuple):
@@ -135,8 +132,6 @@ class Candidate(NamedTuple):
     actor: Actor
     episode: int
     human_s: float
-    seeds: dict[int, int]
-    """Episode -> its seed, of those that the policy is to try, beside the validation's own."""
 
 
 class PersonValidation(Validation):
@@ -150,7 +145,10 @@ class PersonValidation(Validation):
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        learned = self.learned(metrics.critic_loss)
+        added, warmup = self.learning.added, self.config.learner.warmup_steps
+        learned = f"not learning yet ({added} of {warmup} steps)"
+        if not math.isnan(metrics.critic_loss):
+            learned = f"critic loss {metrics.critic_loss:.3f}"
         self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}"
         if not at_end:
             self._beside(metrics, episode, due)
@@ -167,33 +165,19 @@ class PersonValidation(Validation):
             with suppress(OSError):  # The terminal may be gone.
                 print("validation left out", file=sys.stderr)
 
-    def learned(self, critic_loss: float) -> str:
-        added, warmup = self.learning.added, self.config.learner.warmup_steps
-        if added < warmup:
-            return f"not learning yet ({added} of {warmup} steps)"
-        return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
-
     def close(self) -> None:
         self._behind.close()
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
         """Take the validation that is done, into this episode's row, and begin one that is due."""
-        coach, found = self.sitting.coach, self._behind.take()
-        if found is not None:
+        if (found := self._behind.take()) is not None:
             candidate, drives = found
-            runs = self.config.evaluation_runs
-            self.take(drives[:runs], candidate.actor, metrics, candidate.episode)
-            goals = [drive.outcome == GOAL for drive in drives[runs:]]
-            mastered = dict(zip(candidate.seeds, goals, strict=True))
-            coach.take(candidate.human_s, metrics.validation_success, mastered)
+            self.take(drives, candidate.actor, metrics, candidate.episode)
+            point = candidate.human_s, metrics.validation_success
+            self.sitting.coach.curve.append(point)
         if due and metrics.updates and not self._behind.busy:
             actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
-            seeds = {
-                number: episode_seed(self.config.seed, Purpose.TRAINING, number)
-                for number in coach.to_check()
-            }
-            self._behind.begin(Candidate(actor, episode, self.sitting.cost["human_s"], seeds))
-        coach.checking = self._behind.busy
+            self._behind.begin(Candidate(actor, episode, self.sitting.cost["human_s"]))
 
 
 class BehindTheScenes:
@@ -211,10 +195,9 @@ class BehindTheScenes:
     def begin(self, candidate: Candidate) -> None:
         # Not as tensors: torch would share their memory with the process.
         weights = {name: value.numpy() for name, value in candidate.actor.state_dict().items()}
-        seeds = list(candidate.seeds.values())
         try:
             with interrupts_blocked(), _without_script():
-                answer = self._process.submit(_validate, self._config, weights, seeds)
+                answer = self._process.submit(_validate, self._config, weights)
             self._begun = candidate, answer
         except BrokenExecutor:
             self._begun = None  # It was killed; `take` has said so.
@@ -258,12 +241,10 @@ def _start_validating() -> None:
 _trials = cache(Trials)  # Of the one config
 
 
-def _validate(
-    config: RunConfig, weights: dict[str, NDArray[Any]], seeds: list[int]
-) -> list[EpisodeResult]:
+def _validate(config: RunConfig, weights: dict[str, NDArray[Any]]) -> list[EpisodeResult]:
     """Drive what `BehindTheScenes.begin` asks for, in its process."""
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)
     actor.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-    return trials.drive(TogetherDriver(actor.eval().act), seeds)
+    return trials.drive(TogetherDriver(actor.eval().act))

@@ -14,32 +14,30 @@ from pathlib import Path
 from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
-from bridge.outcomes import DISCARDED, RESTARTED, STOPPED, failed, settled
+from bridge.outcomes import DISCARDED, RESTARTED, STOPPED, failed
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError, counted
-from trainer.drivers import load_driver, located
 from trainer.environments import Adapted, make_environment, scenario_of
-from trainer.evaluation import trained_in
+from trainer.evaluation import load_driver, located, trained_in
 from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention, make_transition
 from trainer.learner.replay import Action, Observation, Transition
-from trainer.options import set_threads
-from trainer.person.coach import Coach, SittingEpisode
-from trainer.person.interface import (
+from trainer.person import (
     Amount,
     Control,
+    Intent,
     Person,
     Reading,
+    TakeOver,
     View,
     amount,
-    controls_of,
-    open_person,
     vector,
+    web,
 )
+from trainer.person.coach import Coach, SittingEpisode
 from trainer.person.recording import RecordedStep, Recorder, packed
-from trainer.person.takeover import Intent, TakeOver
 from trainer.scenarios import SCENARIOS
-from trainer.util import Purpose, episode_seed
+from trainer.util import Purpose, episode_seed, set_threads
 
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
@@ -87,7 +85,6 @@ class Sitting(Guide):
         self.episode = 0  # The number of the episode, or of the next one
         self.progress = ""
         self.driven: list[SittingEpisode] = []  # In this sitting
-        self.ended: list[str] = []  # How each episode of the run ended
         self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
         """What the person has given so far, seconds of simulated time, in discarded episodes, too,
         and the episodes that missed the goal. A run that goes on adds what it had."""
@@ -135,11 +132,9 @@ class Sitting(Guide):
         self.show()
         self.pacer.wait()
         self._read()
-        if self._paused:
-            while self._paused and not self._to_end:
-                self._idle("")
-            self._paused = False
-            self.pacer.restart()
+        while self._paused and not self._to_end:
+            self._idle("")
+        self._paused = False
         before, hands = self._intervention, self._reading.action
         if self._policy_action is not None:
             holds = self._intent.update(self._reading, time.monotonic())
@@ -171,7 +166,7 @@ class Sitting(Guide):
     def record(
         self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
     ) -> None:
-        """Keep a control period: the transition, and what the person did; UserError: disk full."""
+        """Keep a control period: the transition, and what the person did."""
         self.recorder.add(
             RecordedStep(
                 **self._moment,
@@ -203,8 +198,7 @@ class Sitting(Guide):
                 self.recorder.end_episode(discarded=True)
         self.recorder.end_episode(self._discard)
         outcome = DISCARDED if self._discard else outcome
-        self.ended.append(outcome)
-        self.cost["failures"] = sum(map(failed, settled(self.ended)))
+        self.cost["failures"] += failed(outcome)
         since_s = (self._step - self._taken_over_at) * period_s
         human_s = self._human_steps * period_s
         self.driven.append(SittingEpisode(self.episode, outcome, human_s, self._takeovers, since_s))
@@ -238,12 +232,10 @@ class Sitting(Guide):
         """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
-        discarded = sum(episode.outcome == DISCARDED for episode in self.driven)
-        return (
-            f"{counted(len(self.driven) - discarded, 'episode')}, "
-            f"{counted(discarded, 'episode')} discarded, "
-            f"{counted(self.pacer.late, 'control period')} late: {self.recorder.path}"
-        )
+        outcomes = Counter(episode.outcome for episode in self.driven)
+        listed = ", ".join(f"{count} {word}" for word, count in outcomes.items())
+        late = counted(self.pacer.late, "control period")
+        return f"episodes: {listed or 'none'}; {late} late: {self.recorder.path}"
 
     def quit(self) -> bool:
         """End the sitting; False where it is over already."""
@@ -253,9 +245,9 @@ class Sitting(Guide):
     def close(self) -> None:
         """Close the cockpit and the recording; a second call does nothing."""
         self.closed = True
+        self.person.close()
         self.recorder.end_episode(self._discard)
         self.recorder.close()
-        self.person.close()
 
     def state_dict(self) -> dict[str, Any]:
         self.show("saving")  # The person sees why nothing moves.
@@ -307,7 +299,6 @@ class PacedEnvironment:
         self.env, self.sitting = env, sitting
 
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; GuideGone where the person quits before it begins."""
         observation, info = self.env.reset(seed=seed)
         self.sitting.begin(seed, observation, info)
         return observation, info
@@ -330,11 +321,11 @@ def run(arguments: argparse.Namespace) -> int:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
-    with closing(env), closing(open_person(arguments)) as person:
+    with closing(env), closing(web.open_cockpit(arguments)) as person:
         sitting = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
         with closing(sitting), quit_on_signals(sitting.quit):
             drive(sitting, policy, seed_of, arguments.episodes)
-    print(f"outcomes: {_listed(sitting) or 'none'}; {sitting.summary()}")
+    print(sitting.summary())
     return 0
 
 
@@ -369,12 +360,6 @@ def drive(
             sitting.record(step, intervention, info)
             ended = step.terminal or step.truncated
         sitting.end_episode(info["outcome"])
-        sitting.progress = _listed(sitting)
-
-
-def _listed(sitting: Sitting) -> str:
-    outcomes = Counter(episode.outcome for episode in sitting.driven)
-    return ", ".join(f"{count} {word}" for word, count in outcomes.items())
 
 
 def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
@@ -385,7 +370,8 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
         period_s = asked.policy and trained_in(asked.policy, asked.public_key)[1]
         scenario = asked.scenario or "left_turn"
-        controls_of(scenario)  # Now: of some simulators only one may live, and this closes its own.
+        # Now: of some simulators only one may live, and this closes its own.
+        web.controls_of(scenario)
         return make_environment(scenario, period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario, "--scenario")

@@ -8,9 +8,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import hmac
 import io
-import logging
 import secrets
 import socket
 import sys
@@ -19,31 +17,26 @@ import time
 import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
-import segno
 from aiohttp import WSCloseCode, WSMsgType, web
-from aiohttp.http_exceptions import HttpProcessingError
 from PIL import Image
 
 from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
-from trainer.person.interface import Reading, View, controls_of
-from trainer.person.takeover import Input, Seat
+from trainer.environments import make_environment
+from trainer.person import Amount, Input, Reading, Seat, View, amount, vector
 from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
+PAGE = Path(__file__).parent / "page"
 TOKEN_BYTES = 16
 MAX_INPUT_BYTES = 1024  # Of a page's message, which is half as long with 16 actions
-KEEP_ALIVE_S = 10.0  # How long a connection stays open for another request
-MAX_CONNECTIONS = 32  # A page opens some six for its files, and keeps one
-HEADERS_S = 5.0  # A connection must show the token within this time
-BACKLOG = 16
-"""Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE = ("0.0.0.0", "::")
 SOMEWHERE = ("192.0.2.1", 9)  # RFC 5737: no machine has this address
@@ -51,7 +44,6 @@ GONE_S = 2.0  # A page that is not heard for this long is disconnected, and the 
 CLOSING_S = 0.5  # How long a page may take to say good-bye
 VIEWS_UNDERWAY = 2
 """Views sent before the page says that it has drawn one: a slow page gets fewer, never old ones."""
-TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
@@ -59,17 +51,55 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """The address holds the token: no browser may keep it, pass it on, or frame the page."""
-OPEN_THE_PRINTED_ONE = "The cockpit has another address: open the one that the trainer printed.\n"
 HINTS = (
     "or slide on the pad, or use a gamepad or wheel",
     "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
     "    Q: quit, all is kept",
 )
+RESERVED = {"p", "r", "q", "escape", "backspace", "space"}  # Of the wishes and of Space
 INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
-LOGGER = logging.getLogger(__name__)
-# A client that speaks no HTTP is no error of the cockpit's.
-LOGGER.addFilter(lambda told: not isinstance((told.exc_info or [None] * 3)[1], HttpProcessingError))
+
+
+@dataclass(frozen=True)
+class Controls:
+    """The keys of one environment."""
+
+    keys: Mapping[str, Amount]
+    """Key, in small letters as ``up`` or ``w`` -> what pressing it fully adds to ``rest``."""
+    rest: Amount  # Hands off
+    rate_per_s: float  # How quickly a key presses
+    names: tuple[str, ...]  # Of the actions
+
+    @property
+    def help(self) -> str:
+        """A line for the page: which key does what."""
+        held: dict[str, list[str]] = {}
+        for key, added in self.keys.items():
+            action = zip(self.names, vector(amount(np.add(self.rest, added))), strict=True)
+            words = ", ".join(f"{name} {value:+g}" for name, value in action)
+            held.setdefault(words, []).append(key.capitalize())
+        what = (f"{' / '.join(keys)}: {words}" for words, keys in held.items())
+        return "    ".join(["hold to take over", *what, "Space: hands off"])
+
+
+@cache
+def controls_of(scenario: str) -> Controls:
+    """Return the controls of an environment; UserError where a person cannot drive it."""
+    with contextlib.closing(make_environment(scenario)) as env:
+        if not getattr(env, "can_be_seen", True):
+            raise UserError(f"a person cannot see {scenario}: it has no render() and no scene()")
+        if not env.keys:
+            raise UserError(f"a person cannot drive {scenario}: several actions, and no keys")
+        keys = {
+            name.lower().removeprefix("arrow").removeprefix("key"): amount(held - env.rest_action)
+            for name, held in env.keys.items()
+        }
+        rest, names = amount(env.rest_action), tuple(env.action_names)
+        controls = Controls(keys, rest, env.key_rate_per_s, names)
+    if taken := sorted(RESERVED & keys.keys()):
+        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which are the cockpit's")
+    return controls
 
 
 def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
@@ -83,10 +113,6 @@ def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
     if has_display():
         url = cockpit.one_time_url()  # In a thread, for it waits for some browsers.
         threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
-    if cockpit.phone_url:
-        print(f"on a phone in this network: {cockpit.phone_url}", flush=True)
-        if sys.stdout.isatty():
-            segno.make(cockpit.phone_url).terminal(compact=True)
     return cockpit
 
 
@@ -102,10 +128,9 @@ class Page:
 
 
 class Cockpit:
-    """A person in a browser; UserError where the address cannot be listened on.
+    """A person in a browser. Everything but the public methods runs in the server's thread.
 
-    The loop's thread calls the public methods, which take microseconds. Everything else runs in
-    the server's thread.
+    Raises UserError where the address cannot be listened on.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
@@ -114,15 +139,13 @@ class Cockpit:
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
-        self._token = secrets.token_urlsafe(TOKEN_BYTES)
-        self._one_time_token = ""
-        name = socket.gethostname() if host in EVERYWHERE else host
-        self._names = {*LOOPBACK, host.lower(), name.lower()}
-        self.url = self._url_of(name)
-        self.phone_url = None if host in LOOPBACK else self._url_of(lan_address(host))
-        """For another machine in this network; None where the cockpit listens on loopback."""
+        self._token, self._once = secrets.token_urlsafe(TOKEN_BYTES), ""
+        address = lan_address(host)
+        self._names = {*LOOPBACK, host.lower(), address, socket.gethostname().lower()}
+        shown = f"[{address}]" if ":" in address else address
+        self._origin = f"http://{shown}:{self.port}"
+        self.url = f"{self._origin}/{self._token}/"
         self._pages: list[Page] = []
-        self._files = _page_files(self.phone_url, np.size(self.controls.rest))
         self._shown = 0
         self._newest = (0, "")  # The newest view's number and message; pages get it when they can
         self._loop = asyncio.new_event_loop()
@@ -132,8 +155,8 @@ class Cockpit:
 
     def one_time_url(self) -> str:
         """Return an address for one request: all users here can read a browser's command line."""
-        self._one_time_token = secrets.token_urlsafe(TOKEN_BYTES)
-        return self.url.replace(self._token, self._one_time_token)
+        self._once = secrets.token_urlsafe(TOKEN_BYTES)
+        return f"{self._origin}/once/{self._once}"
 
     @property
     def present(self) -> bool:
@@ -151,10 +174,6 @@ class Cockpit:
         self._tell(self._closing.set)
         self._thread.join(4 * CLOSING_S)
 
-    def _url_of(self, name: str) -> str:
-        shown = f"[{name}]" if ":" in name else name
-        return f"http://{shown}:{self.port}/{self._token}/"
-
     def _tell(self, function: Callable[..., object], *arguments: object) -> None:
         """Call something in the server's thread; nothing once that is closed."""
         with contextlib.suppress(RuntimeError):  # Closed, perhaps this very moment.
@@ -165,16 +184,19 @@ class Cockpit:
             self._loop.run_until_complete(self._run())
 
     async def _run(self) -> None:
+        app, here = web.Application(middlewares=[self._guard]), f"/{self._token}/"
+        app.router.add_get("/once/{word}", self._let_in_once)
+        app.router.add_get(here, self._index)
+        app.router.add_get(f"{here}socket", self._talk)
+        app.router.add_get(f"{here}colours.css", self._colours)
+        app.router.add_static(here, PAGE)
         # An access log would hold the token.
-        self._door = Door(
-            self._answer, access_log=None, logger=LOGGER, keepalive_timeout=KEEP_ALIVE_S
+        runner = web.AppRunner(
+            app, access_log=None, shutdown_timeout=CLOSING_S, keepalive_timeout=10.0
         )
-        runner = web.ServerRunner(self._door, shutdown_timeout=CLOSING_S)
         await runner.setup()
-        site = web.SockSite(runner, self._listener, backlog=BACKLOG)
-        await site.start()
+        await web.SockSite(runner, self._listener).start()
         await self._closing.wait()
-        await site.stop()
         good_byes = [_say_goodbye(page.socket) for page in self._pages]
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
@@ -184,43 +206,44 @@ class Cockpit:
         for page in self._pages:
             page.wake.set()
 
-    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
-        given, slash, name = request.path[1:].partition("/")
-        if not self._is_asked_by_name(request):
-            return _refusal(421, OPEN_THE_PRINTED_ONE)
-        if self._one_time_token and _is_same(given, self._one_time_token):
-            self._one_time_token = ""
-            raise web.HTTPFound(f"/{self._token}/", headers=HEADERS)
-        if not _is_same(given, self._token):
-            return _refusal(403, OPEN_THE_PRINTED_ONE)
-        self._door.has_token(request.transport)
-        if name == "socket":
-            return await self._talk(request)
-        if not slash:  # The page's own files stand beside it only behind the slash.
-            raise web.HTTPFound(request.path + "/", headers=HEADERS)
-        name = name or "index.html"
-        if name not in self._files:
-            return _refusal(404, "no such page\n")
-        kind, body = TYPES[name.rpartition(".")[2]], self._files[name]
-        return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
-
-    def _is_asked_by_name(self, request: web.BaseRequest) -> bool:
-        """Whether the request names this machine; another site's name may resolve to it, too.
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Refuse a request that does not name this machine; another site's name may resolve to it.
 
         A page from there would be of the same origin (DNS rebinding).
         """
-        try:
+        with contextlib.suppress(ValueError):
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname
-        except ValueError:
-            return False
-        # With --host 0.0.0.0 the address at which the request arrived.
-        arrived_at = request.get_extra_info("sockname", ("",))[0].removeprefix("::ffff:")
-        return host is not None and host in {*self._names, arrived_at}
+            # With --host 0.0.0.0 the address at which the request arrived.
+            arrived_at = request.get_extra_info("sockname", ("",))[0].removeprefix("::ffff:")
+            if host in {*self._names, arrived_at}:
+                response: web.StreamResponse = await handler(request)
+                response.headers.update(HEADERS)
+                return response
+        raise web.HTTPMisdirectedRequest
 
-    async def _talk(self, request: web.BaseRequest) -> web.StreamResponse:
+    async def _let_in_once(self, request: web.Request) -> web.StreamResponse:
+        if not self._once or request.match_info["word"] != self._once:
+            raise web.HTTPForbidden
+        self._once = ""
+        raise web.HTTPFound(f"/{self._token}/", headers=HEADERS)
+
+    async def _index(self, request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(PAGE / "index.html")
+
+    async def _colours(self, request: web.Request) -> web.StreamResponse:
+        actions = np.size(self.controls.rest)
+        named = dict(BY_NAME)
+        for name, colour in BY_NAME.items():
+            shaded = enumerate(shades(colour, actions))
+            named |= {f"{name}-{number}": shade for number, shade in shaded}
+        lines = "".join(f"--{name}: rgb{colour}; " for name, colour in named.items())
+        return web.Response(text=f":root {{ {lines}}}", content_type="text/css")
+
+    async def _talk(self, request: web.Request) -> web.StreamResponse:
         # A page of another site may open sockets to this machine, but cannot lie about its origin.
         if request.headers.get("Origin") != f"http://{request.host}":
-            return _refusal(403, "another site's page\n")
+            raise web.HTTPForbidden(text="another site's page\n")
         socket = web.WebSocketResponse(
             max_msg_size=MAX_INPUT_BYTES, compress=False, timeout=CLOSING_S
         )
@@ -276,22 +299,10 @@ class Cockpit:
                     await page.socket.send_str(message)
 
 
-def _is_same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(), token.encode())
-
-
-def _refusal(status: int, text: str) -> web.Response:
-    response = web.Response(status=status, text=text, headers=HEADERS)
-    response.force_close()
-    return response
-
-
 def _listen(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, address = found[0][0], found[0][4]
-        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        return socket.create_server(address, family=family, dualstack_ipv6=both)
+        return socket.create_server(found[0][4], family=found[0][0])
     except (OSError, OverflowError, UnicodeError) as error:  # The last: no name for DNS.
         raise UserError(f"the cockpit cannot listen on {host} port {port}: {error}") from error
 
@@ -303,8 +314,7 @@ def _encode(kind: str, **fields: Any) -> str:
 def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
     """Encode view ``number``, from 1; ``hints`` say what to press for what, one line each.
 
-    ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` base64 of a JPEG; ``ground`` is the
-    part to show.
+    ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` of a JPEG; ``ground`` is shown.
     """
     left_m, top_m = _corner(view.scene or {})
     frames = None if view.frames is None else view.frames.tobytes()
@@ -318,7 +328,7 @@ def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
 
 
 def _corner(scene: Mapping[str, Any]) -> tuple[float, float]:
-    """Where the ground shown begins, m: as the scene says, or so that the ego car is on it."""
+    """Return where the ground shown begins, m: as the scene says, or around an ego car outside."""
     left_m, top_m = scene.get("view", VIEW)
     for car in scene.get("vehicles", ()):
         inside = 0.0 <= car["x"] - left_m <= WIDTH_M and 0.0 <= car["y"] - top_m <= HEIGHT_M
@@ -341,53 +351,3 @@ def lan_address(host: str) -> str:
         probe.connect(SOMEWHERE)
         return str(probe.getsockname()[0])
     return socket.gethostname()  # There is no such way.
-
-
-def _page_files(phone_url: str | None, actions: int) -> dict[str, bytes]:
-    found = {path.name: path.read_bytes() for path in (Path(__file__).parent / "page").glob("*.*")}
-    colours = "".join(
-        f"--{name}: rgb{colour}; "
-        + "".join(f"--{name}-{n}: rgb{one}; " for n, one in enumerate(shades(colour, actions)))
-        for name, colour in BY_NAME.items()
-    )
-    if phone_url:
-        picture = segno.make(phone_url).svg_data_uri(scale=4)
-        found["index.html"] = found["index.html"].replace(
-            b"<!-- phone -->",
-            '<details id="phone"><summary>On a phone in this network: then close this page, or '
-            "the phone only watches</summary>"
-            f'<img alt="the address as a QR code" src="{picture}" /><code>{phone_url}</code>'
-            "</details>".encode(),
-        )
-    return {**found, "colours.css": f":root {{ {colours}}}".encode()}
-
-
-class Door(web.Server):
-    """Limits the connections. Until a connection has shown the token, it is a stranger.
-
-    At the limit, the oldest stranger is cut off; where there is none, the newcomer.
-    """
-
-    def __init__(self, handler: Any, **options: Any) -> None:
-        super().__init__(handler, **options)
-        self._inside: dict[asyncio.Transport, asyncio.TimerHandle] = {}
-        """Open connections, oldest first, and the timer that cuts off a stranger."""
-
-    def has_token(self, transport: asyncio.Transport | None) -> None:
-        """Let a connection that has shown the token stay."""
-        if transport in self._inside:
-            self._inside[transport].cancel()
-
-    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Take in a newcomer, or cut it off."""
-        self._inside = {one: timer for one, timer in self._inside.items() if not one.is_closing()}
-        if len(self._inside) >= MAX_CONNECTIONS:
-            strangers = (one for one, timer in self._inside.items() if not timer.cancelled())
-            leaving = next(strangers, transport)
-            leaving.abort()
-            if leaving is transport:
-                return
-            del self._inside[leaving]
-        super().connection_made(handler, transport)
-        loop = asyncio.get_running_loop()
-        self._inside[transport] = loop.call_later(HEADERS_S, transport.abort)

@@ -2,11 +2,8 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,14 +15,10 @@ import torch
 from gymnasium.spaces import Box
 
 from bridge import environments as bridge
-from bridge.fork import RecordedEpisode
-from bridge.messages import Origin
-from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from trainer import environments, evaluate, export, train
+from trainer import evaluate, export, train
 from trainer.__main__ import main
-from trainer.drivers import OnnxDriver, constant_driver, load_driver
 from trainer.environments import (
     Adapted,
     check_foresight,
@@ -36,22 +29,21 @@ from trainer.environments import (
     outer,
     task_of,
 )
+from trainer.evaluation import OnnxDriver, constant_driver, load_driver
 from trainer.human import HumanModelConfig
 from trainer.human.model import HumanModel, demonstrate
 from trainer.learner.config import PHIL, LearnerConfig, find_algorithm
 from trainer.learner.networks import Actor, CriticPair, tensors
 from trainer.learner.replay import ReplayBuffer, ReplayLayout, Transition
 from trainer.learner.td3 import TD3Learner
+from trainer.person import Reading
 from trainer.person import session as driving
-from trainer.person.interface import Reading, controls_of
 from trainer.person.recording import Recorder, read_steps
 from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
-from trainer.person.web import encode_view
+from trainer.person.web import controls_of, encode_view
 from trainer.tests.odd import odd
 from trainer.tests.rover import CAMERA, ROVER, Rover
-from trainer.training.delayed import DelayedVehicle
-from trainer.view import ShownStep, sitting_entries
 
 
 @pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
@@ -89,25 +81,14 @@ def test_what_no_network_could_learn_from_is_the_environments_fault(changed, wor
         env.step(np.zeros(1, np.float32))
 
 
-def test_an_environment_without_a_limit_is_given_one(monkeypatch, capsys):
-    monkeypatch.setattr(environments, "MOST_STEPS", 5)
-    gymnasium.register("test/Endless-v0", f"{__name__}:Rover")
-    env = make_environment("test/Endless-v0")
-    for _ in range(2):
-        env.reset(seed=0)
-        ended = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(5)]
-        assert ended == [(False, False)] * 4 + [(False, True)]
-    assert "no limit of its own" in capsys.readouterr().err
-
-
 class Shared(Rover):
     def __deepcopy__(self, memo):
-        return self
+        raise TypeError("a socket cannot be copied")
 
 
 def test_an_environment_that_cannot_be_copied_is_refused_at_the_start(tmp_path):
     gymnasium.register("test/Shared-v0", f"{__name__}:Shared")
-    with pytest.raises(UserError, match=r"nothing can be foreseen in .*: it does not do what"):
+    with pytest.raises(UserError, match="a socket cannot be copied"):
         train(f"{__name__}:test/Shared-v0", out=tmp_path, algorithm="ppl_td3", episodes=1)
 
 
@@ -209,9 +190,6 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     assert len(run.metrics) == 5
 
 
-MISSPELT = replace(PHIL, settings={"bach_size": 4})
-
-
 @pytest.mark.parametrize(
     ("text", "given", "says"),
     [
@@ -228,40 +206,6 @@ def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path, text, 
     with pytest.raises(UserError, match=says):
         main(["train", *words, *given.split()])
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("device", "gpu"), ("threads", -1), ("seed", -1), ("preset", "mine"), ("speed", 0.0)],
-)
-def test_what_python_asks_for_is_checked_like_options(tmp_path, name, value):
-    asked: dict[str, Any] = {name: value}
-    with pytest.raises(UserError, match=f"{name} (must be|= -1 is out of)"):
-        train(ROVER, out=tmp_path / "run", **asked)
-    with pytest.raises(UserError, match=r"settings of .*:MISSPELT: .*'bach_size'"):
-        train(ROVER, out=tmp_path / "run", algorithm=f"{__name__}:MISSPELT")
-    assert not (tmp_path / "run").exists()
-
-
-def test_before_its_first_command_a_car_behind_a_network_has_hands_off():
-    env = make_environment(ROVER)
-    vehicle = DelayedVehicle(env, parse_spec("300ms"))
-    seen, _ = vehicle.reset(seed=0)
-    action = vehicle.behind(lambda _: np.ones(2, np.float32))(seen)
-    assert outer(env.action_range, action).tolist() == [0.0, 0.0]
-
-
-def test_a_person_drives_on_at_the_period_that_a_drive_was_recorded_with(monkeypatch):
-    dark = f"{__name__}:test/Dark-v0"
-    origin = Origin(
-        session="s", environment=dark, condition="nominal", seed=3, standing=False,
-        clock="lockstep", loop="policy", latency="none",
-    )  # fmt: skip
-    task = bridge.describe(bridge.make_environment(dark), 0.5)
-    recorded = RecordedEpisode(Path("drive.mcap"), "v", 0, origin, 0, task, began_ns=0)
-    monkeypatch.setattr(driving, "find_fork", lambda *_: (recorded, 0))
-    asked: Any = SimpleNamespace(recording="drive.mcap", scenario=dark)
-    assert driving._environment(asked)[0].control_period_s == 0.5
 
 
 @pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])
@@ -364,15 +308,6 @@ def test_what_a_wrapper_offers_is_found():
     assert env.env.get_wrapper_attr("pressed") == [True]
 
 
-def test_a_stop_of_no_environments_own_begins_each_episode_with_hands_off():
-    env = make_environment(odd("Says"))
-    for seed in (0, 1):
-        env.reset(seed=seed)
-        assert env.brake_action.tolist() == [0.0]
-        env.step(np.ones(1, np.float32))
-        assert env.brake_action.tolist() == [1.0]
-
-
 def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
     env = make_environment(ROVER)
     env.reset(seed=0)
@@ -388,12 +323,9 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
             find_algorithm(wrong)
     with pytest.raises(UserError, match=r"a person cannot see .*no render\(\)"):
         controls_of(f"{__name__}:test/Dark-v0")
-    with pytest.raises(UserError, match="draws no picture"):
-        make_environment(f"{__name__}:test/Dark-v0").render()
     controls = controls_of(ROVER)
     assert controls.rest == pytest.approx((-0.5, -1.0))
-    assert controls.mix({"up": 1.0}) == (1.0, 1.0)
-    assert controls.mix({"a": 1.0, "up": 0.0, "x": 1.0}) == pytest.approx((-1.0, -1.0))
+    assert controls.keys == {"up": (1.5, 2.0), "a": pytest.approx((-0.5, 0.0))}
     for keys, says in (
         ({"KeyQ": (0.0, 0.0)}, "is driven with q, which"),
         ({}, "several actions, and no keys"),
@@ -403,12 +335,6 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
         with pytest.raises(UserError, match=says):
             controls_of(ROVER)
     controls_of.cache_clear()
-
-
-def test_the_package_is_light_before_something_is_asked_for():
-    said = "import trainer, sys; print('torch' in sys.modules, hasattr(trainer, 'no'))"
-    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "False"]
 
 
 def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
@@ -425,7 +351,3 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
     assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
     assert np.isfinite(model.learn(2))
-    first, *_ = sitting_entries([sitting.recorder.path])
-    assert isinstance(first, ShownStep)
-    assert isinstance(first.scene, np.ndarray)
-    assert first.scene.shape == (8, 8, 3)

@@ -37,7 +37,6 @@ TOLD = [
     ("train --out x --set batch_size=1.5", "expected a whole number, got '1.5'"),
     ("train --out x --set bach_size=4", "did you mean batch_size?"),
     ("trian", "invalid choice: 'trian'"),
-    ("plot x --out a.jpg", "a picture is a .png"),
     ("plot one two --out c.png", "one holds no metrics"),
     ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
     ("experiment report status", "no other name"),

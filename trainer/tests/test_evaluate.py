@@ -10,11 +10,17 @@ import torch
 from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from trainer import drivers
 from trainer.__main__ import main
-from trainer.drivers import BEST_FILE, OnnxDriver, load_actor
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes, drive_together, evaluate
+from trainer.evaluation import (
+    BEST_FILE,
+    OnnxDriver,
+    TogetherDriver,
+    drive_episodes,
+    drive_together,
+    evaluate,
+    load_actor,
+)
 from trainer.learner.networks import Actor
 from trainer.util import save_torch
 
@@ -33,7 +39,7 @@ def test_a_crafted_field_of_a_checkpoint_is_one_line(tmp_path, crafted):
     label = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 0, "episode": 3}
     save_torch(tmp_path / BEST_FILE, {**label, "actor": Actor().state_dict(), **crafted})
     with pytest.raises(UserError):
-        load_actor(tmp_path)
+        load_actor(tmp_path, make_environment("left_turn"))
 
 
 @pytest.mark.parametrize("command", ["evaluate", "export"])
@@ -57,14 +63,14 @@ def test_a_policy_file_changes_as_fast_as_the_edge_lets_it(monkeypatch):
     manifest = msgspec.structs.replace(policy.manifest, action=[slow])
     session = SimpleNamespace(run=lambda outputs, inputs: [np.ones((1, 1), np.float32)])
     policy = policy._replace(manifest=manifest, session=session)
-    monkeypatch.setattr("edge_runtime.policy.load_policy", lambda *_, **__: policy)
+    monkeypatch.setattr("trainer.evaluation.load_policy", lambda *_, **__: policy)
     driver, seen = OnnxDriver(POLICY), np.zeros((2, 45, 80), np.uint8)
     for _ in range(2):
         driver.reset()
         np.testing.assert_allclose([driver.act(seen)[0] for _ in range(3)], [0.05, 0.1, 0.15])
 
 
-@drivers.TogetherDriver
+@TogetherDriver
 def brightness(observations):
     """Its action follows the newer picture."""
     means = observations.mean(axis=(2, 3), dtype=np.float64) / 255.0

@@ -16,8 +16,8 @@ import pytest
 from bridge.outcomes import COLLISION, GOAL
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import call, refusal
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.environments import CONDITIONS
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments import command, compute, figures, plan, records, report
 from trainer.experiments.compute import FAILED, FINISHED, STOPPED, Job
 from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit

@@ -9,6 +9,7 @@ from deploy.certs import write_key_pair
 from edge_runtime.policy import check_graph, load_policy
 from edge_runtime.util import UserError
 from trainer import policy_file as export_module
+from trainer.environments import make_environment
 from trainer.learner.networks import Actor
 from trainer.policy_file import Export, export_policy, parity, real_observations, write_policy
 
@@ -26,7 +27,7 @@ def make_actor(frames: int = 2) -> Actor:
 
 @pytest.fixture(scope="module")
 def exported() -> Export:
-    return export_policy(make_actor(), LABEL, {"gamma": 0.95})
+    return export_policy(make_actor(), LABEL, {"gamma": 0.95}, make_environment("left_turn"))
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +50,7 @@ def test_the_file_is_what_the_contract_says(exported):
 
 
 def test_parity_is_measured_on_observations_that_differ_and_sees_a_difference(exported):
-    observations, changed = real_observations("left_turn", 200), make_actor()
+    observations, changed = real_observations(make_environment("left_turn"), 200), make_actor()
     assert len(np.unique(observations.reshape(200, -1), axis=0)) > 190
     with torch.no_grad():
         assert changed(torch.from_numpy(observations)).std() > 0.01
@@ -63,7 +64,7 @@ def test_parity_is_measured_on_observations_that_differ_and_sees_a_difference(ex
 def test_an_export_that_fails_parity_writes_nothing(monkeypatch):
     monkeypatch.setattr(export_module, "parity", lambda *_: float("nan"))
     with pytest.raises(UserError, match="differ"):
-        export_policy(make_actor(), LABEL, {})
+        export_policy(make_actor(), LABEL, {}, make_environment("left_turn"))
 
 
 def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, tmp_path):
@@ -74,7 +75,7 @@ def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, t
     assert policy.manifest.training["seed"] == 4
     assert policy.manifest.training["config"] == {"gamma": 0.95}
     assert policy.manifest.action[0].name == "pedal"
-    for frames in real_observations("left_turn", 10):
+    for frames in real_observations(make_environment("left_turn"), 10):
         with torch.no_grad():
             wanted = make_actor()(torch.from_numpy(frames)[None])[0].numpy()
         np.testing.assert_allclose(policy.act({"frames": frames}), wanted, atol=1e-5)

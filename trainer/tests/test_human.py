@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.drivers import constant_driver
 from trainer.environments import expert_of, make_environment
+from trainer.evaluation import constant_driver
 from trainer.human import HumanModelConfig
 from trainer.human.guide import ASKED, Asking, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, imitate, load_human_model

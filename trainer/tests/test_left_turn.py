@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from trainer.drivers import constant_driver
+from trainer.evaluation import constant_driver
 from trainer.human.guide import HumanGuide, steps_held
 from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
 from trainer.person.tests.people import BRAKE, FULL, NOTHING, drive, episode

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
-from trainer.drivers import TogetherDriver
 from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluation import TogetherDriver, drive_episodes
 from trainer.human.guide import Intervention, make_transition
 from trainer.learner.replay import Transition
 from trainer.tests.loops import CONFIG, ScriptedEnv, frames, number

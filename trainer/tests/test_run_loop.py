@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from trainer.drivers import CHECKPOINT_FILE
+from trainer.evaluation import CHECKPOINT_FILE
 from trainer.learner.td3 import Losses
 from trainer.tests.loops import BATCH, CONFIG, HUMAN, POLICY, number, scripted_run, trained
 from trainer.training.metrics import MetricsWriter

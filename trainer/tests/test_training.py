@@ -17,7 +17,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from edge_runtime.cli import INTERRUPTED, run_cli
 from edge_runtime.util import UserError
 from trainer.__main__ import main
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
+from trainer.environments import make_environment
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import LearnerConfig
 from trainer.tests.learners import same_weights
@@ -74,7 +75,7 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
     assert human_steps == trained.learning.replay.human_count > 0
     assert EventAccumulator(str(directory / "tensorboard")).Reload().Tags()["scalars"]
     assert json.loads((directory / "report.json").read_text())["steps"] == steps
-    assert load_actor(directory)[1]["seed"] == 3
+    assert load_actor(directory, make_environment("left_turn"))[1]["seed"] == 3
 
 
 def test_the_same_seed_in_two_parts_gives_the_same_weights_and_metrics(trained, tmp_path):
@@ -228,6 +229,6 @@ def test_what_is_kept_is_the_averaged_network_that_was_validated(tmp_path):
     network = run.learning.learner.target_actor
     assert judged == [network.act(pictures)]
     wanted = network.state_dict()
-    assert same_actors(wanted, load_actor(tmp_path)[0].state_dict())
+    assert same_actors(wanted, load_actor(tmp_path, make_environment("left_turn"))[0].state_dict())
     (tmp_path / BEST_FILE).unlink()  # then the checkpoint's
-    assert same_actors(wanted, load_actor(tmp_path)[0].state_dict())
+    assert same_actors(wanted, load_actor(tmp_path, make_environment("left_turn"))[0].state_dict())

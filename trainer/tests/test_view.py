@@ -2,26 +2,24 @@
 
 import threading
 from contextlib import nullcontext
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
+import rerun as rr
 import torch
 from rerun.chunk import RrdReader
 
 from bridge.rerun import HUMAN, POLICY
 from trainer import view
-from trainer.__main__ import main
-from trainer.environments import make_environment
 from trainer.human.guide import REASONS
 from trainer.learner.config import LearnerConfig
-from trainer.person.recording import Recorder, packed
-from trainer.person.tests.people import recorded_step
 from trainer.training.config import RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
-from trainer.view import ShownStep
 
 TINY = RunConfig(
     seed=3, episodes=1, evaluate_every_steps=1, evaluation_runs=1, threads=1,
@@ -70,11 +68,11 @@ def test_the_view_holds_the_run(shown):
     for path in ("/action/applied", "/speed/ego"):
         assert [step for step, _ in found[path]] == steps
     ends = np.cumsum([int(row["steps"]) for row in metrics]) - 1
-    columns = {path: name for path, (_, name) in view.MEASURED.items()}
-    for path, column in {"return/episode": "episode_return", **columns}.items():
+    columns = [(plot, column) for plot, (_, shown) in view.EPISODES.items() for column in shown]
+    for plot, column in columns:
         said = zip(ends, (row[column] for row in metrics), strict=True)
         expected = {int(end): float(value) for end, value in said if value != "nan"}
-        assert dict(found.get(f"/{path}", [])) == pytest.approx(expected), path
+        assert dict(found.get(f"/{plot}/{column}", [])) == pytest.approx(expected), column
     pictures = {"/frames/now", "/frames/before", "/road/ego/body", "/road/traffic/body",
                 "/road/roads", "/status"}  # fmt: skip
     assert pictures <= found.keys()
@@ -86,24 +84,20 @@ def test_the_view_holds_the_run(shown):
     assert {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)} == view.DRIVERS
 
 
-def step(number=0, action: Any = 0.0, **changes):
-    return ShownStep(number, action, action, 3.0, None)._replace(**changes)
-
-
 def test_a_slow_view_holds_nobody_up():
-    drawn, go_on = [], threading.Event()
+    drawn: list[int] = []
+    go_on = threading.Event()
 
-    def draw(entry):
+    def draw(number, log):
         go_on.wait(10.0)
-        drawn.append(entry)
+        drawn.append(number)
 
-    background = view.Background(lambda: nullcontext(draw))
-    entries: list[Any] = [step(number) for number in range(view.MOST_WAITING + 100)]
-    for entry in entries:
-        background.put(entry)
+    background = view.Background(nullcontext)
+    for number in range(view.MOST_WAITING + 100):
+        background.put(partial(draw, number))
     go_on.set()
     background.close()
-    assert drawn[: view.MOST_WAITING] == entries[: view.MOST_WAITING]
+    assert drawn[: view.MOST_WAITING] == list(range(view.MOST_WAITING))
     assert len(drawn) - view.MOST_WAITING in (0, 1)  # One may have been in its hands already.
 
 
@@ -112,46 +106,21 @@ class PanicError(BaseException):
 
 
 def test_a_view_that_fails_does_not_end_the_run(capsys):
-    background = view.Background(lambda: nullcontext(Mock(side_effect=PanicError("disk full"))))
+    background = view.Background(nullcontext)
     for _ in range(3):
-        background.put(step())
+        background.put(Mock(side_effect=PanicError("disk full")))
     background.close()
     (line,) = capsys.readouterr().err.splitlines()
     assert "disk full" in line
 
 
-BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
-
-
-def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", policy: float | None = 0.5):
-    """A recorded sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
-    env, recorder = make_environment(scenario), Recorder(directory)
-    for episode, seed in enumerate(seeds):
-        observation, _ = env.reset(seed=seed)
-        for number, action in enumerate(BRAKED[:steps]):
-            frames = observation
-            observation, reward, *_ = env.step(np.array([action], np.float32))
-            recorder.write(recorded_step(
-                recorder.sitting, recorder.index, scenario=scenario, seed=seed, episode=episode,
-                step=number, seen=packed(frames), seen_next=packed(observation),
-                policy_action=policy, action=action, human=5 <= number < 10, first=number == 5,
-                reward=float(reward), speed_mps=env.ego.speed,
-                outcome="restarted" if number == steps - 1 else "",
-            ))  # fmt: skip
-    recorder.close()
-    return recorder.path
-
-
-def test_a_sitting_is_shown_whole(tmp_path):
-    drive(tmp_path / "drives")
-    out = tmp_path / "sitting.rrd"
-    assert main(["view", str(tmp_path / "drives"), "--save", str(out)]) == 0
-    found = values_in(out)
-    assert [value for _, value in found["/action/applied"]] == 2 * BRAKED
-    assert {value for _, value in found["/action/policy"]} == {0.5}
-    assert found["/driver"] == [
-        (0, "policy"), (5, "person"), (10, "policy"), (20, "person"), (25, "policy"),
-    ]  # fmt: skip
-    assert [step for step, _ in found["/return/episode"]] == [14, 29]
-    assert {"/road/ego/body", "/road/roads", "/frames/now"} <= set(found)
-    assert "/loss/critic" not in {path for path, rows in found.items() if rows}
+def test_numbers_and_the_picture_of_any_environment_are_drawn():
+    recording, action = MagicMock(), np.ones(2, np.float32)
+    seen: Any = SimpleNamespace(overruled=action, action=action)
+    picture = np.zeros((8, 8, 3), np.uint8)
+    near = {"near": np.arange(40.0)}
+    view.TrainingLog(recording).draw_step(0, seen, "slow", 3.0, near, picture=picture)
+    shown = dict(call.args for call in recording.log.call_args_list)
+    assert isinstance(shown["road/picture"], rr.Image)
+    rows = (shown[path].as_component_batches() for path in ("action/applied", "observation/near"))
+    assert [len(row[0].as_arrow_array().to_pylist()) for row in rows] == [2, 16]

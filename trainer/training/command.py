@@ -21,11 +21,11 @@ from bridge.report import ProgressBar
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml
-from trainer import options
-from trainer.drivers import CHECKPOINT_FILE, is_expert, located
+from trainer import util
 from trainer.environments import scenario_of
+from trainer.evaluation import CHECKPOINT_FILE, is_expert, located
 from trainer.learner.config import find_algorithm
-from trainer.person.interface import FASTEST, HUMANS, PERSON, SLOWEST, check_person_options
+from trainer.person import FASTEST, HUMANS, PERSON, SLOWEST
 from trainer.training.config import (
     CONFIG_FILE,
     DEFAULTS,
@@ -43,7 +43,6 @@ from trainer.training.config import (
 )
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals, write_learning_curve
 from trainer.training.run import TrainingRun
-from trainer.util import claimed
 
 
 @dataclass(frozen=True)
@@ -126,14 +125,14 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     values["human"] = PERSON if human in HUMANS else located(human)
     values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
     config = make_config(preset, values)
-    options.check_device(config.device)
+    util.check_device(config.device)
     run_dir = (_new_directory(config) if how.out is None else Path(how.out)).absolute()
     person = argparse.Namespace(
         human=human, scenario=config.scenario, host=how.host, port=how.port, speed=how.speed
     )
-    with claimed(run_dir), options.limited_threads(config.threads):
+    with util.claimed(run_dir), util.limited_threads(config.threads):
         person.resume = check_directory(run_dir, config, how.resume)
-        return _train(person, config, run_dir, how.rerun, options.deadline_s(how.max_minutes))
+        return _train(person, config, run_dir, how.rerun, util.deadline_s(how.max_minutes))
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -155,7 +154,6 @@ def _train(
             training, sitting = stack.enter_context(began)
             quit_training = sitting.quit
         else:
-            check_person_options(person)
             training = TrainingRun(config, run_dir, person.resume)
             quit_training = partial(_quit, training)
         extent = config.episodes, training.episode

@@ -19,9 +19,17 @@ from bridge.report import EpisodeResult
 from edge_runtime.files import write_atomic, write_json
 from edge_runtime.util import UserError
 from trainer import util
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, TogetherDriver, is_expert, load_driver
 from trainer.environments import check_foresight, expert_of, foresee, make_environment
-from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
+from trainer.evaluation import (
+    BEST_FILE,
+    CHECKPOINT_FILE,
+    NO_NETWORK,
+    TogetherDriver,
+    drive_episodes,
+    drive_together,
+    is_expert,
+    load_driver,
+)
 from trainer.human.guide import (
     ASKED,
     STUCK,

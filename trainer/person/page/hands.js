@@ -1,7 +1,7 @@
 // Keyboard and sliding pad. A held key or finger takes over; letting go hands control back.
 
 // Which keys there are, and what each adds to hands off, comes with a view: ``controls``, as in
-// trainer/person/controls.py. An action is one number, or a list of several.
+// ``Controls`` of trainer/person/web.py. An action is one number, or a list of several.
 const FIRST_S = 0.1; // what a press is worth at once
 const HOLD = "space";
 const WISHES = { KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit" };

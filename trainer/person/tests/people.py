@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import structs
 
 from trainer.environments import make_environment
-from trainer.person.interface import Reading, View, Wish
+from trainer.person import Reading, View, Wish
 from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.person.session import Sitting
 

@@ -10,9 +10,7 @@ from trainer.person.coach import Coaching, SittingEpisode
 from trainer.person.tests.browser import (
     LIVE,
     OVER,
-    READY,
     WHY,
-    Tunnel,
     first_view,
     page,
     poll,
@@ -180,21 +178,3 @@ async def test_what_is_shown_is_drawn_and_a_second_page_watches_until_the_end(br
     await until(browser, "!document.body.classList.contains('watching')")
     cockpit.close()
     await until(browser, OVER)
-
-
-async def test_a_lost_connection_is_letting_go_and_comes_back_once(browser, cockpit):
-    """Through a tunnel, as over ``ssh -L``, that swallows everything and then is cut."""
-    async with Tunnel(cockpit.port) as tunnel:
-        await browser.goto(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
-        await until(browser, READY)
-        await browser.keyboard.down("ArrowUp")
-        await reads(cockpit, lambda r: r.engaged)
-        tunnel.swallow()
-        await reads(cockpit, lambda r: r == LET_GO)
-        await asyncio.sleep(1.2)
-        tunnel.cut()  # As the page is about to give it up.
-        await until(browser, "document.body.dataset.link === 'lost'")
-        await press_again(browser, cockpit)
-        joined = len(tunnel._ways)
-        await asyncio.sleep(1.5)
-        assert len(tunnel._ways) == joined, "it does not connect again and again"

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from edge_runtime.util import UserError
-from trainer.drivers import CHECKPOINT_FILE
-from trainer.person.interface import vector
+from trainer.evaluation import CHECKPOINT_FILE
+from trainer.person import vector
 from trainer.person.recording import DIRECTORY, RecordedStep, read_steps, sittings
 from trainer.person.tests.browser import address, page, say
 from trainer.util import load_torch

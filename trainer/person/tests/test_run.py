@@ -23,7 +23,7 @@ from trainer.training.run import Parts, TrainingRun, Validation
 def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):
     behind = BehindTheScenes(RunConfig())
     for _ in range(2):
-        behind.begin(Candidate(Actor(), 1, 0.0, {}))
+        behind.begin(Candidate(Actor(), 1, 0.0))
         behind.kill()
         wait_until(lambda: not behind.busy, "the answer's absence")
         assert behind.take() is None

@@ -5,8 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.person.interface import WISHES, Reading, distance
-from trainer.person.takeover import MAX_SLEW, SILENCE_S, Input, Intent, Seat, TakeOver
+from trainer.person import (
+    MAX_SLEW,
+    SILENCE_S,
+    WISHES,
+    Input,
+    Intent,
+    Reading,
+    Seat,
+    TakeOver,
+    distance,
+)
 from trainer.person.tests.people import LET_GO
 
 ACTION = st.floats(-1.0, 1.0)

@@ -1,48 +1,21 @@
 import argparse
-import asyncio
-import itertools
-import os
 import queue
-import resource
-import socket
-import time
 import webbrowser
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 import aiohttp
 import pytest
 
 from trainer.person import web
-from trainer.person.interface import open_person
 from trainer.person.tests.browser import (
     WAIT_S,
-    hear,
     origin,
     page,
     reads,
     say,
-    view_of_step,
 )
 from trainer.person.web import MAX_INPUT_BYTES, Cockpit
-
-
-async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
-    """Its views and echoes pile up in front of a closed window; the loop's thread goes on."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", cockpit.port, limit=256)
-    path = cockpit.url.partition(str(cockpit.port))[2]
-    request = (
-        f"GET {path}socket HTTP/1.1\r\nHost: 127.0.0.1:{cockpit.port}\r\n"
-        f"Origin: {origin(cockpit)}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-        f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {'A' * 22}==\r\n\r\n"
-    )
-    writer.write(request.encode())
-    assert b"101" in await reader.readline()
-    for step in range(2000):
-        cockpit.show(view_of_step(step))
-    async with page(cockpit) as link:
-        assert (await hear(link, "view"))["step"] == 1999
-    writer.close()
 
 
 async def status_of(url, **more):
@@ -58,26 +31,7 @@ async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
     for name in (*served, "server.py", "..%2fserver.py"):
         assert (await status_of(cockpit.url + name))[0] == (200 if name in served else 404), name
     for path in ("", "wrong/", "wrong/cockpit.js", "wrong/socket", "socket"):
-        assert (await status_of(f"{origin(cockpit)}/{path}"))[0] == 403, path
-
-
-@pytest.mark.parametrize(
-    ("words", "answer"),
-    [
-        (b"\x16\x03\x01\x02\x00", b"400 Bad Request"),
-        (b"OPTIONS * HTTP/1.1", b"421 "),
-        (b"GET /wrong/ HTTP/1.1\r\nHost: 127.0.0.1", b"403"),  # no token
-    ],
-)
-def test_who_is_refused_is_disconnected_and_the_log_stays_empty(cockpit, caplog, words, answer):
-    with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
-        link.sendall(words + (b"" if b"Host" in words else b"\r\nHost: x") + b"\r\n\r\n")
-        told = b""
-        while part := link.recv(4096):
-            told += part
-    assert answer in told.partition(b"\r\n")[0]
-    cockpit.close()
-    assert caplog.messages == []
+        assert (await status_of(f"{origin(cockpit)}/{path}"))[0] == 404, path
 
 
 async def refusal(cockpit, **more):
@@ -118,8 +72,8 @@ async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
 
 
 def open_web(**options):
-    given = {"human": "web", "scenario": "left_turn", "speed": 1.0}
-    return open_person(argparse.Namespace(**given, **{"host": "127.0.0.1", "port": 0, **options}))
+    given = {"scenario": "left_turn", "host": "127.0.0.1", "port": 0}
+    return web.open_cockpit(argparse.Namespace(**given | options))
 
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
@@ -128,7 +82,7 @@ def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys
         cockpit.close()
         out, err = capsys.readouterr()
         assert ("warning: --host" in err) == warned
-        assert (f"phone in this network: {cockpit.phone_url}\n" in out) == warned
+        assert out == f"cockpit: open {cockpit.url}\n"
 
 
 async def test_where_there_is_a_display_the_browser_opens_by_an_address_for_one_request(
@@ -145,46 +99,6 @@ async def test_where_there_is_a_display_the_browser_opens_by_an_address_for_one_
         assert (await status_of(url))[0] == 200
         assert (await status_of(url))[0] == 403
         assert (await status_of(cockpit.url))[0] == 200
-
-
-CROWD = 375
-
-
-@pytest.fixture
-def few_descriptors():
-    """As many as a crowd of clients needs in this process, and the door with its pages besides."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    held = {int(name) for name in os.listdir("/dev/fd")}  # By earlier tests, anywhere.
-    free = (number for number in itertools.count() if number not in held)
-    enough = next(itertools.islice(free, CROWD + web.MAX_CONNECTIONS + 40, None))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (enough, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-@pytest.mark.usefixtures("few_descriptors")
-async def test_a_crowd_that_says_little_takes_no_descriptors_and_fills_no_log(cockpit, caplog):
-    there = ("127.0.0.1", cockpit.port)
-    with ExitStack() as idle:
-        async with page(cockpit) as link:
-            await say(link)
-            for _ in range(CROWD):
-                idle.enter_context(socket.create_connection(there, WAIT_S)).sendall(b"GET /")
-                await say(link)  # A page that falls silent is disconnected.
-            assert (await status_of(cockpit.url))[0] == 200
-            assert (await say(link))["driving"], "the page that was there first stays"
-    cockpit.close()
-    assert caplog.messages == []
-
-
-def test_a_client_that_sends_no_whole_request_is_cut_off(cockpit, monkeypatch):
-    monkeypatch.setattr(web, "HEADERS_S", 0.2)
-    with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as stranger:
-        stranger.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: ")
-        began_s = time.monotonic()
-        with suppress(ConnectionResetError):
-            assert stranger.recv(1) == b""
-        assert time.monotonic() - began_s < WAIT_S / 2
 
 
 @pytest.mark.parametrize("host", ["evil.example:{port}", "[::1", "127.0.0.1.evil"])
