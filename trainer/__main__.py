@@ -55,7 +55,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
     file = "read options and settings from this file, such as the config.toml of a run; options "
-    file += "on the command line win; --preset and --algorithm may not change a setting in it"
+    file += "on the command line win; a setting in it wins over one of --preset or --algorithm"
     add("--config", metavar="F.toml", help=file)
     change = "change a setting; may be repeated; --set alone lists all settings with their "
     change += "defaults and meanings"
@@ -190,7 +190,7 @@ def bench(parser: argparse.ArgumentParser) -> None:
 
 
 @command(
-    "trainer.experiments.command:run",
+    "trainer.experiments.compute:run",
     "python -m trainer experiment status",
     "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
     "python -m trainer experiment guidance --max-minutes 60",
@@ -200,15 +200,13 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     words = (
         f"compute the missing runs of {', '.join(plan.EXPERIMENTS)} or all (the paper's), or of "
         "the guidance table, and write the page; status (of guidance): count the finished runs; "
-        "report: write the paper's page from the runs that there are; typical: write the curves "
-        "that the coach of the cockpit shows"
+        "report: write the paper's page from the runs that there are"
     )
-    known = [*plan.EXPERIMENTS, *plan.WORDS, *plan.STUDIES]
+    known = [*plan.EXPERIMENTS, "all", "status", "report", *plan.STUDIES]
     add("names", nargs="+", metavar="NAME", choices=known, help=words)
     seeds = "trainings of each algorithm in each setting"
     add("--seeds", type=cli.whole_number(1, 1000), default=plan.DEFAULT_SEEDS, help=seeds)
-    one = f"compute this task only (default: all; {', '.join(plan.FOREIGN)}: of guidance)"
-    add("--scenario", choices=[*plan.SCENARIOS, *plan.FOREIGN], help=one)
+    add("--scenario", choices=list(plan.TASKS), help="compute this task only (default: all)")
     quick = "train for a few steps, in RUNS/quick: a trial whose numbers mean nothing"
     add("--quick", action="store_true", help=quick)
     how = parser.add_argument_group("how it is computed")
@@ -220,8 +218,7 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     last = "stop every run after its next episode once this time is over; the same command resumes"
     add_time_limit(how, last)
     where = parser.add_argument_group("where it is kept")
-    results = "tables, figures and page (default: results/paper, or results/guidance; typical: the "
-    results += "directory of both, results)"
+    results = "tables, figures and page (default: results/paper, or results/guidance)"
     where.add_argument("--results", metavar="DIR", help=results)
     runs = "checkpoints and actors (default: runs/paper, or runs/guidance)"
     where.add_argument("--runs", metavar="DIR", help=runs)

@@ -7,7 +7,8 @@ and, in the last step, the outcome. `Adapted` brings any environment into that f
 """
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,11 +19,14 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from bridge import environments as bridge
+from bridge.inbound import ROUNDING_S
+from bridge.network import COMMAND_WINDOW, LatencySpec, VirtualLink
 from bridge.outcomes import outcome_of
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError
+from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Action, Expert, Reason
-from trainer.learner.replay import ReplayLayout
+from trainer.learner.replay import Observation, ReplayLayout
 from trainer.scenarios import SCENARIOS, Scene
 from trainer.util import PERIOD_S
 
@@ -275,3 +279,82 @@ def _known(info: Mapping[str, Any]) -> dict[str, Any]:
     """Return the info with distance and speed, which are 0 and NaN where they are unknown."""
     unknown = {"distance_m": 0.0, "speed_mps": float("nan")}
     return unknown | {key: value for key, value in info.items() if value is not None}
+
+
+class DelayedVehicle:
+    """Wraps an environment whose policy acts over a network; the vehicle brakes by itself.
+
+    Each control period ask a policy that is ``behind`` the network for the vehicle's action, and
+    step with it, or with a human's after ``release_brake``. The seed of an episode decides the
+    network's luck, too, as in ``bridge simulate``.
+
+    A learner stores what happens at the vehicle beside what the policy knows of it: in tick n the
+    observation of tick n - d, the action carried out in tick n, its reward, and the observation of
+    tick n + 1 - d, where d (`ticks_late`) is how many ticks old a command is that is on time.
+    """
+
+    def __init__(self, env: Any, spec: LatencySpec) -> None:
+        self.env, self.spec = env, spec
+        self.control_period_s: float = env.control_period_s
+        self._braking = False
+
+    def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed)
+        self.link: VirtualLink[Observation] = VirtualLink(
+            self.spec, seed, self.control_period_s, observation.nbytes
+        )
+        self._tick = 0
+        return observation, info
+
+    def step(self, action: Action) -> Any:
+        """Drive for one control period."""
+        return self.env.step(action)
+
+    def behind(self, policy: Callable[[Observation], Action]) -> Callable[[Observation], Action]:
+        """Return what the vehicle does with a policy on the other end: once a control period.
+
+        The policy is asked for each fresh observation that reaches the edge within the tick. The
+        vehicle obeys the newest command; it brakes where none has come for 2 T, or the command is a
+        safe stop.
+        """
+
+        def carried_out(observation: Observation) -> Action:
+            self.link.send_state(self._tick, observation)
+            self._tick += 1
+            while arrival := self.link.next_at_edge():
+                if not arrival.overtaken:
+                    answer = policy(arrival.message)
+                    self.link.answer(arrival, _command(arrival.step, answer))
+            decision = self.link.decide()
+            self._press_brake(bool(decision.brake_reason))
+            if self._braking:
+                return self.env.brake_action
+            command = decision.command
+            return self.env.rest_action if command is None else np.array(command.action, np.float32)
+
+        return carried_out
+
+    def release_brake(self) -> None:
+        """Let a human drive until the next tick."""
+        self._press_brake(False)
+
+    def _press_brake(self, pressed: bool) -> None:
+        """Brake or not until the next tick: a scenario whose action only steers has a pedal."""
+        self._braking = pressed
+        getattr(self.env, "press_brake", lambda pressed: None)(pressed)
+
+
+def _command(step: int, action: Action) -> Command:
+    """Make a command as far as a virtual link looks at it."""
+    return Command(
+        session="", episode=0, step=step, mode=DRIVE, action=action.tolist(), policy_id="",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
+
+
+def ticks_late(spec: LatencySpec, period_s: float) -> int:
+    """Return how many ticks old the state is that a command answers when it is on time."""
+    round_trip_s = (spec.up.delay_ms + spec.down.delay_ms) * 1e-3
+    beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW * period_s - ROUNDING_S)
+    return math.ceil(beyond_window_s / period_s)

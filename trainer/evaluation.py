@@ -24,6 +24,7 @@ from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer.environments import (
     CONDITIONS,
+    DelayedVehicle,
     check_trained_in,
     entries_of,
     expert_of,
@@ -38,7 +39,6 @@ from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation
 from trainer.training.config import period_of
-from trainer.training.delayed import DelayedVehicle
 from trainer.util import fitting, limited_threads, load_torch
 
 NO_NETWORK = LatencySpec()

@@ -1,13 +1,27 @@
-"""One unit from its first step to its record: training, test drives, and what is kept of both.
+"""``python -m trainer experiment``: compute what is missing of a study, then write its page.
 
-What is killed goes on from its last checkpoint, to the same bits.
+A unit goes from its first step to its record: training, test drives, and what is kept of both.
+Units are computed in processes of this machine or on a Ray cluster. What is killed goes on from its
+last checkpoint, to the same bits.
 """
 
+import argparse
 import json
 import math
+import multiprocessing
+import os
+import signal
+import sys
+import tempfile
+import threading
 import time
-from collections.abc import Iterable
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,58 +31,40 @@ import pandas as pd
 import torch
 
 from bridge.outcomes import GOAL
-from edge_runtime.files import write_json
-from edge_runtime.util import read_bytes, read_json
-from trainer import util
+from bridge.report import ProgressBar
+from edge_runtime.files import make_directory, write_atomic, write_json
+from edge_runtime.util import UserError, read_bytes, read_json
+from trainer import evaluation, util
 from trainer.environments import make_environment
 from trainer.evaluation import (
     BEST_FILE,
     CHECKPOINT_FILE,
-    CONSTANT,
     constant_driver,
     drive_episodes,
     drive_together,
-    is_expert,
     load_actor,
     load_driver,
 )
-from trainer.experiments import plan
-from trainer.experiments.plan import TASKS, Line, Study, Unit
-from trainer.experiments.records import (
-    ARRIVED_ONLY,
-    DISTANCE,
-    RECORD_FILE,
-    REWARD,
-    Record,
-    Store,
-    columns_of,
-    summarise_tests,
-)
+from trainer.experiments import plan, records, report
+from trainer.experiments.plan import STUDIES, TASKS, Study, Unit
+from trainer.experiments.records import RECORD_FILE, Record, Store
 from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, was_validated
 from trainer.training.run import TrainingRun
+from trainer.util import check_device, deadline_s
 
-FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
-"""How work on a unit ends: with its record; with a checkpoint, for lack of time; at once, since
-another process has it; with an error."""
-EPISODES = {
-    "total_steps": "end_step",
-    "episode_return": "return",
-    "distance_m": "distance_m",
-    "outcome": "outcome",
-    "human_steps": "human_steps",
-    "interventions": "takeovers",
-    "validation_success": "validation_success",
-    "validation_distance_m": "validation_distance_m",
-    "validation_reward": "validation_reward",
-}
+FINISHED, STOPPED, FAILED = "finished", "stopped", "failed"
+"""How a unit ends: with its record; with a checkpoint, for lack of time; with an error."""
+RENAMED = {"total_steps": "end_step", "episode_return": "return", "interventions": "takeovers"}
 """Column of a run's metrics -> column of the table of episodes."""
 TIMES = ["environment_s", "acting_s", "storing_s", "waiting_s"]
 """Columns of the metrics that add up to the time that a training took."""
 UNLIMITED_EPISODES = 10**6  # So many that steps decide
+TOGETHER = 50  # Test drives side by side
+Files = dict[str, bytes]
 
 
 @dataclass(frozen=True)
@@ -83,13 +79,170 @@ class Job:
 
     @property
     def run_dir(self) -> Path:
-        """Where the unit is trained."""
         return self.store.run_dir(self.unit)
 
     @property
     def human_model(self) -> Path:
-        """The human model of its scenario."""
         return self.store.humans / self.unit.scenario / MODEL_FILE
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compute, say how much is done, or report; return the exit status."""
+    names, seeds = {*arguments.names}, arguments.seeds
+    study = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
+    alone = names - plan.EXPERIMENTS.keys()
+    if alone and len(names) > 1 and names != {"status", study.name}:
+        raise UserError(f"{', '.join(sorted(alone))}: no other name goes with it")
+    store = _store(arguments, study)
+    units = store.study.units(seeds, arguments.scenario, names)
+    if "status" in names:
+        there = store.load(units, seeds)
+        done = Counter(unit[:3] for unit in there.found)
+        for line, count in Counter(unit[:3] for unit in units).items():
+            print("{2:10} {1:24} {0:11}".format(*line), f"{done[line]} of {count} done")
+        stale = f"{len(there.stale)} records of other settings"
+        print(f"{len(there.found)} of {len(units)} units done; {stale}")
+        return 0
+    failed = 0 if "report" in names else compute_missing(arguments, store, units)
+    there = store.load(store.study.units(seeds), seeds)
+    if "report" in names or {*units} & {*there.found}:
+        print(f"wrote {report.write_page(store, there)}")
+    return 1 if failed else 0
+
+
+def _store(arguments: argparse.Namespace, study: Study) -> Store:
+    results = Path(arguments.results or util.kept(f"results/{study.name}"))
+    runs = Path(arguments.runs or util.kept(f"runs/{study.name}"))
+    if arguments.quick:
+        study, results, runs = study.quick(), runs / "quick/results", runs / "quick"
+    return Store(study, results, runs, Path(arguments.humans))
+
+
+def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequence[Unit]) -> int:
+    """Compute the units that have no current record; return how many failed."""
+    if not wanted:
+        raise UserError(f"{', '.join(arguments.names)}: nothing to compute in {arguments.scenario}")
+    check_device(arguments.device)
+    stop_at_s = deadline_s(arguments.max_minutes, time.time)  # The clock of all processes
+    done = {*store.load(wanted, arguments.seeds).found}
+    jobs = [Job(unit, store, stop_at_s, arguments.device) for unit in wanted if unit not in done]
+    ends: Counter[str] = Counter()
+    with util.claimed(store.runs), ProgressBar("units", len(jobs)) as bar:
+        start = run_on_ray(jobs, arguments.ray) if arguments.ray else run_here(jobs, arguments.jobs)
+        for job, end in start:
+            ends[end] += 1
+            bar.advance({"last": str(job.unit)})
+    said = "".join(f", {count} {end}" for end, count in ends.items())
+    print(f"{len(done)} of {len(wanted)} units were there already{said}")
+    if ends[FINISHED] < len(jobs):
+        print("the same command goes on")
+    return ends[FAILED]
+
+
+def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str]]:
+    """Compute units in so many processes at a time, 0: one for each core; yield how each ends.
+
+    Raises UserError where a process dies: nothing tells which unit's it was.
+    """
+    pool = ProcessPoolExecutor(
+        processes or util.cores(), multiprocessing.get_context("spawn"), _begin_process,
+        max_tasks_per_child=1,
+    )  # fmt: skip
+    try:
+        work = {pool.submit(compute, job): job for job in jobs}
+        for future in as_completed(work):
+            if time.time() > work[future].stop_at_s:
+                for each in work:  # A process takes seconds to find out that the time is over.
+                    each.cancel()
+            yield work[future], _end(work[future], future.result)
+    except BaseException:
+        # Only here: a process that is killed while it waits for work keeps the queue's lock.
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
+    pool.shutdown()
+
+
+def _begin_process() -> None:
+    """Leave ^C to the parent, end with it, and keep the machine usable for others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=util.die_with_parent, daemon=True).start()
+    os.nice(5)
+
+
+def _end(job: Job, result: Callable[[], str]) -> str:
+    """Return how a unit ended; an error is one line, with a traceback where it is not ours."""
+    try:
+        return result()
+    except CancelledError:
+        return STOPPED
+    except BrokenProcessPool:
+        raise UserError("the process of a unit died; the same command goes on") from None
+    except Exception as error:
+        cause = getattr(error, "cause", error)  # Ray wraps it.
+        if not isinstance(cause, UserError):
+            traceback.print_exception(error)
+        said = f"failed: {job.unit}: {type(cause).__name__}: {cause}"
+        print(" ".join(said.split()), file=sys.stderr, flush=True)
+    return FAILED
+
+
+def run_on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str]]:
+    """Compute units as Ray tasks of one processor each; yield how each ends.
+
+    ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
+
+    Raises UserError: Ray is not installed, or nothing answers at the address.
+    """
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
+    import bridge
+    import edge_runtime
+    import trainer
+
+    # Nodes need the libraries; our own code is sent to them.
+    modules = {"py_modules": [edge_runtime, bridge, trainer]}
+    try:
+        ray.init(address=address, runtime_env=modules, log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise UserError(f"--ray {address}: no cluster answers: {error}") from error
+    remote = ray.remote(num_cpus=1, max_retries=3)(compute_there)  # For nodes that die
+    work = {remote.remote(job, files_of(job, [job.human_model])).future(): job for job in jobs}
+    for future in as_completed(work):
+        job = work[future]
+        yield job, _end(job, partial(take, job, future.result))
+
+
+def compute_there(job: Job, files: Files) -> tuple[str, Files]:
+    """Compute a unit on a node; return how it ended, and the files that it leaves."""
+    with tempfile.TemporaryDirectory() as root:
+        store = replace(job.store, runs=Path(root) / "runs", humans=Path(root))
+        job = replace(job, store=store)
+        write_files(job, files)
+        return compute(job), files_of(job, [])
+
+
+def files_of(job: Job, more: Iterable[Path]) -> Files:
+    paths = [*job.run_dir.glob("*"), *more]
+    return {path.name: path.read_bytes() for path in paths if path.is_file()}
+
+
+def write_files(job: Job, files: Files) -> None:
+    for name, data in files.items():
+        path = job.human_model if name == MODEL_FILE else job.run_dir / name
+        make_directory(path.parent)
+        write_atomic(path, data)
+
+
+def take(job: Job, there: Callable[[], tuple[str, Files]]) -> str:
+    """Keep what a node made; return how it ended."""
+    end, files = there()
+    write_files(job, files)
+    if end == FINISHED:
+        (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
+    return end
 
 
 def compute(job: Job) -> str:
@@ -100,6 +253,7 @@ def compute(job: Job) -> str:
     torch.set_num_threads(1)
     if time.time() > job.stop_at_s or (job.unit.trained and not _train(job)):
         return STOPPED
+    make_directory(job.run_dir)
     write_json(job.run_dir / RECORD_FILE, make_record(job))
     # The actor stays, for export and for tests to come; what learning needs is large.
     (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
@@ -133,7 +287,7 @@ def _train(job: Job) -> bool:
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
     if over and was_validated(rows[-1]) and (run_dir / BEST_FILE).is_file():
-        return True  # trained before; the checkpoint may be gone already
+        return True  # Trained before; the checkpoint may be gone already.
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
@@ -148,15 +302,17 @@ def make_record(job: Job) -> Record:
     """Test a unit, trained or not; return its rows of each table."""
     unit, study = job.unit, job.store.study
     tables: dict[str, pd.DataFrame] = {}
-    own: dict[str, Any] = {}
+    own: dict[str, Any] = {
+        "digest": study.digest(unit),
+        "config": json.dumps(study.config(unit), separators=(",", ":")),
+    }
     device, policy = "cpu", unit.scripted_human
     if unit.trained:
         rows = pd.read_csv(job.run_dir / METRICS_FILE)
-        episodes = rows[[*EPISODES]].rename(columns=EPISODES)
-        tables["episodes"] = episodes.map(_rounded)
-        env = make_environment(TASKS[unit.scenario][0])
+        tables["episodes"] = rows.rename(columns=RENAMED)[records.TABLES["episodes"]].map(_rounded)
+        env = make_environment(TASKS[unit.scenario]["environment"])
         tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
-        own = {
+        own |= {
             "period_s": env.control_period_s,
             "updates": int(rows.updates.iloc[-1]),
             "tested_actor_at_step": int(rows.total_steps[tested - 1]),
@@ -166,57 +322,38 @@ def make_record(job: Job) -> Record:
         device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
         policy = str(job.run_dir)
     elif unit.algorithm == plan.CONSTANT:
-        own = best_constant(unit.scenario, study)
-        policy = f"{CONSTANT}{own['action']}"
+        own |= best_constant(unit.scenario, study)
+        policy = f"{evaluation.CONSTANT}{own['action']}"
     elif unit.algorithm == plan.HUMAN_MODEL:
         policy = str(job.human_model.parent)
-    began_s = time.monotonic()
-    drives = drive_tests(unit, policy, study.of(unit.scenario))
-    own["tests_s"] = round(time.monotonic() - began_s)
-    tables["tests"] = summarise_tests(unit.scenario, drives)
-    if Line(unit.algorithm, unit.setting) in plan.BOXED:
-        tables["drives"] = arrivals(drives, plan.BOXES[unit.scenario])
-    row = {
-        "digest": study.digest(unit),
-        "config": json.dumps(study.config(unit), separators=(",", ":")),
-        "human_model": None,
-        **own,
-        **_computed_on(device),
-    }
+    drives = drive_tests(unit, policy, study.of(unit.scenario).test_runs)
+    tables["tests"] = records.summarise_tests(unit.scenario, drives)
     if unit.needs_human:
-        model = sha256(read_bytes(job.human_model, "human model"))
-        row["human_model"] = model.hexdigest()[: plan.ID_LENGTH]
-    record = {name: columns_of(table) for name, table in tables.items()}
-    return {**record, "units": {name: [value] for name, value in row.items()}}
+        own["human_model"] = sha256(read_bytes(job.human_model, "human model")).hexdigest()[:12]
+    tables["units"] = pd.DataFrame([own | _computed_on(device)])
+    return {name: records.columns_of(table) for name, table in tables.items()}
 
 
 def _rounded(value: Any) -> Any:
-    """Return a number with five digits; anything else as it is."""
     return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
-def drive_tests(unit: Unit, policy: str, study: Study) -> pd.DataFrame:
+def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
     """Return the test drives of a policy, a row each, condition by condition."""
-    environment, seeds = TASKS[unit.scenario][0], range(study.test_runs)
-    columns = ["outcome", DISTANCE, REWARD, *ARRIVED_ONLY]
+    environment, seeds = TASKS[unit.scenario]["environment"], range(count)
     tests = []
     for condition in unit.conditions:
         env = make_environment(environment, condition)
         driver: Any = load_driver(policy, env)[0]
-        if is_expert(policy):  # it has a memory, and drives its own environment only
+        if evaluation.is_expert(policy):  # It has a memory, and drives its own environment only.
             drives = drive_episodes(env, driver, seeds, condition)
         else:
-            more = range(min(study.together, study.test_runs) - 1)
+            more = range(min(TOGETHER, count) - 1)
             envs = [env, *(make_environment(environment, condition) for _ in more)]
             drives = drive_together(envs, driver.act_together, seeds, condition)
-        tests += [(condition, drive.seed, *(_rounded(getattr(drive, name)) for name in columns))
+        tests += [(condition, *(_rounded(getattr(drive, name)) for name in records.DRIVEN))
                   for drive in drives]  # fmt: skip
-    return pd.DataFrame(tests, columns=["condition", "drive", *columns])
-
-
-def arrivals(drives: pd.DataFrame, quantities: Iterable[str]) -> pd.DataFrame:
-    """Return the rows of the table of drives: those that reach the goal."""
-    return drives.loc[drives.outcome == GOAL, ["condition", "drive", *quantities]]
+    return pd.DataFrame(tests, columns=["condition", *records.DRIVEN])
 
 
 def best_constant(scenario: str, study: Study) -> dict[str, Any]:
@@ -224,7 +361,7 @@ def best_constant(scenario: str, study: Study) -> dict[str, Any]:
 
     Searched on two grids: from -1 to 1, then a step to either side of the best one.
     """
-    envs = [make_environment(scenario) for _ in range(study.together)]
+    envs = [make_environment(scenario) for _ in range(min(TOGETHER, study.search_runs))]
     seeds = [util.episode_seed(0, util.Purpose.VALIDATION, run) for run in range(study.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
@@ -243,11 +380,9 @@ def best_constant(scenario: str, study: Study) -> dict[str, Any]:
 
 def _computed_on(device: str) -> dict[str, Any]:
     """Return what computed: the same settings give other bits elsewhere."""
-    there = torch.cuda.is_available()
-    gpu = torch.cuda.get_device_name() if there else "of another machine"
     return {
         "processor": util.processor_model(),
-        "gpu": gpu if device == "cuda" else None,
+        "gpu": None if device == "cpu" else torch.cuda.get_device_name(),
         "bfloat16": bfloat16_is_faster(device),
         "compiled_kernel": load_kernel() is not None,
         "torch": torch.__version__,

@@ -6,7 +6,6 @@ of these: ``pandas.read_csv("results/guidance/units.csv.xz")`` reads one.
 
 from __future__ import annotations
 
-import copy
 import lzma
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -32,23 +31,22 @@ KEY = ["scenario", "algorithm", "setting", "seed"]  # A unit, in every table
 RECORD_FILE = "record.json"  # What a unit leaves in its directory: table -> column -> values
 WRITING_PATIENCE_S = 60.0
 """Longest wait for another process to finish writing the tables."""
-SUCCESS, DISTANCE, REWARD, TIME_S = "success", "distance_m", "reward", "time_s"
-LATERAL, LONGITUDINAL = "lateral_acceleration_mps2", "longitudinal_acceleration_mps2"
-ARRIVED_ONLY = [TIME_S, LATERAL, LONGITUDINAL]
-"""Compared over drives that reach the goal only: a car that crashes at once is quick and smooth."""
+SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
+ARRIVED_ONLY = ["time_s", "lateral_acceleration_mps2", "longitudinal_acceleration_mps2"]
+"""Means of the drives that reach the goal only: a car that crashes at once is quick and smooth."""
+DRIVEN = ["outcome", DISTANCE, REWARD, *ARRIVED_ONLY]  # What is taken of a test drive
 SCORES = (SUCCESS, REWARD, DISTANCE)
 TABLES: Mapping[str, list[str]] = {
     "episodes": [
         *("end_step", "return", DISTANCE, "outcome", "human_steps", "takeovers"),
-        *(f"validation_{score}" for score in SCORES),
+        *(f"validation_{score}" for score in (SUCCESS, DISTANCE, REWARD)),
     ],
     "tests": ["condition", "drives", *SCORES],
-    "drives": ["condition", "drive", *ARRIVED_ONLY],
     "units": ["digest", "period_s", "training_s"],
 }
 """Table -> columns that it has at least: a row is a training episode, with the validation at its
-end if there was one; a test condition; a test drive; a unit. The last table is written last: it
-says which units the others hold."""
+end if there was one; a test condition; a unit. The last table is written last: it says which units
+the others hold."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
@@ -63,8 +61,8 @@ Record = Mapping[str, Mapping[str, list[Any]]]  # Table -> column -> the unit's 
 
 def columns_of(table: pd.DataFrame) -> dict[str, list[Any]]:
     """Return the columns as JSON takes them: with None for NaN."""
-    return {str(name): values for name, values in
-            table.astype(object).where(table.notna(), None).to_dict("list").items()}  # fmt: skip
+    plain = table.astype(object).where(table.notna(), None)
+    return {str(name): values for name, values in plain.to_dict("list").items()}
 
 
 def summarise_tests(scenario: str, drives: pd.DataFrame) -> pd.DataFrame:
@@ -101,7 +99,7 @@ class Store:
     humans: Path  # Directory with a human model for each scenario
 
     def run_dir(self, unit: Unit) -> Path:
-        """Where the unit is trained, and its actor stays."""
+        """Return where the unit is trained, and its actor stays."""
         return self.runs / self.study.run_name(unit)
 
     def load(self, units: Collection[Unit], seeds: int) -> Records:
@@ -110,36 +108,32 @@ class Store:
         Raises UserError: a record or a table is damaged, or another process keeps writing.
         """
         wanted = {unit: self.study.digest(unit) for unit in units}
-        tables = self._tables()
-        if self._left(wanted, tables):
-            with util.held(self.results, WRITING_PATIENCE_S) as mine:
-                if not mine:
-                    raise UserError(f"{self.results} is held by another process")
-                tables = self._tables()
-                self._pack(tables, self._left(wanted, tables))
+        with util.held(self.results, WRITING_PATIENCE_S) as mine:
+            if not mine:
+                raise UserError(f"{self.results} is held by another process")
             tables = self._tables()
+            if new := self._left(wanted, tables):
+                self._pack(tables, new)
+                tables = self._tables()
         known = tables["units"].digest.to_dict()
         found = [unit for unit, digest in wanted.items() if known.get(unit) == digest]
         stale = [unit for unit in wanted if unit in known and unit not in found]
         current = {name: table[table.index.isin(found)] for name, table in tables.items()}
         return Records(self.study, current, found, stale, seeds)
 
-    def record_left(self, unit: Unit) -> Record | None:
-        """Return the current record that a run has left in the unit's directory."""
-        path = self.run_dir(unit) / RECORD_FILE
-        if not path.is_file():
-            return None
-        record = read_json(path, "record")
-        with util.fitting(f"{path} is no record of a unit"):
-            return record if record["units"]["digest"] == [self.study.digest(unit)] else None
-
     def _left(
         self, wanted: Mapping[Unit, str], tables: Mapping[str, pd.DataFrame]
     ) -> dict[Unit, Record]:
-        """Return the records that runs have left and that the tables lack."""
-        known = tables["units"].digest.to_dict()
-        return {unit: record for unit, digest in wanted.items() if known.get(unit) != digest
-                and (record := self.record_left(unit))}  # fmt: skip
+        """Return the current records that runs have left and that the tables lack."""
+        known, left = tables["units"].digest.to_dict(), dict[Unit, Record]()
+        for unit, digest in wanted.items():
+            path = self.run_dir(unit) / RECORD_FILE
+            if known.get(unit) != digest and path.is_file():
+                record = read_json(path, "record")
+                with util.fitting(f"{path} is no record of a unit"):
+                    if record["units"]["digest"] == [digest]:
+                        left[unit] = record
+        return left
 
     def _tables(self) -> dict[str, pd.DataFrame]:
         """Return all tables, with the unit as their index; empty where there is no file."""
@@ -177,20 +171,8 @@ class Records:
 
     def of(self, task: str, line: Line) -> pd.DataFrame:
         """Return the numbers of a line's units, by seed; what is only tested has seed 0."""
-        its, (algorithm, setting) = self.numbers, line
-        return its[(its.scenario == task) & (its.algorithm == algorithm) & (its.setting == setting)]
-
-    def only(self, seeds: int) -> Records:
-        """Return the records with the numbers of the first seeds."""
-        few = copy.copy(self)
-        few.numbers = self.numbers[self.numbers.seed <= seeds]
-        return few
-
-    def arrivals(self, task: str, line: Line, condition: str) -> pd.DataFrame:
-        """Return the test drives of a line that are kept and reach the goal."""
-        drives = self.tables["drives"]
-        units = self.of(task, line)[KEY].itertuples(index=False, name=None)
-        return drives[drives.index.isin([*units]) & (drives.condition == condition)]
+        its = self.numbers
+        return its[(its.scenario == task) & (its.algorithm == line[0]) & (its.setting == line[1])]
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
@@ -200,9 +182,8 @@ class Records:
         """
         rows = self.tables["episodes"]
         full_m = rows.index.get_level_values("scenario").map(lambda task: FULL_PATH_M.get(task))
-        counted = rows[["human_steps", "takeovers"]].assign(
-            episodes=1, failures=rows.outcome.map(failed).astype(int)
-        )
+        missed = rows.outcome.map(failed).astype(int)
+        counted = rows[["human_steps", "takeovers"]].assign(episodes=1, failures=missed)
         spent = counted.groupby(KEY).cumsum().assign(steps=rows.end_step)
         period_s = self.tables["units"].period_s.reindex(rows.index)
         return spent.assign(
@@ -226,15 +207,14 @@ class Records:
         success = rows[f"{SUCCESS} {ALONE}"]
         for level in LEVELS:
             first = rows.loc[is_reached(level, success), SPENT].astype(float).groupby(KEY).first()
-            costs = costs.join(first.reindex(costs.index, fill_value=np.inf).add_suffix(
-                f"_to_{level:.0%}"
-            ))  # fmt: skip
+            first = first.reindex(costs.index, fill_value=np.inf)
+            costs = costs.join(first.add_suffix(f"_to_{level:.0%}"))
         for kind, score in product((TRAINING, ALONE), SCORES):
             measured = rows[["steps", f"{score} {kind}"]].dropna()
             last = measured.steps.groupby(KEY).transform("max")
             at_end = measured[measured.steps > last - END_STEPS]
             costs[f"{score} {kind}, end"] = at_end[f"{score} {kind}"].groupby(KEY).mean()
-        # A mean of equals may be rounded up
+        # A mean of equals may be rounded up.
         lost = success.groupby(KEY).max() - costs[f"{SUCCESS} {ALONE}, end"]
         costs["unlearned"] = lost.clip(lower=0.0)
         tests = self.tables["tests"].pivot_table(index=KEY, columns="condition")
@@ -252,21 +232,18 @@ class Records:
         """Return a column of ``episodes`` at each point of the grid: [seeds, points].
 
         In training it is the mean of the episodes since the point before, or of the next one where
-        none ended there; of the policy alone it is interpolated; what was spent, that so far.
+        none ended there; of the policy alone it is interpolated.
         """
         grid = self.grid(task)
 
         def curve(rows: pd.DataFrame) -> Numbers:
             steps, values = rows.steps.to_numpy(float), rows[name].to_numpy(float)
-            if name in SPENT:
-                return np.append(0.0, values)[np.searchsorted(steps, grid, side="right")]
             if name.endswith(ALONE):
                 return np.interp(grid, steps, values)
             next_one = np.searchsorted(steps, grid).clip(max=len(steps) - 1)
             means = pd.Series(values).groupby(np.searchsorted(grid, steps)).mean()
             return means.reindex(range(len(grid))).fillna(pd.Series(values[next_one])).to_numpy()
 
-        keys = self.of(task, line)[KEY].itertuples(index=False, name=None)
-        rows = self.episodes[list(dict.fromkeys(["steps", name]))].dropna()
-        units = rows[rows.index.isin([*keys])].groupby(KEY)
-        return np.array([curve(rows) for _, rows in units])
+        units = self.of(task, line)[KEY].itertuples(index=False, name=None)
+        rows = self.episodes.loc[self.episodes.index.isin([*units]), ["steps", name]].dropna()
+        return np.array([curve(of) for _, of in rows.groupby(KEY)])

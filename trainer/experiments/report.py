@@ -1,12 +1,10 @@
 """Pages of the studies: tables in Python, prose in templates.
 
-``NAME.md.jinja`` is the page of a study, and ``PAGES`` names the functions that it calls. A cell of
-a table is made of the numbers of a line's units in one task, one row a unit.
+``NAME.md.jinja`` is the page of a study; it calls the functions of this module. A cell of a table
+is made of the numbers of a line's units in one task, one row a unit.
 """
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,27 +13,37 @@ import jinja2
 import numpy as np
 import pandas as pd
 
-from bridge.report import ProgressBar, markdown_table
+from bridge.report import markdown_table
 from bridge.statistics import Estimate, mean_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
 from trainer.experiments import figures, plan
 from trainer.experiments import records as data
-from trainer.experiments.figures import PAPER_SCENES, SCENES, label
-from trainer.experiments.plan import EXPERIMENTS, GOOD, HELPED, HUMANS, SCENARIOS, TASKS, Line
+from trainer.experiments.plan import (
+    EXPERIMENTS,
+    GOOD,
+    HELPED,
+    HUMANS,
+    RIVALS,
+    ROWS,
+    SCENARIOS,
+    Line,
+)
 from trainer.experiments.records import LEARNED, WELL, Records, Store
 from trainer.learner.config import ALGORITHMS
-from trainer.training.config import PRESETS
+from trainer.training.config import PRESETS, flat
 
-CLAIMS_FILE = "claims.csv"
-"""Claims of the paper and of this project, each with the verdict of the kept records."""
 Cell = Callable[[pd.DataFrame], str]
 PHIL = "phil_td3"
-OWN = {
-    plan.MODEL: Line(plan.HUMAN_MODEL, plan.MODEL),
-    plan.SLOWER: Line(plan.EXPERT, plan.SLOWER),
-}
+PAIRS = len(SCENARIOS) * plan.DEFAULT_SEEDS
+ENOUGH = 9  # Of these pairs: an equal row has so many by chance in one of 93 cases
+MOST_EPISODES = 100  # In which a row of the table of human guidance is to learn
+SCENES = [*product(SCENARIOS, CONDITIONS)]
+PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
+BESIDE = [Line(row, GOOD) for row in ROWS]
+"""The rows of the table of human guidance, beside the scripted expert."""
+OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
 """Humans who drive by themselves; the others are the expert, with a fault or without."""
 
 
@@ -47,26 +55,22 @@ def write_page(store: Store, records: Records) -> Path:
     if not records.found:
         raise UserError(f"there are no results to report in {store.results}")
     name = store.study.name
-    drawn = figures.FIGURES[name]
-    with ProgressBar("report", len(drawn)) as bar:
-        for title, draw in drawn.items():
-            figures.write(draw(records), store.results / f"{title}.png")
-            bar.advance({"drawn": title})
+    for title, draw in figures.FIGURES[name].items():
+        figures.write(draw(records), store.results / f"{title}.png")
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     templates.filters["listed"] = lambda values: ", ".join(f"`{k}={v}`" for k, v in values.items())
     templates.filters |= {"words": plan.words, "percent": "{:.0%}".format, "number": "{:,}".format}
-    claims = store.results / CLAIMS_FILE  # Of the kept records alone
+    templates.filters |= {"label": label, "cell": lambda text: text.replace("|", "/")}
+    claims = store.results / "claims.csv"  # With the verdicts of the kept records
     text = templates.get_template(f"{name}.md.jinja").render(
-        {function.__name__: function for function in PAGES[name]},
-        algorithms=ALGORITHMS,
+        globals(),
         claims=pd.read_csv(claims, keep_default_na=False) if claims.is_file() else None,
         command="python -m trainer experiment",
         data=data,
-        figures=drawn,
-        plan=plan,
+        drawn=figures.FIGURES[name],
         records=records,
         study=store.study,
         wanted=len(store.study.units(records.seeds)),
@@ -76,8 +80,13 @@ def write_page(store: Store, records: Records) -> Path:
     return path
 
 
+def label(scene: tuple[str, str]) -> str:
+    """Return scenario and condition as in the paper's figure 9: L, L-N, L-V, C, ..."""
+    letter, condition = scene[0][0].upper(), scene[1]
+    return letter if condition == "nominal" else f"{letter}-{condition[0].upper()}"
+
+
 def markdown(head: Iterable[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table in Markdown."""
     return "\n".join(markdown_table([*head], rows)).rstrip("\n")
 
 
@@ -89,16 +98,14 @@ def table(records: Records, places: Iterable[tuple[str, Line]], columns: Mapping
     return markdown(("", "scenario", *columns), rows)
 
 
-def shown(cell: Cell, rows: pd.DataFrame) -> str:
-    """Return a cell; a dash where there is no unit."""
+def shown(cell: Cell, records: Records, task: str, line: Line) -> str:
+    """Return a line's cell; a dash where there is no unit."""
+    rows = records.of(task, line)
     return cell(rows) if len(rows) else "–"
 
 
 def spread(numbers: pd.Series) -> str:
-    """Return median (of an even number the upper middle), least and most, as in "12 [8, ∞]".
-
-    Of five, 15 of 16 times the true median lies between the least and the most.
-    """
+    """Return median (of an even number the upper middle), least and most, as in "12 [8, ∞]"."""
     ordered = numbers.sort_values()
     ends = (f"{ordered.iloc[place]:,.0f}" for place in (len(ordered) // 2, 0, -1))
     middle, least, most = ("0" if end == "-0" else end.replace("inf", "∞") for end in ends)
@@ -143,7 +150,7 @@ def estimate(column: str, digits: int = 0, factor: float = 1.0) -> Cell:
     return cell
 
 
-S_TO_LEARNED = f"human s to {LEARNED:.0%}"
+S_TO_LEARNED, S_LEARNED = f"human s to {LEARNED:.0%}", f"human_s_to_{LEARNED:.0%}"
 SPENT: Mapping[str, Cell] = {
     "seeds": lambda rows: f"{len(rows)}",
     f"steps to {LEARNED:.0%}": until(LEARNED, "steps"),
@@ -183,13 +190,10 @@ def computed_in(records: Records, algorithms: Iterable[str], settings: Iterable[
 # The paper's experiments
 
 
-def presets() -> str:
-    """Return the table of the settings that are not the paper's."""
-    ours, printed = (asdict(PRESETS[name]) for name in ("ours", "printed"))
-    for values in (ours, printed):
-        values |= values.pop("learner")
-    rows = [(f"`{name}`", ours[name], value) for name, value in printed.items()]
-    return markdown(("setting", "ours", "printed"), [row for row in rows if row[1] != row[2]])
+def presets() -> list[tuple[str, Any, Any]]:
+    """Return the settings that are not the paper's: name, ours, the paper's."""
+    ours, printed = (flat(PRESETS[name]) for name in ("ours", "printed"))
+    return [(name, ours[name], value) for name, value in printed.items() if value != ours[name]]
 
 
 def anchor(name: str) -> str:
@@ -197,105 +201,49 @@ def anchor(name: str) -> str:
     return f"{name} {EXPERIMENTS[name].title}".lower().replace(",", "").replace(" ", "-")
 
 
-def summary(claims: pd.DataFrame) -> str:
-    """Return the table of how many claims hold, by experiment."""
-    answers = {"yes": "holds", "no": "does not", "undecided": "undecided"}
-
-    def row(title: str, about: str, of: pd.DataFrame) -> list[Any]:
-        found, alone = (column.value_counts().reindex(list(answers), fill_value=0)
-                        for column in (of.holds, of.holds_alone))  # fmt: skip
-        return [title, about, *found, *(alone if alone.any() else [""] * len(alone))]
-
-    parts = {name: claims[claims.experiment == name] for name in EXPERIMENTS}
-    rows = [row("all", "the paper's claims", claims[claims.by == "paper"])]
-    rows += [row(f"[{name}](#{anchor(name)})", EXPERIMENTS[name].title, of)
-             for name, of in parts.items() if len(of)]  # fmt: skip
-    alone = [f"policy alone: {answer}" for answer in answers.values()]
-    return markdown(("", "about", *answers.values(), *alone), rows)
+def verdicts(claims: pd.DataFrame) -> list[Any]:
+    """Return how many claims hold, do not and are undecided; then the same of the policy alone."""
+    answers = ("yes", "no", "undecided")
+    found, alone = ([(claims[column] == answer).sum() for answer in answers]
+                    for column in ("holds", "holds_alone"))  # fmt: skip
+    return [*found, *(alone if any(alone) else ["", "", ""])]
 
 
-def verdicts(claims: pd.DataFrame, name: str) -> str:
-    """Return the table of an experiment's claims; nothing where it has none."""
-    of, paper = claims[claims.experiment == name], "wanted" if name == "goals" else "the paper"
-    head = {"claim": "claim", "said": paper, "weakest": "weakest comparison", "holds": "holds"}
-    if of.holds_alone.any():
-        head |= {"weakest_alone": "weakest, policy alone", "holds_alone": "holds"}
-    return markdown(head.values(), of[[*head]].to_numpy()) if len(of) else ""
+def tested(condition: str) -> Cell:
+    """Show the success under a condition, and in brackets that on the paper's seeds."""
+    paper = mean(f"paper_success {condition}", 0, 100.0)
+    return lambda rows: f"{share(condition)(rows)} ({paper(rows)})"
 
 
-def tests(records: Records) -> str:
-    """Return the table of every policy's success in every scene, and on the paper's seeds."""
+def pooled(condition: str) -> Cell:
+    """Show the distance of all drives on the paper's seeds, mean and standard deviation."""
 
-    def cell(condition: str) -> Cell:
-        paper = mean(f"paper_success {condition}", 0, 100.0)
-        return lambda rows: f"{share(condition)(rows)} ({paper(rows)})"
+    def cell(rows: pd.DataFrame) -> str:
+        each, sd = (rows[f"paper_distance_{m} {condition}"] for m in ("m", "sd_m"))
+        return f"{each.mean():.2f}±{np.sqrt((sd**2).mean() + each.var(ddof=0)):.2f}"
 
-    rows = [
-        (line.name, *(shown(cell(condition), records.of(scenario, line))
-                      for scenario, condition in SCENES))
-        for row in records.study.rows for line in row.lines
-    ]  # fmt: skip
-    return markdown(("", *map(label, SCENES)), [row for row in rows if {*row[1:]} != {"–"}])
+    return cell
 
 
-def distances(records: Records, name: str, paper: Mapping[str, Sequence[str]]) -> str:
-    """Return a table of the paper: our distances, of all drives on its seeds, beside its own."""
-    scenes = [scene for scene in PAPER_SCENES if scene[0] in EXPERIMENTS[name].scenarios]
-
-    def pooled(condition: str) -> Cell:
-        def cell(rows: pd.DataFrame) -> str:
-            each, sd = (rows[f"paper_distance_{m} {condition}"] for m in ("m", "sd_m"))
-            return f"{each.mean():.2f}±{np.sqrt((sd**2).mean() + each.var(ddof=0)):.2f}"
-
-        return cell
-
-    rows = [
-        (Line(algorithm).name,
-         *(f"{shown(pooled(condition), records.of(scenario, Line(algorithm)))} ({number})"
-           for (scenario, condition), number in zip(scenes, numbers, strict=True)))
-        for algorithm, numbers in paper.items()
-    ]  # fmt: skip
-    return markdown(("", *map(label, scenes)), rows)
-
-
-def times(records: Records, paper: Mapping[str, float]) -> str:
-    """Return the paper's table of time efficiency, seconds for 10,000 steps, beside ours."""
-    units = [records.of(SCENARIOS[0], Line(name)) for name in paper]
-    ours = [mean_estimate(1e4 * its.training_s / its.steps).text(0) for its in units]
-    head = ("", *(Line(name).name for name in paper))
-    return markdown(head, [("the paper", *paper.values()), ("ours", *ours)])
+def seconds(rows: pd.DataFrame) -> str:
+    """Show how long 10,000 steps of training took."""
+    return mean_estimate(1e4 * rows.training_s / rows.steps).text(0)
 
 
 def cost(records: Records) -> str:
     """Return the table of what each line's trainings cost."""
-    trained = [row for row in records.study.rows if row.seeds]
-    lines = product((line for row in trained for line in row.lines), SCENARIOS)
-    return table(records, ((task, line) for line, task in lines), COST)
+    lines = [line for row in records.study.rows if row.seeds for line in row.lines]
+    return table(records, ((task, line) for line in lines for task in SCENARIOS), COST)
 
 
 # The fair table of human guidance
 
 
-def short(records: Records) -> str:
-    """Return the table of seconds, success and pairs, one row an algorithm."""
-    seconds, success = until(LEARNED, "human_s"), mean("success nominal", 0, 100.0)
-    columns = [*product((("s", seconds), ("%", success)), TASKS)]
-    rows = [
-        (Line(row).name,
-         *(shown(cell, records.of(task, Line(row, GOOD))) for (_, cell), task in columns),
-         less_in(pairs(records, row)) if row in plan.RIVALS else "–")
-        for row in plan.ROWS
-    ]  # fmt: skip
-    titles = (f"{unit}, {plan.words(task)}" for (unit, _), task in columns)
-    return markdown(("", *titles, "pairs with less than PHIL-TD3"), rows)
-
-
 def pairs(records: Records, row: str, tasks: Iterable[str] = SCENARIOS) -> pd.DataFrame:
     """Return the human's seconds until a row and PHIL-TD3 had learned, pair by pair of seeds."""
-    found = records.numbers
+    found = records.numbers[records.numbers.seed <= plan.DEFAULT_SEEDS]
     found = found[found.scenario.isin([*tasks]) & (found.setting == GOOD)]
-    learned = f"human_s_to_{LEARNED:.0%}"
-    found = found.pivot(index=["scenario", "seed"], columns="algorithm", values=learned)
+    found = found.pivot(index=["scenario", "seed"], columns="algorithm", values=S_LEARNED)
     return found.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
 
 
@@ -310,8 +258,8 @@ def over(records: Records, rows: pd.DataFrame, other: Line, column: str) -> Esti
     return mean_estimate(rows.set_index("seed")[column] - theirs.get(0, theirs))
 
 
-def place(records: Records) -> str:
-    """Return the table of each row less PHIL-TD3."""
+def beside_phil(records: Records) -> Mapping[str, Cell]:
+    """Return the columns of a row less PHIL-TD3."""
 
     def points(rows: pd.DataFrame) -> str:
         return over(records, rows, Line(PHIL, GOOD), "success nominal").times(100.0).text(1)
@@ -324,9 +272,8 @@ def place(records: Records) -> str:
         less = (found.own - found.phil).where(found.own != found.phil, 0.0)
         return spread(less) if np.isfinite(found).any(axis=None) else "–"
 
-    columns = {"success, nominal, points": points, S_TO_LEARNED: sooner,
-               "less in": lambda rows: less_in(of(rows))}  # fmt: skip
-    return table(records, product(TASKS, [Line(row, GOOD) for row in plan.RIVALS]), columns)
+    return {"success, nominal, points": points, S_TO_LEARNED: sooner,
+            "less in": lambda rows: less_in(of(rows))}  # fmt: skip
 
 
 def default(records: Records) -> str | int:
@@ -334,125 +281,55 @@ def default(records: Records) -> str | int:
 
     Where pairs are missing, instead how many there are of one row.
     """
-    first = records.only(plan.DEFAULT_SEEDS)
-    found = {row: pairs(first, row) for row in plan.RIVALS}
-    if (fewest := min(map(len, found.values()))) < plan.PAIRS:
+    found = {row: pairs(records, row) for row in RIVALS}
+    if (fewest := min(map(len, found.values()))) < PAIRS:
         return fewest
 
     def takes_its_place(row: str) -> bool:
-        behind = (over(first, first.of(scenario, Line(row, GOOD)), Line(PHIL, GOOD),
+        behind = (over(records, records.of(scenario, Line(row, GOOD)), Line(PHIL, GOOD),
                        f"success {condition}").high < 0.0
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
-        return (found[row].own < found[row].phil).sum() >= plan.ENOUGH and not any(behind)
+        return (found[row].own < found[row].phil).sum() >= ENOUGH and not any(behind)
 
     better = {row: found[row].own.quantile(interpolation="higher")
-              for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
+              for row in filter(takes_its_place, RIVALS)}  # fmt: skip
     return Line(min(better, key=better.__getitem__, default=PHIL)).name
 
 
 def late(records: Records) -> list[str]:
     """Return which rows get there in good time in every seed of none of our scenes."""
-    found = records.numbers[records.numbers.scenario.isin(SCENARIOS)]
-    found = found[(found.setting == GOOD) & found.algorithm.isin(plan.ROWS)]
-    most = found.groupby(["algorithm", "scenario"])[f"episodes_to_{LEARNED:.0%}"].max()
-    soon = most.groupby("algorithm").min() <= plan.MOST_EPISODES
-    return [Line(row).name for row in plan.ROWS if not soon.get(row, False)]
 
+    def in_time(task: str, line: Line) -> bool:
+        return records.of(task, line)[f"episodes_to_{LEARNED:.0%}"].max() <= MOST_EPISODES
 
-def beside(records: Records) -> pd.DataFrame:
-    """Return the numbers of the units that a human helps in the left turn."""
-    found = records.numbers
-    return found[(found.scenario == "left_turn") & found.algorithm.isin(HELPED)
-                 & found.setting.isin([*HUMANS])]  # fmt: skip
+    return [line.name for line in BESIDE if not any(in_time(task, line) for task in SCENARIOS)]
 
 
 def forgives(records: Records) -> tuple[list[str], list[str]]:
     """Return which rows succeed beside each human in the left turn, and which beside some not."""
     good, less = list[str](), list[str]()
-    success = beside(records).groupby(["algorithm", "setting"])["success nominal"].mean().unstack()
-    for row in (row for row in HELPED if row in success.index):
-        shares = 100.0 * success.loc[row].reindex(list(HUMANS))
+    for row in HELPED:
+        found = {human: records.of("left_turn", Line(row, human)) for human in HUMANS}
+        shares = {human: 100.0 * its["success nominal"].mean() for human, its in found.items()}
         low = [f"{plan.words(human)} {share:.1f}" for human, share in shares.items()
                if share < 100.0 * LEARNED]  # fmt: skip
-        name = Line(row).name
-        (less if low else good).append(f"{name} ({', '.join(low)})" if low else name)
+        if low:
+            less.append(f"{Line(row).name} ({', '.join(low)})")
+        elif any(map(len, found.values())):
+            good.append(Line(row).name)
     return good, less
-
-
-def seeds_beside(records: Records, human: str) -> str:
-    """Return how many seeds the rows have beside a human."""
-    found = beside(records)
-    counts = found[found.setting == human].algorithm.value_counts().reindex(HELPED, fill_value=0)
-    return " to ".join(map(str, sorted({counts.min(), counts.max()})))
-
-
-def beside_each(records: Records, title: str) -> str:
-    """Return the table with a row for each algorithm, a column for each human in the left turn."""
-    cell = {**COSTS, **outcomes(records), "success, nominal, %": share("nominal")}[title]
-    lines = {key: cell(rows) for key, rows in beside(records).groupby(["algorithm", "setting"])}
-    humans = [human for human in HUMANS if any(human == setting for _, setting in lines)]
-    rows = [(Line(row).name, *(lines.get((row, human), "–") for human in humans)) for row in HELPED]
-    return markdown((title, *map(plan.words, humans)), rows)
 
 
 def outcomes(records: Records) -> Mapping[str, Cell]:
     """Return the columns of what came of a training."""
 
     def less_the_humans(rows: pd.DataFrame) -> str:
-        expert, setting = Line(plan.EXPERT, GOOD), rows.setting.iloc[0]
         trained = rows.algorithm.iloc[0] in ALGORITHMS
-        human = OWN.get(setting, expert) if trained else expert
-        return over(records, rows, human, "reward nominal").text(2)
+        human = OWN.get(rows.setting.iloc[0]) if trained else None
+        return over(records, rows, human or Line("expert", GOOD), "reward nominal").text(2)
 
     return {
         **{f"{condition}, %": share(condition) for condition in CONDITIONS},
         "lost at the end, points": estimate("unlearned", 1, 100.0),
         "return over the human's, nominal": less_the_humans,
     }
-
-
-def costs(records: Records) -> str:
-    """Return the table of what a training cost with the scripted expert."""
-    return table(records, product(TASKS, [Line(row, GOOD) for row in plan.ROWS]), COSTS)
-
-
-def came_of_it(records: Records) -> str:
-    """Return the table of how the policies drive alone, and the humans."""
-    lines = [*(Line(row, GOOD) for row in (*plan.ROWS, plan.EXPERT)), *OWN.values()]
-    return table(records, product(TASKS, lines), outcomes(records))
-
-
-PAGES: Mapping[str, Sequence[Callable[..., Any]]] = {
-    "paper": (presets, computed_in, anchor, summary, verdicts, tests, distances, times, cost),
-    "guidance": (
-        short, place, default, late, forgives, seeds_beside, beside_each, costs, came_of_it,
-        computed_in,
-    ),
-}  # fmt: skip
-"""Study -> what its template calls."""
-
-
-def write_typical(found: Iterable[Records], path: Path) -> None:
-    """Write the curves that a person's coach shows.
-
-    Environment -> algorithm -> the medians of the seeds with an ordinary human, at the grid's
-    steps: pairs of the seconds that the human had driven and the policy's success alone.
-
-    Raises UserError: there is no record to make a curve of.
-    """
-    curves: dict[str, dict[str, Any]] = {}
-    for records in found:
-        human = GOOD if records.study is plan.GUIDANCE else plan.NORMAL
-        units = records.numbers[records.numbers.setting == human]
-        for (task, row), its in units.groupby(["scenario", "algorithm"]):
-            if row in ALGORITHMS and ALGORITHMS[row].guided:
-                given, alone = (
-                    np.median(records.curves(task, Line(row, human), name), axis=0)
-                    for name in ("human_s", f"{data.SUCCESS} {data.ALONE}")
-                )
-                points = np.stack([given.round(1), alone.round(3)], axis=1).tolist()
-                curve = {"human": human, "seeds": len(its), "points": points}
-                curves.setdefault(TASKS[task][0], {})[row] = curve
-    if not curves:
-        raise UserError("there are no records of a guided training")
-    write_atomic(path, (json.dumps(curves) + "\n").encode())

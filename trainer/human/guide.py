@@ -74,17 +74,10 @@ def make_transition(
     """Make the transition of a control period, whether driven now or read from a recording."""
     next_observation, reward, terminated, truncated, _ = stepped
     return Transition(
-        observation=observation,
-        action=action,
-        reward=reward,
-        next_observation=next_observation,
-        terminal=terminated,
-        truncated=truncated,
-        human=intervention is not None,
-        overruled=policy_action,
-        penalised=penalised,
+        observation, action, reward, next_observation, terminated, truncated=truncated,
+        human=intervention is not None, overruled=policy_action, penalised=penalised,
         foreseen=tuple(foreseen),
-    )
+    )  # fmt: skip
 
 
 class GuideGone(Exception):  # noqa: N818 (no error: it was asked for)

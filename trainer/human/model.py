@@ -1,12 +1,11 @@
 """The DAgger human model of section V, which imitates the human's actions so far."""
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,17 +80,14 @@ class HumanModel(Driver):
             self.optimiser.step()
         return loss.item()
 
-    def refine(self, updates: int) -> Iterator[float]:
-        """Learn on after the last episode, part by part; yield each part's loss.
-
-        The learning rate falls linearly from part to part, so that the model settles.
-        """
+    def refine(self, updates: int) -> None:
+        """Learn on after the last episode; the learning rate falls, so that the model settles."""
         parts = min(updates, REFINING_PARTS)
         for part in range(parts):
             for group in self.optimiser.param_groups:
                 group["lr"] = self.config.learning_rate * (1.0 - part / parts)
             each, rest = divmod(updates, parts)
-            yield self.learn(each + (part < rest))
+            self.learn(each + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
         """Write the model to ``directory``, with ``about``, which says on what it was trained."""
@@ -136,50 +132,31 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
     shape, space = env.action_space.shape, env.observation_space
     model = HumanModel(config, arguments.seed, shape[0], space)
     if arguments.recordings is None:
-        episodes = imitate(model, env, arguments.seed)
+        losses = imitate(model, env, arguments.seed)
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
         taken_over = demonstrate(model, recordings, env.scenario)
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
-        # As many gradient steps as with the expert, without the episodes between them.
-        episodes = (
-            HumanEpisode(model.learn(config.updates_per_episode), model.demonstrations)
-            for _ in range(config.episodes)
-        )
+        # As many gradient steps as with the expert, without the episodes between them
+        losses = (model.learn(config.updates_per_episode) for _ in range(config.episodes))
     with ProgressBar("human model", config.episodes) as bar:
-        for episode in episodes:
-            shown = {"demonstrations": str(episode.demonstrations), "loss": f"{episode.loss:.3f}"}
-            if episode.outcome:
-                shown |= {"interventions": str(episode.interventions), "outcome": episode.outcome}
-            bar.advance(shown)
+        for loss in losses:
+            bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
             if time.monotonic() > end_s:
                 break
-    if bar.done < config.episodes:
-        print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
     # In proportion: part of the episodes have shown part of the examples, in part of the time.
-    updates = config.refining_updates * bar.done // config.episodes
-    if updates:
-        with ProgressBar("refining", min(updates, REFINING_PARTS)) as refining:
-            for loss in model.refine(updates):
-                refining.advance({"loss": f"{loss:.3f}"})
-    about["config"] = asdict(config)
+    model.refine(config.refining_updates * bar.done // config.episodes)
+    about |= {"config": asdict(config), "episodes": bar.done}
     model.save(directory, about)
-    amount = {"episodes": bar.done, "demonstrations": model.demonstrations}
-    write_json(directory / "human.json", about | amount)
+    write_json(directory / "human.json", about | {"demonstrations": model.demonstrations})
     print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
 
 
-class HumanEpisode(NamedTuple):
-    """One episode of the human model's training."""
+def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[float]:
+    """Imitate the scripted expert, which takes over while the model drives.
 
-    loss: float
-    demonstrations: int  # The human's steps so far
-    interventions: int = 0
-    outcome: str = ""  # Empty where nobody drove: the model learned from recordings
-
-
-def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
-    """Imitate the scripted expert, which takes over while the model drives; yield each episode."""
+    Yields the loss after each episode.
+    """
     config = model.config
     # Three, as each has a memory: a person who takes over looks at the scene afresh.
     expert, adviser = expert_of(env), expert_of(env)
@@ -187,10 +164,10 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
     for episode in range(config.episodes):
         every = config.demonstrate_every
         demonstrated = every and episode % every == every - 1
-        observation, info = env.reset(seed=episode_seed(seed, Purpose.HUMAN_EPISODES, episode))
+        observation, _ = env.reset(seed=episode_seed(seed, Purpose.HUMAN_EPISODES, episode))
         guide.reset()
         adviser.reset()
-        interventions, ended = 0, False
+        ended = False
         while not ended:
             action = model.act(observation)
             intervention = None if demonstrated else guide.watch(observation, action)
@@ -199,11 +176,9 @@ def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[HumanEpisode]:
                 model.add(observation, action)
             elif config.label_every_step:
                 model.add(observation, adviser.act(observation))
-            interventions += intervention is not None and intervention.first
-            observation, _, terminated, truncated, info = env.step(action)
+            observation, _, terminated, truncated, _ = env.step(action)
             ended = terminated or truncated
-        loss = model.learn(config.updates_per_episode)
-        yield HumanEpisode(loss, model.demonstrations, interventions, info["outcome"])
+        yield model.learn(config.updates_per_episode)
 
 
 def demonstrate(model: HumanModel, recordings: Sequence[Path], scenario: str) -> int:

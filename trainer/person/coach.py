@@ -98,6 +98,9 @@ def advise(episodes: Sequence[SittingEpisode], curve: Curve) -> str:
 
 
 def typical_curve(scenario: str, algorithm: str) -> Curve:
-    """Return the curve of a scripted human's ordinary run; empty where none is known."""
+    """Return the curve of a scripted human's ordinary run; empty where none is known.
+
+    The program that made the file from the experiments' records is in revision 2bbf9911.
+    """
     known = json.loads(TYPICAL_FILE.read_text()).get(scenario, {}).get(algorithm, {})
     return [(human_s, success) for human_s, success in known.get("points", [])]

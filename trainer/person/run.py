@@ -37,7 +37,7 @@ from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_ve
 from trainer.util import die_with_parent, interrupts_blocked
 
 SCRIPTED = (
-    "guided_share", "guided_until_episode", "guided_until_step", "poor_guidance_share",
+    "guided_share", "guided_until_episode", "poor_guidance_share",
     "late_to_s", "missed_share",
 )  # fmt: skip
 """Settings of a scripted human."""

@@ -86,16 +86,10 @@ SCENES: dict[Scene, CongestionConfig] = {
     # lanes would touch. Gaps along a lane are from 2 to 8 m, so that the walls have holes, too; a
     # lane's queue is long enough to be there until the goal.
     "dense": CongestionConfig(
-        lane_width_m=2.9,
-        lane_offset_m=(-0.35, 0.35),
-        lane_speed_mps=(-1.0, 1.0),
-        side_cars=6,
-        side_front_m=(14.0, 22.0),
-        cars_behind=2,
-        gap_m=(2.0, 8.0),
-        ahead_gap_m=(2.5, 9.0),
+        lane_width_m=2.9, lane_offset_m=(-0.35, 0.35), lane_speed_mps=(-1.0, 1.0), side_cars=6,
+        side_front_m=(14.0, 22.0), cars_behind=2, gap_m=(2.0, 8.0), ahead_gap_m=(2.5, 9.0),
     ),
-}
+}  # fmt: skip
 LANES = 3
 EGO_LANE = 1  # The middle one, y = 0; lane 0 is to its left
 REACH_M = 200.0  # How far the road goes on before start and goal
@@ -254,11 +248,9 @@ class CongestionEnv(DrivingEnv):
     def _leader(self) -> TrafficVehicle | None:
         """The nearest vehicle ahead in the ego car's corridor, whatever the lane."""
         x, y = self.ego.position.tolist()
-        ahead = [
-            car
-            for car in self.traffic
-            if car.position[0] > x and abs(car.position[1] - y) < 0.5 * (car.WIDTH + self.ego.WIDTH)
-        ]
+        room = self.ego.WIDTH
+        ahead = [car for car in self.traffic if car.position[0] > x
+                 and abs(car.position[1] - y) < 0.5 * (car.WIDTH + room)]  # fmt: skip
         return min(ahead, key=lambda car: float(car.position[0]), default=None)
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:

@@ -87,6 +87,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     (``_reward``); ``_frame`` draws the policy's picture.
     """
 
+    car: Any  # The fields of ``edge_runtime.manifest.Car``, for a robot in the car's place
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
     scenario: str
     observation_name = "frames"
@@ -126,12 +127,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def render(self) -> NDArray[np.uint8]:
         """Draw the scene from above for a person, uint8 [height, width, 3]."""
-        return draw_scene(self.scene(), self.frames, self._caption())
-
-    @property
-    def car(self) -> dict[str, float]:
-        """The fields of ``edge_runtime.manifest.Car``, for a robot in the car's place."""
-        raise NotImplementedError
+        return draw_scene(self.scene())
 
     def scene(self) -> dict[str, Any]:
         """Describe the scene for viewers, in plain lists and numbers."""
@@ -218,7 +214,3 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
             "longitudinal_acceleration_mps2": self.ego.longitudinal_acceleration_mps2,
         }
         return info if outcome is None else {**info, "outcome": outcome}
-
-    def _caption(self) -> str:
-        time_s, goal_m = self.steps * self.config.control_period_s, self.config.goal_m
-        return f"{time_s:.1f} s\n{self.ego.speed:.1f} m/s\n{self.distance_m:.1f} of {goal_m:.0f} m"

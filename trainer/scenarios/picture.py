@@ -6,7 +6,7 @@ mixed by area: a car that moves by a tenth of a pixel changes the picture, so tw
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -152,74 +152,28 @@ BODY = ("x", "y", "heading_rad", "length_m", "width_m")
 """A scene's vehicle in the order of a ``Rectangle``."""
 
 
-def draw_scene(
-    scene: dict[str, Any], frames: NDArray[np.uint8] | None = None, caption: str = ""
-) -> NDArray[np.uint8]:
-    """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
-
-    The picture is uint8 [height, width, 3].
-    """
+def draw_scene(scene: dict[str, Any]) -> NDArray[np.uint8]:
+    """Draw ``scene`` (see ``DrivingEnv.scene``) from above, uint8 [height, width, 3]."""
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
     image = Image.new("RGB", size, shown.GROUND)
-    pen, corner = ImageDraw.Draw(image), scene.get("view", VIEW)
+    pen, corner = ImageDraw.Draw(image), np.array(scene.get("view", VIEW))
 
-    def pixels(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
-        return [
-            ((x - corner[0]) * PIXELS_PER_METRE, (y - corner[1]) * PIXELS_PER_METRE)
-            for x, y in points
-        ]
+    def pixels(points: Any) -> list[tuple[float, ...]]:
+        return [*map(tuple, ((np.array(points) - corner) * PIXELS_PER_METRE).tolist())]
 
-    def line(points: Iterable[Sequence[float]], colour: Colour, width_pixels: int) -> None:
+    def line(points: Any, colour: Colour, width_pixels: int) -> None:
         pen.line(pixels(points), fill=colour, width=width_pixels)
 
     for road in scene["roads"]:
         line(road, shown.ROAD, int(scene["road_width_m"] * PIXELS_PER_METRE))
-    # Lane lines of their own, or the centre line of every road outside their crossing.
-    lines, skip_m = scene.get("lane_lines"), 0.0
-    if lines is None:
-        lines, skip_m = scene["roads"], 0.5 * scene["road_width_m"]
-    for each in lines:
-        for dash in _dashes(each, skip_m):
-            line(dash, shown.MARKING, 2)
+    for each in scene.get("lane_lines", scene["roads"]):
+        line(each, shown.MARKING, 2)
     line(scene["path"], shown.PATH, 4)
-    if scene["goal"] is not None:
-        x, y = scene["goal"]
-        line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], shown.GOAL, 8)
+    x, y = scene["goal"]
+    line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], shown.GOAL, 8)
     for vehicle in scene["vehicles"]:
-        body = Rectangle(*(vehicle[name] for name in BODY))
-        ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
-        glass = Rectangle(
-            body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
-        )
-        colour = POLICY if vehicle.get("ego") else shown.APPLIED
-        pen.polygon(pixels(corners(body)), fill=colour, outline=shown.GLASS, width=2)
-        pen.polygon(pixels(corners(glass)), fill=shown.GLASS)
-    if frames is not None:
-        _inset_frames(image, frames)
-    end = (size[0] - 12, size[1] - 12)
-    pen.multiline_text(end, caption, shown.GLASS, anchor="rd", font_size=15)
+        body = corners(Rectangle(*(vehicle[name] for name in BODY)))
+        colour = POLICY if vehicle["ego"] else shown.APPLIED
+        pen.polygon(pixels(body), fill=colour, outline=shown.GLASS, width=2)
+        line((body[0], body[1]), shown.GLASS, 8)  # The front
     return np.asarray(image)
-
-
-def _dashes(road: Sequence[Sequence[float]], skip_m: float) -> Iterator[list[list[float]]]:
-    """Dash a line every 2 m, except nearer to the origin than ``skip_m``."""
-    start, end = np.array(road[0]), np.array(road[-1])
-    length_m = float(np.hypot(*(end - start)))
-    for start_m in np.arange(0.0, length_m, 4.0):
-        ends = [start + (m / length_m) * (end - start) for m in (start_m, start_m + 2.0)]
-        if all(np.abs(each).max() >= skip_m for each in ends):
-            yield [each.tolist() for each in ends]
-
-
-def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:
-    """Paste the policy's frames, enlarged, into the lower left corner, the older first."""
-    scale, margin = 2.3, 12
-    size = (int(frames.shape[2] * scale), int(frames.shape[1] * scale))
-    top = image.height - size[1] - margin
-    pen = ImageDraw.Draw(image)
-    for place, (frame, when) in enumerate(zip(frames, ("0.1 s ago", "now"), strict=True)):
-        inset = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST).convert("RGB")
-        left = margin + place * (size[0] + margin)
-        image.paste(inset, (left, top))
-        text = f"the policy sees, {when}"
-        pen.text((left, top - 20), text, fill=shown.GLASS, font_size=14)

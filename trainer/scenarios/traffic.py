@@ -48,7 +48,6 @@ def idm_acceleration(
 class VehicleType:
     """Size and IDM parameters of one kind of vehicle."""
 
-    name: str
     length_m: float
     width_m: float
     acceleration_mps2: float  # Comfortable acceleration (IDM's a)
@@ -57,14 +56,14 @@ class VehicleType:
     standstill_gap_m: float = 2.0  # Bumper to bumper at rest (IDM's s0)
 
 
-CAR = VehicleType("car", 5.0, 2.0, 3.0, 5.0, 0.8)
-BUBBLE_CAR = replace(CAR, name="bubble car", length_m=2.3, width_m=1.4)
-SMALL_CAR = replace(CAR, name="small car", length_m=3.6, width_m=1.65)
-COMPACT_CAR = replace(CAR, name="compact car", length_m=4.3, width_m=1.8)
-LARGE_CAR = replace(CAR, name="large car", length_m=5.3, width_m=2.1)
-VAN = VehicleType("van", 6.5, 2.16, 2.6, 4.5, 1.0)
-TRUCK = VehicleType("truck", 7.1, 2.4, 1.3, 4.0, 1.2)
-MOTORCYCLE = VehicleType("motorcycle", 2.2, 0.9, 6.0, 10.0, 0.6)
+CAR = VehicleType(5.0, 2.0, 3.0, 5.0, 0.8)
+BUBBLE_CAR = replace(CAR, length_m=2.3, width_m=1.4)
+SMALL_CAR = replace(CAR, length_m=3.6, width_m=1.65)
+COMPACT_CAR = replace(CAR, length_m=4.3, width_m=1.8)
+LARGE_CAR = replace(CAR, length_m=5.3, width_m=2.1)
+VAN = VehicleType(6.5, 2.16, 2.6, 4.5, 1.0)
+TRUCK = VehicleType(7.1, 2.4, 1.3, 4.0, 1.2)
+MOTORCYCLE = VehicleType(2.2, 0.9, 6.0, 10.0, 0.6)
 
 Mix = tuple[tuple[VehicleType, float], ...]  # Vehicle types and their shares, which sum to 1
 CARS_ONLY: Mix = tuple((car, 0.2) for car in (BUBBLE_CAR, SMALL_CAR, COMPACT_CAR, CAR, LARGE_CAR))
@@ -120,17 +119,11 @@ class TrafficVehicle(IDMVehicle):
         leader: Vehicle | None,
     ) -> None:
         lane = road.network.get_lane(lane_index)
-        heading = lane.heading_at(position_m)
         # Without a road at first: highway-env would search all lanes for the one named here.
         super().__init__(
-            None,
-            lane.position(position_m, 0.0),
-            heading=heading,
-            speed=speed_mps,
-            target_lane_index=lane_index,
-            target_speed=speed_mps,
-            enable_lane_change=False,
-        )
+            None, lane.position(position_m, 0.0), lane.heading_at(position_m), speed_mps,
+            target_lane_index=lane_index, target_speed=speed_mps, enable_lane_change=False,
+        )  # fmt: skip
         self.road, self.lane, self.lane_index = road, lane, lane_index
         self._start_m = float(lane.start[0])
         self.leader = leader

@@ -8,13 +8,13 @@ import numpy as np
 from gymnasium import spaces
 
 from bridge.network import parse_spec
+from trainer.environments import DelayedVehicle
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import FRAMES_LAYOUT
 from trainer.learner.td3 import Losses
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.training.config import RunConfig
-from trainer.training.delayed import DelayedVehicle
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import read_metrics
 from trainer.training.run import Parts, TrainingRun, Validation

@@ -191,20 +191,14 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("text", "given", "says"),
-    [
-        ("learner = 3", "", "learner"),
-        ("tau = 0.1", "--preset printed", "sets tau, and so does --preset"),
-        ("algorithm = 'phil_td3'\nalpha = 0.5", "--algorithm rlpd_td3", "sets alpha, and so does"),
-        ("human = 'person'", "", "a person guides that run: name --human web"),
-        ("late_to_s = 0.1\nlate_from_s = 0.3", "", "late_to_s 0.1 is below late_from_s 0.3"),
-    ],
+    ("text", "says"),
+    [("learner = 3", "learner"), ("late_to_s = 0.1\nlate_from_s = 0.3", "late_to_s")],
 )
-def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path, text, given, says):
+def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path, text, says):
     (tmp_path / "config.toml").write_text(f"{text}\n")
     words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
     with pytest.raises(UserError, match=says):
-        main(["train", *words, *given.split()])
+        main(["train", *words])
     assert not (tmp_path / "run").exists()
 
 

@@ -28,7 +28,7 @@ WRONG = [
     )),
     "export {tmp} --out {tmp}/p.txt", "export {tmp}/nothing --out {tmp}/p.onnx", "plot {tmp}",
     "train --out {tmp}/file/x", "plot {tmp} --out /dev/null/p.png", "human --out {tmp}/file",
-    "bench --out /dev/null/b.json", "experiment status --results ''",
+    "bench --out /dev/null/b.json",
 ]  # fmt: skip
 
 
@@ -40,8 +40,6 @@ TOLD = [
     ("plot one two --out c.png", "one holds no metrics"),
     ("train --out x --period 5", "period_s = 5.0 is out of range: 0.01 to 1.0"),
     ("experiment report status", "no other name"),
-    ("experiment fig7 --ray auto --device cuda", "on processors"),
-    ("experiment guidance --ray auto", "lacks hill, racetrack"),
     ("experiment table1 --scenario congestion", "nothing to compute"),
 ]  # fmt: skip
 """What would be right is said, too."""
@@ -74,7 +72,7 @@ def test_a_shipped_policy_is_verified_with_the_key_beside_it(capsys, tmp_path, m
     status, _, err = call(capsys, "evaluate", POLICY, "--runs", "1")
     assert status == 0, err
     drive = ["drive", "--human", "web", "--policy", POLICY, "--public-key", "none.pub"]
-    assert "public key none.pub does not exist" in refusal(capsys, *drive)
+    assert "none.pub does not exist" in refusal(capsys, *drive)
     for end in ("", ".sig"):
         shutil.copy(POLICY + end, f"p.onnx{end}")
     evaluate = ["evaluate", "p.onnx", "--runs", "2"]
@@ -104,8 +102,8 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path, monkeypatch):
     assert len(read_metrics(Path("run"))) == 4
     for words, said in (
         (f"{train} 2", "--resume"),
-        (f"{train} 2 {small} --resume", "is a run of --episodes 4: repeat that, or more"),
-        (f"{train} 4 --seed 8 --resume", "was trained with --seed 0 (now 8): repeat"),
+        (f"{train} 2 {small} --resume", "was trained with episodes = 4, not 2"),
+        (f"{train} 4 --seed 8 --resume", "was trained with seed = 0, not 8"),
         (human, "holds a human model"),
     ):
         assert said in refusal(capsys, *words.split())
@@ -136,20 +134,14 @@ def config(tmp_path, capsys):
     return values, refused
 
 
-OTHERS = "--seed 0 --human expert --set evaluate_every_steps=500 --set batch_size=128"
 GIVEN = "--seed 3 --episodes 4 --human web --set batch_size=8 --set evaluate_every_steps=7"
 
 
-def test_changed_settings_are_named_as_they_are_given(config):
+def test_a_changed_setting_is_named(config):
     values, refused = config
-    assert (
-        "was trained with --seed 3 (now 0), --human web (now expert), "
-        "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
-    ) in refused(values, *OTHERS.split())
-    # What came later had its default.
-    del values["learner"]["gamma"], values["averaged_actor"], values["period_s"]
-    err = refused(values, *GIVEN.split())
-    assert "no averaged_actor (now True), no gamma (now 0.95): repeat" in err
+    assert "batch_size = 8, not 9" in refused(values, "--human", "web", "--set", "batch_size=9")
+    del values["learner"]["gamma"]
+    assert "gamma = None, not 0.95" in refused(values, *GIVEN.split())
 
 
 def test_no_file_of_a_run_decides_what_is_imported(config, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.evaluation import constant_driver
 from trainer.human.guide import HumanGuide, steps_held
-from trainer.human.left_turn import Crossing, LeftTurnHuman, PedalPlan
+from trainer.human.left_turn import LeftTurnHuman
 from trainer.person.tests.people import BRAKE, FULL, NOTHING, drive, episode
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 
@@ -39,32 +39,6 @@ def environment(**changes) -> LeftTurnEnv:
 def triggered(**changes):
     env = environment(**changes)
     return env, LeftTurnHuman(env)
-
-
-def test_foresight_agrees_with_what_then_happens():
-    env = LeftTurnEnv()
-    crossing, agreed = Crossing(env, side_clearance_m=0.0), 0
-    for seed in range(40):
-        env.reset(seed=seed)
-        foreseen = crossing.clear(5.0, margin_m=0.0, plan=PedalPlan(pedal=1.0, hold_s=10.0))
-        *_, (_, _, info) = episode(env, FULL)
-        agreed += foreseen == (info["outcome"] == "goal")
-    # Traffic is foreseen at constant speed; IDM speeds differ a little.
-    assert agreed >= 37
-
-
-def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
-    (env, trigger), steps = triggered(first_car_m=(9.0, 9.0)), 0
-    while (reason := trigger.wants_control(NOTHING)) is None:
-        env.step(NOTHING)
-        steps += 1
-    assert steps > 1
-    assert reason == "collision"
-    assert trigger.wants_control(BRAKE) is None
-    for _ in range(20):
-        env.step(BRAKE)
-    assert env.ego.speed == 0.0
-    assert env.distance_m < LeftTurnHuman.STOP_BY_M
 
 
 @pytest.mark.parametrize(
@@ -118,13 +92,6 @@ def test_trigger_takes_over_from_a_car_that_waits_for_nothing():
     assert first > LeftTurnHuman.STANDING_STEPS + LeftTurnHuman.OPEN_STEPS
     assert reasons == [None] * first + ["stuck"] * (40 - first)
     assert trigger.wants_control(FULL) is None  # it starts by itself
-
-
-def test_waiting_for_traffic_is_not_stuck():
-    env = environment(first_car_m=(12.0, 12.0), ego_speed_mps=(3.0, 3.0))
-    (car,) = env.traffic
-    car.target_speed, car.speed, car.position[0] = 0.01, 0.0, 0.0
-    assert set(braking(env)[1]) == {None}
 
 
 def test_a_human_who_stops_in_the_lane_gives_up_and_the_policy_drives_on():

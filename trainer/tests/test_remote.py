@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from bridge.network import LatencySpec, parse_spec
-from trainer.environments import make_environment
+from trainer.environments import DelayedVehicle, make_environment, ticks_late
 from trainer.evaluation import TogetherDriver, drive_episodes
 from trainer.human.guide import Intervention, make_transition
 from trainer.learner.replay import Transition
 from trainer.tests.loops import CONFIG, ScriptedEnv, frames, number
-from trainer.training.delayed import DelayedVehicle, ticks_late
 from trainer.training.learning import LearningThread
 
 
@@ -53,13 +52,6 @@ def test_a_perfect_network_is_none_to_the_bit(scenario):
     remote: Any = TogetherDriver(brightness.act_together)
     remote.act = vehicle.behind(brightness.act)
     assert drive_episodes(vehicle, remote, [0, 1]) == drive_episodes(env, brightness, [0, 1])
-
-
-def test_a_delayed_driver_is_another_and_the_same_each_time():
-    env, spec = make_environment("left_turn"), parse_spec("100ms+-40ms,loss=5%")
-    first, again = (drive_episodes(env, brightness, [3], latency=spec) for _ in range(2))
-    assert first == again
-    assert first[0].actions != drive_episodes(env, brightness, [3])[0].actions
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it(monkeypatch):

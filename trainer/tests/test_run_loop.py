@@ -1,8 +1,11 @@
 """The loop on a scripted road: what is stored, when it learns, validates and ends."""
 
 import math
+import threading
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,30 +15,42 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.evaluation import CHECKPOINT_FILE
+from trainer.learner.config import LearnerConfig
+from trainer.learner.replay import Transition
 from trainer.learner.td3 import Losses
-from trainer.tests.loops import BATCH, CONFIG, HUMAN, POLICY, number, scripted_run, trained
+from trainer.tests.loops import (
+    BATCH,
+    CONFIG,
+    HUMAN,
+    POLICY,
+    ScriptedEnv,
+    number,
+    scripted_run,
+    trained,
+)
+from trainer.training.config import RunConfig
+from trainer.training.learning import UnhurriedLearning
 from trainer.training.metrics import MetricsWriter
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "reason", "penalise_stuck", "penalty"),
+    ("algorithm", "reason", "penalty"),
     [
-        ("phil_td3", "collision", False, -7.0),
-        ("phil_td3", "stuck", False, 0.0),
-        ("phil_td3", "stuck", True, -7.0),
-        ("phil_without_shaping", "collision", True, 0.0),
-        ("rlif_td3", "collision", False, -7.0),
-        ("rlif_td3", "stuck", False, -7.0),
-        ("pvp_td3", "collision", True, 0.0),
-        ("phil_gated", "collision", False, -7.0),
-        ("phil_gated", "asked", False, 0.0),
+        ("phil_td3", "collision", -7.0),
+        ("phil_td3", "stuck", 0.0),
+        ("phil_without_shaping", "collision", 0.0),
+        ("rlif_td3", "collision", -7.0),
+        ("rlif_td3", "stuck", -7.0),
+        ("pvp_td3", "collision", 0.0),
+        ("phil_gated", "collision", -7.0),
+        ("phil_gated", "asked", 0.0),
     ],
 )
 @pytest.mark.parametrize("penalty_on", ["human", "overruled"])
 def test_what_was_done_is_stored_and_only_taking_over_is_penalised(
-    tmp_path, algorithm, reason, penalise_stuck, penalty, penalty_on
+    tmp_path, algorithm, reason, penalty, penalty_on
 ):
-    config = {"penalise_stuck": penalise_stuck, "penalty_on": penalty_on, "reason": reason}
+    config: dict[str, str] = {"penalty_on": penalty_on, "reason": reason}
     run = trained(tmp_path, 5, human_steps=(2, 3), algorithm=algorithm, **config)
     assert [told.episode_return for told in run.told] == [15.0]  # whatever the penalty
     paid = 0.0 if algorithm in ("rlif_td3", "pvp_td3") else 1.0  # these have no reward
@@ -77,13 +92,12 @@ def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_netwo
 @given(st.floats(0.0, 1.0), st.integers(1, 300))
 def test_the_share_of_watched_episodes_is_met_at_any_time(share, episodes):
     config = replace(CONFIG, guided_share=share)
-    watched = sum(config.guided(episode, 0) for episode in range(episodes))
+    watched = sum(config.guided(episode) for episode in range(episodes))
     assert watched == math.ceil(episodes * share)
 
 
-@pytest.mark.parametrize("until", [{"guided_until_step": 3}, {"guided_until_episode": 2}])
-def test_the_human_leaves_after_so_many_steps_or_episodes(tmp_path, until):
-    run = trained(tmp_path, 2, human_steps=(2,), episodes=4, **until)
+def test_the_human_leaves_after_so_many_episodes(tmp_path):
+    run = trained(tmp_path, 2, human_steps=(2,), episodes=4, guided_until_episode=2)
     assert [stored.human for stored in run.stored] == [False, True] * 2 + [False] * 4
 
 
@@ -113,7 +127,93 @@ def test_divergence_ends_the_run_where_it_shows_and_the_checkpoint_stays(spoil, 
     run.save()
     before = (tmp_path / CHECKPOINT_FILE).read_bytes()
     spoil(run)
-    with pytest.raises(UserError, match="diverged in episode 2"):
+    with pytest.raises(UserError, match="diverged"):
         run.train()
     assert all(np.isfinite(run.env.actions))
     assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
+
+
+PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
+SOON_S = 30.0
+
+
+def transition(reward: float = 0.0, action: float = 0.5, **more: Any) -> Transition:
+    done = more.pop("terminal", False)
+    return Transition(PICTURE, np.full(1, action, np.float32), reward, PICTURE, done, **more)
+
+
+def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
+    run = scripted_run(tmp_path, CONFIG, length=4)
+    begun, moved, known = threading.Event(), threading.Event(), []
+    update, step = run.learning.learner.update, run.env.step
+
+    def slow_update(batch, beta):
+        begun.set()
+        assert moved.wait(10.0)  # so it is still at work when the environment is done
+        known.append(len(run.stored))
+        return update(batch, beta)
+
+    def step_beside(action):
+        assert not run.stored or begun.wait(10.0)
+        moved.set()
+        return step(action)
+
+    run.learning.learner.update, run.env.step = slow_update, step_beside
+    run.train()
+    assert known == [1, 2, 3]
+
+
+@pytest.fixture
+def unhurried(one_thread):
+    config = RunConfig(learner=LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1))
+    unhurried = UnhurriedLearning(config, ScriptedEnv())
+    for reward in range(3):
+        unhurried.add(transition(float(reward)))
+    unhurried.release()
+    yield unhurried
+    unhurried.close()
+
+
+@pytest.fixture
+def gate(unhurried, monkeypatch):
+    """Updates are held up until it is open."""
+    learner, gate = unhurried.learner, SimpleNamespace(open=threading.Event(), begun=0)
+    update = learner.update
+
+    def held_up(batch, beta=0.0):
+        gate.begun += 1
+        assert gate.open.wait(SOON_S)
+        return update(batch, beta)
+
+    monkeypatch.setattr(learner, "update", held_up)
+    return gate
+
+
+def test_while_an_update_hangs_everything_goes_on(unhurried, gate):
+    before = unhurried.act(PICTURE)
+    unhurried.begin(0.0)
+    for _ in range(5):
+        np.testing.assert_array_equal(unhurried.act(PICTURE), before)
+        unhurried.begin(0.0)
+        assert unhurried.finish() == 0.0
+    assert not unhurried._begun[1].done()
+    assert gate.begun <= 1
+    gate.open.set()
+    unhurried.settle()
+    assert np.any(unhurried.act(PICTURE) != before)
+
+
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurried, gate):
+    unhurried.begin(0.0)
+    for keep, reward in ((False, 9.0), (True, 3.0)):
+        unhurried.add(transition(reward, human=True))
+        unhurried.add(transition(reward + 1.0, terminal=True))
+        assert unhurried.added == 3
+        if not keep:
+            threading.Timer(0.05, gate.open.set).start()
+        unhurried.end_episode(0.0, keep)
+    unhurried.release()
+    state = unhurried.state_dict()["replay"]
+    assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert state["human"].tolist() == [False, False, False, True, False]
+    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]

@@ -7,7 +7,6 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from trainer.human.guide import ASKED, Asking
 from trainer.learner.config import LearnerConfig
 from trainer.tests.learners import same_weights
 from trainer.tests.loops import rows_of
-from trainer.training.command import _quit as ask_to_quit
 from trainer.training.command import check_directory
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, read_metrics
@@ -149,7 +147,6 @@ def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fi
         (replay, "pictures", wide),
         (replay, "priorities", torch.full_like(replay["priorities"], math.nan)),
         (learner, "actor_optimiser", {**learner["actor_optimiser"], **moments}),
-        (state, "episode", 1.5),
     ):
         kept, place[name] = place[name], crafted
         save_torch(tmp_path / CHECKPOINT_FILE, state)
@@ -190,19 +187,6 @@ def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
     assert 2 <= driven < 5
     assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == driven
     resume_and_compare(tmp_path, whole, *seldom)
-
-
-def test_who_quits_gets_one_more_episode_and_a_checkpoint(tmp_path, monkeypatch):
-    run = TrainingRun(replace(TINY, checkpoint_every=100), tmp_path)
-
-    def on_episode(_):
-        # The reader of stderr is gone, as `tee`, which has had the same ^C.
-        with monkeypatch.context() as patch:
-            patch.setattr("os.write", Mock(side_effect=BrokenPipeError))
-            assert ask_to_quit(run)
-
-    run.train(on_episode)
-    assert (run.episode, run.quitting) == (2, True)
 
 
 def test_a_deadline_ends_a_run_with_a_checkpoint_and_an_actor(tmp_path):

@@ -23,17 +23,13 @@ from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml
 from trainer import util
 from trainer.environments import scenario_of
-from trainer.evaluation import CHECKPOINT_FILE, is_expert, located
-from trainer.learner.config import find_algorithm
+from trainer.evaluation import CHECKPOINT_FILE, located
 from trainer.person import FASTEST, HUMANS, PERSON, SLOWEST
 from trainer.training.config import (
     CONFIG_FILE,
     DEFAULTS,
     EXTENT,
-    LATER,
     OPTIONS,
-    PRESETS,
-    SETTINGS,
     TYPED,
     RunConfig,
     flat,
@@ -67,9 +63,14 @@ def run(arguments: argparse.Namespace) -> int:
     own = Path(arguments.out) / CONFIG_FILE
     in_file: dict[str, Any] = {}
     if arguments.config is not None:
-        in_file = _config_file(Path(arguments.config), given)
+        found = read_toml(Path(arguments.config), "config")
+        in_file = settings_in(found, arguments.config)
+        in_file |= {name: value for name, value in found.items() if name == "preset"}
     elif arguments.resume and own.is_file():
-        in_file = _own_config(own, given)
+        in_file = settings_in(read_json(own, "run config"), str(own))
+        for name in {"scenario", "algorithm", "human"} - given.keys():
+            # A name of a module must be typed: no file imports one.
+            name_in_file(str(in_file.get(name)), f"{arguments.out} was trained with", f"--{name}")
     values = {**in_file, **given, **dict(map(parse_setting, arguments.set))}
     done = _begin(values.pop("preset", "ours"), values, arguments)
     return INTERRUPTED if done.interrupted else 0
@@ -114,12 +115,8 @@ def train(
 def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     """Train with these settings; ``how`` holds the options that do not decide the result."""
     human = values.get("human", DEFAULTS.human)
-    if human == PERSON:  # as a run's own --config says
-        raise UserError(f"a person guides that run: name --human {', '.join(HUMANS)}")
-    if not is_expert(human) and human not in HUMANS and not Path(human).exists():
-        known = ", ".join([DEFAULTS.human, *HUMANS])
-        words = f"none of {known}, no module:Class and no human model's directory"
-        raise UserError(f"--human {human} is {words}")
+    if human == PERSON:  # As a run's own config says
+        human = HUMANS[0]
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
     values["human"] = PERSON if human in HUMANS else located(human)
@@ -184,9 +181,6 @@ def _train(
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{_summary(run_dir, training.env.control_period_s)}: {run_dir}")
-    if training.over and training.steps < config.steps:
-        said = f"{config.episodes} episodes were over first: --episodes N allows more"
-        print(said, file=sys.stderr)
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
@@ -211,38 +205,6 @@ def _summary(run_dir: Path, period_s: float) -> str:
     return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
-def _config_file(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Read the file of ``--config``; --preset and --algorithm may not change a setting in it."""
-    found = read_toml(path, "config")
-    values = settings_in(found, str(path))
-    if "preset" in found:
-        values["preset"] = found["preset"]
-    decided = _changed_by(given["preset"]) if "preset" in given else set()
-    rows = {given.get("algorithm"), values.get("algorithm")} - {None}
-    if len(rows) == 2:
-        decided = decided.union(*(find_algorithm(str(row)).settings for row in rows))
-    if clash := decided & values.keys():
-        what = "--preset or --algorithm"
-        raise UserError(f"config {path} sets {min(clash)}, and so does {what}: leave one out")
-    return values
-
-
-def _own_config(path: Path, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a resumed run's config; a name of a module must be typed: no file imports one."""
-    values = settings_in(read_json(path, "run config"), str(path))
-    if "preset" in given:
-        names = _changed_by("ours") | _changed_by("printed")
-        values = {name: value for name, value in values.items() if name not in names}
-    for name in {"scenario", "algorithm", "human"} - given.keys():
-        name_in_file(str(values.get(name)), f"{path.parent} was trained with", f"--{name}")
-    return values
-
-
-def _changed_by(preset: str) -> set[str]:
-    changed = flat(PRESETS[preset])
-    return {name for name, default in SETTINGS.items() if changed[name] != default}
-
-
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
     """Return whether there is a checkpoint to resume.
 
@@ -265,28 +227,9 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
     saved, wanted = settings_in(read_json(path, "run config"), str(path)), flat(config)
-    saved = {name: SETTINGS[name] for name in LATER if name in SETTINGS} | saved
-    if not saved.keys() >= set(EXTENT):
-        raise UserError(f"run config {path} does not say how many episodes and steps")
-    changed = [
-        f"{_option(name, saved[name]) if name in saved else f'no {name}'} (now {_typed(name, now)})"
-        for name, now in wanted.items()
-        if name not in EXTENT and (name not in saved or saved[name] != now)
-    ]
-    if changed:
-        raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
-    for name in EXTENT:
-        # Steps left out are 0: the run would go by episodes, and begin to explore anew.
-        if wanted[name] < saved[name]:
-            raise UserError(f"{run_dir} is a run of --{name} {saved[name]}: repeat that, or more")
-
-
-def _option(name: str, value: Any) -> str:
-    """Return an option with its value, as it was typed."""
-    if name == "period_s":  # 0: what the environment says
-        return f"--period {value}" if value else "no --period"
-    return (f"--{name} " if name in OPTIONS else f"--set {name}=") + _typed(name, value)
-
-
-def _typed(name: str, value: Any) -> str:
-    return "|".join(HUMANS) if (name, value) == ("human", PERSON) else str(value)
+    for name, now in wanted.items():
+        before = saved.get(name)
+        # A run may go on for longer.
+        if before is None or (now < before if name in EXTENT else now != before):
+            what = f"{run_dir} was trained with {name} = {before}, not {now}"
+            raise UserError(f"{what}: repeat the options that it had")

@@ -23,14 +23,6 @@ RANGES = {
     (MIN_PERIOD_S, MAX_PERIOD_S): ("period_s",),
 }
 """What these numbers may be; all others are at least 0."""
-LATER = (
-    "guided_until_episode", "late_from_s", "late_to_s", "missed_share",
-    "period_s",
-    "q_term", "rewarded", "proxy_values", "human_share", "updates_per_step", "asks",
-    "foresight", "preference_beta",
-)  # fmt: skip
-"""Fields of a run's config and of an algorithm's row that came after the first records. A run or a
-record without one had its default."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
@@ -62,8 +54,6 @@ class RunConfig:
     guided_share: float = 1.0
     """Share of the episodes in which the human watches (the authors' code: a third in the left
     turn)."""
-    guided_until_step: int = 0
-    """Environment steps after which the human no longer watches; 0: no end."""
     guided_until_episode: int = 0
     """Episodes after which the human no longer watches; 0: no end."""
     late_from_s: float = 0.0
@@ -72,9 +62,6 @@ class RunConfig:
     """Maximum take-over delay, s."""
     missed_share: float = 0.0
     """Share of the reasons to take over that the human overlooks, each for 15 control periods."""
-    penalise_stuck: bool = False
-    """Whether a take-over from a car that waits too long is penalised, too. Such a car looks like
-    one that rightly waits, so the penalty teaches to fear waiting."""
     averaged_actor: bool = True
     """Whether the target actor is validated, kept and exported, instead of the actor that learns.
     It is a running average of that one (Polyak and Juditsky, 1992), which swings."""
@@ -110,10 +97,8 @@ class RunConfig:
         if self.late_to_s < self.late_from_s:
             raise UserError(f"late_to_s {self.late_to_s} is below late_from_s {self.late_from_s}")
 
-    def guided(self, episode: int, steps: int) -> bool:
-        """Whether the human watches an episode that begins after so many environment steps."""
-        if self.guided_until_step and steps >= self.guided_until_step:
-            return False
+    def guided(self, episode: int) -> bool:
+        """Whether the human watches an episode, counted from 0."""
         if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)

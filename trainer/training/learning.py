@@ -8,7 +8,6 @@ finished, and only then the step is stored. Beside a person nothing waits (`Unhu
 import copy
 import math
 import os
-import sys
 import threading
 import time
 from collections import deque
@@ -22,18 +21,21 @@ import torch
 
 from bridge.network import parse_spec
 from edge_runtime.util import UserError
+from trainer.environments import ticks_late
 from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.replay import Action, Batch, Observation, ReplayBuffer, Transition
 from trainer.learner.td3 import NETWORKS, Losses, TD3Learner, charges_overruled
 from trainer.training.config import RunConfig
-from trainer.training.delayed import ticks_late
 from trainer.util import Purpose, random_stream
 
 LOSSES = Losses._fields[:4]  # What is averaged over an episode
-NICENESS = 10
-"""Of what learns beside a person, with torch's own threads: the loop goes first."""
-LOOK_S = 0.002  # Between two looks whether an update is done, where it must be waited for
+NICENESS = 10  # Of what learns beside a person, with torch's own threads: the loop goes first
+
+
+def diverged(what: str) -> UserError:
+    hint = "a smaller --set actor_learning_rate or critic_learning_rate may help"
+    return UserError(f"the training diverged, its {what} are no longer finite: {hint}")
 
 
 class LearningThread:
@@ -42,8 +44,6 @@ class LearningThread:
     The policy acts in that thread, too: another would bring a second pool of OpenMP threads, and
     the two would fight for the same cores. The networks are on the config's device, the replay
     buffer is in the processor's memory.
-
-    Raises UserError: there is no memory for the replay buffer.
     """
 
     def __init__(self, config: RunConfig, env: Any) -> None:
@@ -58,10 +58,8 @@ class LearningThread:
                 c.gamma, c.intervention_penalty if charges_overruled(c, row) else None,
                 env.layout, row.human_share, bool(row.foresight),
             )  # fmt: skip
-        except MemoryError:
-            what = f"a replay buffer of {c.replay_capacity} transitions"
-            hint = "--set replay_capacity=N, a smaller one"
-            raise UserError(f"there is no memory for {what}: {hint}") from None
+        except MemoryError as error:
+            raise UserError(f"replay_capacity {c.replay_capacity}: {error}") from None
         self._random = random_stream(config.seed, Purpose.REPLAY)
         late = ticks_late(parse_spec(config.latency), env.control_period_s)
         self._seen: deque[Observation] = deque(maxlen=late + 1)
@@ -77,10 +75,6 @@ class LearningThread:
     def added(self) -> int:
         """Transitions stored since the run began."""
         return self.replay.added
-
-    @property
-    def updating(self) -> bool:
-        return self._begun is not None and not self._begun[1].done()
 
     def act(self, observation: Observation) -> Action:
         return self.in_thread(self.learner.actor.act, observation[None])[0]
@@ -102,15 +96,14 @@ class LearningThread:
             return
         seen = [*self._seen, transition.next_observation]
         ahead = [*self._seen, *transition.foreseen[1:]][: len(transition.foreseen)]
+        # Eq. 17's reward as printed, unless the overruled action is charged
+        reward = transition.reward if self.algorithm.rewarded else 0.0
+        charged = transition.penalised and self.config.penalty_on == HUMANS_ACTION
+        reward = equations.shaped_reward(reward, self.config.intervention_penalty, charged, False)
         self.replay.add(
-            replace(
-                transition,
-                observation=seen[0],
-                reward=self._shaped(transition),
-                next_observation=seen[1],
-                foreseen=tuple(ahead),
-            )
-        )
+            replace(transition, observation=seen[0], reward=reward, next_observation=seen[1],
+                    foreseen=tuple(ahead))
+        )  # fmt: skip
 
     def begin(self, beta: float) -> None:
         """Start an update, or several, on what is stored; ``beta`` is eq. 15's exponent."""
@@ -121,7 +114,7 @@ class LearningThread:
     def finish(self) -> float:
         """Wait for the update that was begun, if one was; return the seconds waited.
 
-        What the update raised comes out here; FloatingPointError where learning has diverged.
+        What the update raised comes out here; UserError where learning has diverged.
         """
         if self._begun is None:
             return 0.0
@@ -129,7 +122,7 @@ class LearningThread:
         (batches, update), self._begun = self._begun, None
         done, learning_s = update.result()
         if not all(np.isfinite(losses.priorities).all() for losses in done):
-            raise FloatingPointError("its losses are no longer finite")
+            raise diverged("losses")
         waited_s = time.perf_counter() - began_s
         self._waiting_s += waited_s
         self._learning_s += learning_s
@@ -162,10 +155,10 @@ class LearningThread:
         self.replay.end_episode()
 
     def check_weights(self) -> None:
-        """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
+        """Raise UserError unless every weight is finite: no such checkpoint is kept."""
         networks = (getattr(self.learner, name) for name in NETWORKS)
         if not all(p.isfinite().all() for network in networks for p in network.parameters()):
-            raise FloatingPointError("its weights are no longer finite")
+            raise diverged("weights")
 
     def state_dict(self) -> dict[str, Any]:
         replay = {
@@ -182,12 +175,6 @@ class LearningThread:
 
     def close(self) -> None:
         self._thread.shutdown()
-
-    def _shaped(self, transition: Transition) -> float:
-        """Return eq. 17's reward as printed, unless the overruled action is charged."""
-        reward = transition.reward if self.algorithm.rewarded else 0.0
-        charged = transition.penalised and self.config.penalty_on == HUMANS_ACTION
-        return equations.shaped_reward(reward, self.config.intervention_penalty, charged, False)
 
     def _update(self, batches: list[Batch], beta: float) -> tuple[list[Losses], float]:
         began_s = time.perf_counter()
@@ -243,27 +230,23 @@ class UnhurriedLearning(LearningThread):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self._copy_actor()
+        self._actor.load_state_dict(self.learner.actor.state_dict())
 
     def settle(self) -> None:
         """Wait for the update that is under way."""
         # In short waits: a signal that another thread took does not wake the main thread.
         while not self._tidy():
-            time.sleep(LOOK_S)
+            time.sleep(0.002)
 
     def _tidy(self) -> bool:
         """Finish an update that is done; return False where one is not."""
-        if self.updating:
-            return False
         if self._begun is not None:
+            if not self._begun[1].done():
+                return False
             super().finish()
-            self._copy_actor()
+            self._actor.load_state_dict(self.learner.actor.state_dict())
         return True
-
-    def _copy_actor(self) -> None:
-        self._actor.load_state_dict(self.learner.actor.state_dict())
 
 
 def _step_aside() -> None:
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -6,27 +6,25 @@ import io
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.outcomes import GOAL, failed, settled
-from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.training.config import CURVE_FILE
+from trainer.util import fitting
 
 NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
-COUNTED = ("episode", "total_steps", "interventions", "human_steps")
-WHOLE = (*COUNTED, "updates")
-ALWAYS = (*COUNTED, "steps", "episode_return", "distance_m")
-"""Columns that hold a number in every row; others are empty in runs from before they came."""
+WHOLE = ("episode", "total_steps", "interventions", "human_steps", "updates")
+LEARNED = (0.9, 0.98)
+"""Success rates of the policy alone, in validation, whose cost is reported."""
 
 
 @dataclass
@@ -75,56 +73,44 @@ class MetricsWriter:
     """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T."""
 
     def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
-        self.path = run_dir / METRICS_FILE
-        kept = read_metrics(run_dir)[:from_episode]
-        if len(kept) < from_episode:
-            raise UserError(f"{self.path} lacks episodes before the checkpoint: {from_episode}")
+        path, self._period_s = run_dir / METRICS_FILE, period_s
+        self._rows = read_metrics(run_dir)[:from_episode]
+        if len(self._rows) < from_episode:
+            raise UserError(f"{path} lacks episodes before the checkpoint: {from_episode}")
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
-        writer.writerows(kept)
-        write_atomic(str(self.path), text.getvalue().encode())
-        self._period_s, self._spent = period_s, spent(kept, period_s)
-        self._outcomes = [row["outcome"] for row in kept]
-        there = totals(kept, period_s).get("until", {})
-        self._human_s_to = {level: it["human_s"] for level, it in there.items() if it}
-        self._file = self.path.open("a", newline="")
+        writer.writerows(self._rows)
+        write_atomic(path, text.getvalue().encode())
+        self._file = path.open("a", newline="")
         self._csv = csv.DictWriter(self._file, NAMES)
         self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=from_episode)
 
     def add(self, metrics: EpisodeMetrics) -> None:
-        """Write one episode's row, with the totals so far; UserError where the disk is full."""
-        self._spent["human_s"] += metrics.human_steps * self._period_s
-        self._spent["takeovers"] += metrics.interventions
-        self._outcomes.append(metrics.outcome)
-        metrics.total_human_s = round(self._spent["human_s"], 6)
-        metrics.total_takeovers = self._spent["takeovers"]
-        metrics.total_failures = sum(map(failed, settled(self._outcomes)))
-        for level in LEARNED:
-            if is_reached(level, metrics.validation_success):
-                self._human_s_to.setdefault(f"{level:g}", metrics.total_human_s)
-        reached = (self._human_s_to.get(f"{level:g}", NAN) for level in LEARNED)
-        metrics.human_s_to_90, metrics.human_s_to_98 = reached
+        """Write one episode's row, with the totals so far."""
+        self._rows.append({name: str(value) for name, value in asdict(metrics).items()})
+        so_far = totals(self._rows, self._period_s)
+        metrics.total_human_s, metrics.total_takeovers = so_far["human_s"], so_far["takeovers"]
+        metrics.total_failures = sum(so_far["failures"].values())
+        metrics.human_s_to_90, metrics.human_s_to_98 = (
+            until["human_s"] if until else NAN for until in so_far["until"].values()
+        )
         row = asdict(metrics)
-        try:
-            self._csv.writerow(row)
-            self._file.flush()
-            os.fsync(self._file.fileno())  # No power cut leaves a checkpoint without its rows.
-        except OSError as error:
-            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+        self._csv.writerow(row)
+        self._file.flush()
+        os.fsync(self._file.fileno())  # No power cut leaves a checkpoint without its rows.
         row["success"] = float(metrics.outcome == GOAL)
         for name, value in row.items():
             if isinstance(value, (int, float)) and value == value:
                 self._board.add_scalar(name, value, metrics.episode)
 
     def close(self) -> None:
-        with suppress(OSError):  # Closing tries once more to write what `add` could not.
-            self._file.close()
+        self._file.close()
         self._board.close()
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """Read the rows of a run, none where it has none; a column that came later is empty.
+    """Read the rows of a run, none where it has none.
 
     A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
     Raises UserError for a file that is damaged, or not of this project.
@@ -132,30 +118,24 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
     path = run_dir / METRICS_FILE
     if not path.exists():
         return []
-    try:
+    with fitting(f"{path} is no metrics of a training, or damaged"):
         # As csv ends lines: an outcome may hold what `str.splitlines` takes for another end.
         whole, end, _ = read_bytes(path, "metrics").rpartition(b"\n")
-        reader = csv.DictReader(io.StringIO((whole + end).decode(), newline=""), strict=True)
-        if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
-            raise ValueError("its columns are others")
-        rows = list(reader)
+        text = io.StringIO((whole + end).decode(), newline="")
+        rows = list(csv.DictReader(text, strict=True))
         for number, row in enumerate(rows):
-            for name, value in row.items():  # None stands for a column too few or too many.
-                if name in ALWAYS or (value != "" and name != "outcome"):
-                    (int if name in WHOLE else float)(value)
-            if int(row["episode"]) != number:
-                raise ValueError(f"row {number + 1} is of episode {row['episode']}")
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path} is no metrics of a training, or damaged: {error}") from None
-    return [{**dict.fromkeys(NAMES, ""), **row} for row in rows]
+            values = {name: _number(name, text) for name, text in row.items() if name != "outcome"}
+            if [*row] != NAMES or values["episode"] != number:
+                raise ValueError(row)
+    return rows
 
 
-LEARNED = (0.9, 0.98)
-"""Success rates of the policy alone, in validation, whose cost is reported."""
+def _number(name: str, text: str) -> float:
+    return int(text) if name in WHOLE else float(text)
 
 
 def was_validated(row: Mapping[str, str]) -> bool:
-    return row["validation_success"] not in ("", "nan")
+    return row["validation_success"] != "nan"
 
 
 def is_reached(level: float, success: float) -> bool:
@@ -163,7 +143,7 @@ def is_reached(level: float, success: float) -> bool:
     return success >= level - 1e-9
 
 
-def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
+def spent(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]:
     """Sum up what episodes cost: steps, the human's effort, failures by outcome."""
     human_steps = sum(int(row["human_steps"]) for row in rows)
     failures = Counter(filter(failed, settled(row["outcome"] for row in rows)))
@@ -176,27 +156,24 @@ def spent(rows: Sequence[dict[str, str]], period_s: float) -> dict[str, Any]:
     }
 
 
-def totals(
-    rows: Sequence[dict[str, str]], period_s: float, kept_episode: int | None = None
-) -> dict[str, Any]:
+def totals(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]:
     """Sum up what a run cost and what it reached, from its rows; empty without rows.
 
     ``failures``: training episodes, with the human's help, that missed the goal, by outcome.
-    ``validation``: best and last success rate, and the steps after which the kept actor reached the
-    best. ``until``: what was spent until the policy alone first reached each of ``LEARNED``, or
-    None. ``kept_episode``: episodes before the kept actor; None: the rows tell.
+    ``validation``: best and last success rate, and the environment steps before the best.
+    ``until``: what was spent until the policy alone first reached each of ``LEARNED``, or None.
     """
     if not rows:
         return {}
     measured = [
-        (float(row["validation_success"]), float(row.get("validation_reward") or "nan"), number)
+        (float(row["validation_success"]), float(row["validation_reward"]), number)
         for number, row in enumerate(rows)
         if was_validated(row)
     ]
     validation = {}
     if measured:
         best, _, number = max(measured)  # As `Validation` keeps it: of equal ones the last.
-        at_step = int(rows[: kept_episode or number + 1][-1]["total_steps"])
+        at_step = int(rows[number]["total_steps"])
         validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
     until = {}
     for level in LEARNED:
@@ -204,7 +181,7 @@ def totals(
         until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
     return {
         "episodes": len(rows),
-        "updates": int(rows[-1]["updates"] or 0),
+        "updates": int(rows[-1]["updates"]),
         **spent(rows, period_s),
         "validation": validation,
         "until": until,
@@ -219,7 +196,6 @@ PANELS = {
     "success": "success",
     "human_share": "share of steps driven by the human",
 }
-Values = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -236,34 +212,26 @@ def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
     ``out`` is by default in the first run's directory. UserError: a run has no metrics yet.
     """
     path = run_dirs[0] / CURVE_FILE if out is None else Path(out)
-    check_writable(path)
-    runs = [_columns(run_dir) for run_dir in run_dirs]
-    shortest = min(len(run["episode"]) for run in runs)
-    episodes = runs[0]["episode"][:shortest]
+    runs = [_curves(run_dir) for run_dir in run_dirs]
+    shortest = min(map(len, runs))
     figure = Figure(figsize=(10, 6), layout="constrained")
     panels = dict(zip(PANELS, figure.subplots(2, 2, sharex=True).flat, strict=True))
     for name, panel in panels.items():
-        curves = [moving_average(run[name], WINDOW) for run in runs]
-        label = f"mean of {WINDOW}"
+        means = pd.concat([run[name].rolling(WINDOW, min_periods=1).mean() for run in runs], axis=1)
         if len(runs) == 1:
-            panel.plot(episodes, runs[0][name], ".", markersize=3, color="0.75")
+            panel.plot(runs[0][name], ".", markersize=3, color="0.75")
         else:
-            label = f"{len(runs)} runs, {label}"
-            for run, curve in zip(runs, curves, strict=True):
-                panel.plot(run["episode"], curve, color="C0", alpha=0.25, linewidth=1)
-        mean = np.mean([curve[:shortest] for curve in curves], axis=0)
-        panel.plot(episodes, mean, color="C0", label=label)
+            panel.plot(means, color="C0", alpha=0.25, linewidth=1)
+        label = f"mean of {len(runs)} runs and {WINDOW} episodes"
+        panel.plot(means[:shortest].mean(axis=1), color="C0", label=label)
         panel.set_title(PANELS[name])
+        panel.set_xlabel("episode")
         panel.grid(alpha=0.3)
-    # Mean success of the policy alone, where all runs were validated.
-    validated = np.array([run["validation"][:shortest] for run in runs])
-    tested = ~np.isnan(validated).any(axis=0)
-    means = validated[:, tested].mean(axis=0)
-    success = panels["success"]
-    success.plot(episodes[tested], means, "o-", color="C1", label="policy alone, validation")
-    success.legend()
-    for name in ("success", "human_share"):
-        panels[name].set_xlabel("episode")
+    # Where all runs were validated
+    validated = pd.concat([run["validation_success"] for run in runs], axis=1).dropna()
+    label = "policy alone, validation"
+    panels["success"].plot(validated.mean(axis=1), "o-", color="C1", label=label)
+    panels["success"].legend()
     write_figure(figure, path)
     return path
 
@@ -274,26 +242,12 @@ def write_figure(figure: Figure, path: Path) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def moving_average(values: Values, window: int) -> Values:
-    """Return the means of the last ``window`` values (fewer at the start), same length."""
-    sums = np.convolve(values, np.ones(window))[: len(values)]
-    return sums / np.minimum(np.arange(1, len(values) + 1), window)
-
-
-def _columns(run_dir: Path) -> dict[str, Values]:
-    rows = read_metrics(run_dir)
-    if not rows:
+def _curves(run_dir: Path) -> pd.DataFrame:
+    """Return a run's metrics as numbers, an episode a row, counted from 1."""
+    rows = pd.DataFrame(read_metrics(run_dir))
+    if rows.empty:
         raise UserError(f"{run_dir} holds no metrics to draw")
-
-    def column(name: str) -> Values:
-        # Kept results have an empty field where there was no number.
-        return np.array([row.get(name) or "nan" for row in rows], dtype=float)
-
-    return {
-        "episode": column("episode") + 1,
-        "episode_return": column("episode_return"),
-        "distance_m": column("distance_m"),
-        "success": np.array([row["outcome"] == GOAL for row in rows], dtype=float),
-        "human_share": column("human_steps") / column("steps"),
-        "validation": column("validation_success"),
-    }
+    curves = rows.drop(columns="outcome").astype(float)
+    curves["success"] = (rows.outcome == GOAL).astype(float)
+    curves["human_share"] = curves.human_steps / curves.steps
+    return curves.set_index(curves.episode + 1)

@@ -3,8 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,9 +16,14 @@ from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_atomic, write_json
-from edge_runtime.util import UserError
 from trainer import util
-from trainer.environments import check_foresight, expert_of, foresee, make_environment
+from trainer.environments import (
+    DelayedVehicle,
+    check_foresight,
+    expert_of,
+    foresee,
+    make_environment,
+)
 from trainer.evaluation import (
     BEST_FILE,
     CHECKPOINT_FILE,
@@ -49,8 +53,7 @@ from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
-from trainer.training.delayed import DelayedVehicle
-from trainer.training.learning import LearningThread
+from trainer.training.learning import LearningThread, diverged
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
@@ -102,22 +105,17 @@ class Validation(Trials):
         self.best = (-1.0, -1.0)
         """Success and return of the best actor among the validations that were due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
-        self.kept_episode: int | None = None  # After so many was the actor that the file holds
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Validate after ``episode`` episodes where that is due, or at the end of a run."""
-        if due or (at_end and self.config.evaluate_every_steps):
-            self.judge(metrics, episode, due)
-
-    def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
-        """Validate the policy as it stands, into ``metrics``; keep it if it is the best so far.
+        """Validate after ``episode`` episodes where that is due, or at the end of a run.
 
         A resumed run forgets a validation that was not ``due``: when a run was stopped must not
         decide which actor it ends with.
         """
-        actor = getattr(self.learning.learner, self.config.kept_actor)
-        driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
-        self.take(self.drive(driver), actor, metrics, episode, due)
+        if due or (at_end and self.config.evaluate_every_steps):
+            actor = getattr(self.learning.learner, self.config.kept_actor)
+            driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
+            self.take(self.drive(driver), actor, metrics, episode, due)
 
     def take(
         self,
@@ -132,10 +130,9 @@ class Validation(Trials):
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        state = {**self.config.label(episode), "actor": actor.state_dict()}
         if (success, reward) >= self.best:
+            state = {**self.config.label(episode), "actor": actor.state_dict()}
             save_torch(self.run_dir / BEST_FILE, state)
-            self.kept_episode = episode
             if due:
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
 
@@ -144,18 +141,14 @@ class Validation(Trials):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
-        self.best = tuple(state["best_validation"])
-        self._best_actor = state["best_actor"]
-        if self._best_actor is not None:
-            save_torch(self.run_dir / BEST_FILE, self._best_actor)
-            self.kept_episode = self._best_actor["episode"]
-        else:  # What is there was validated before it was due.
+        self.best, self._best_actor = tuple(state["best_validation"]), state["best_actor"]
+        if self._best_actor is None:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)
+        else:
+            save_torch(self.run_dir / BEST_FILE, self._best_actor)
 
 
 NOBODY = Guide()
-
-
 Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]
 """Takes a control period and the info of its step, once it is stored: a view, or a recording."""
 
@@ -266,15 +259,13 @@ class TrainingRun:
             metrics_writer.close()
             self.learning.close()
             self.env.close()
-            rows, kept = read_metrics(self.run_dir), self.validation.kept_episode
-            report = totals(rows, self.env.control_period_s, kept)
+            report = totals(read_metrics(self.run_dir), self.env.control_period_s)
             write_json(self.run_dir / REPORT_FILE, report)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
-        with self._divergence_said():
-            metrics = self._episode()
-            self.learning.check_weights()
+        metrics = self._episode()
+        self.learning.check_weights()
         self.episode += 1
         self.steps = metrics.total_steps
         return metrics
@@ -291,22 +282,19 @@ class TrainingRun:
         return max(episodes, self.steps / self.config.steps) if self.config.steps else episodes
 
     def save(self) -> None:
-        with self._divergence_said():  # The update under way beside a person may be the one.
-            state = {
-                **self.config.label(self.episode),
-                **self.guide.state_dict(),
-                "learning": self.learning.state_dict(),
-                "steps": self.steps,
-                "kept_actor": self.config.kept_actor,
-                "exploration": self.exploration.bit_generator.state,
-                **self.validation.state_dict(),
-            }
+        state = {
+            **self.config.label(self.episode),
+            **self.guide.state_dict(),
+            "learning": self.learning.state_dict(),
+            "steps": self.steps,
+            "kept_actor": self.config.kept_actor,
+            "exploration": self.exploration.bit_generator.state,
+            **self.validation.state_dict(),
+        }
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.episode, self.steps = state["episode"], state["steps"]
-        if not (type(self.episode) is type(self.steps) is int and self.episode >= 0 <= self.steps):
-            raise ValueError("no counts")
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guide.load_state_dict(state)
@@ -317,7 +305,7 @@ class TrainingRun:
         seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
         observation, info = self.vehicle.reset(seed=seed)
         self._drawn = np.zeros(self.env.action_space.shape)
-        guide = self.guide if config.guided(self.episode, self.steps) else NOBODY
+        guide = self.guide if config.guided(self.episode) else NOBODY
         self.guide.reset()
         ended = False
         while not ended:
@@ -377,18 +365,20 @@ class TrainingRun:
         return next_observation, terminated or truncated, info
 
     def penalises(self, intervention: Intervention | None) -> bool:
-        """Return whether an intervention begins that costs the policy (eq. 17)."""
+        """Return whether an intervention begins that costs the policy (eq. 17).
+
+        Help that was asked for is no objection. A stuck car looks like one that rightly waits: a
+        penalty would teach to fear waiting.
+        """
         row = self.algorithm
         if intervention is None or not intervention.first or not row.penalty:
             return False
-        if intervention.reason == ASKED:  # no objection
-            return False
-        return intervention.reason != STUCK or self.config.penalise_stuck or not row.rewarded
+        return intervention.reason != ASKED and (intervention.reason != STUCK or not row.rewarded)
 
     def _explore(self, observation: Observation) -> Action:
         action = self.learning.act(observation)
         if not np.isfinite(action).all():  # No car is to be driven by it.
-            raise FloatingPointError("its actions are no longer finite")
+            raise diverged("actions")
         c, std = self.config.learner, self._exploration_std()
         self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
         noise = equations.exploration_noise(std, c.exploration_bound, self._drawn)
@@ -408,13 +398,3 @@ class TrainingRun:
         """Return whether a run that is never stopped validates here."""
         every = self.config.evaluate_every_steps
         return bool(every) and (self.over or self.steps // every > steps_before // every)
-
-    @contextmanager
-    def _divergence_said(self) -> Iterator[None]:
-        """Turn the FloatingPointError of learning that diverged into a UserError."""
-        try:
-            yield
-        except FloatingPointError as error:
-            hint = "a smaller --set actor_learning_rate or critic_learning_rate may help"
-            where = f"the training diverged in episode {self.episode + 1}"
-            raise UserError(f"{where}: {error}; {hint}") from None
