@@ -234,7 +234,7 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
 def handled(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iterator[None]:
     """Handle signals in the block; a signal within ``AGAIN_S`` of the last one is the same one.
 
-    A signal that is ignored stays so (SIGHUP under nohup). Does nothing outside of the main thread.
+    A SIGHUP that is ignored stays so (nohup). Does nothing outside of the main thread.
     """
     had_s = -math.inf
 
@@ -246,7 +246,8 @@ def handled(numbers: Iterable[int], handler: Callable[[int, Any], None]) -> Iter
 
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in numbers if is_main}
-    before = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
+    if before.get(signal.SIGHUP) is signal.SIG_IGN:
+        del before[signal.SIGHUP]
     try:
         for number in before:
             signal.signal(number, once)
