@@ -89,13 +89,14 @@ def test_what_a_link_held_up_is_not_driven_on_and_what_it_lost_is():
 
 @pytest.mark.parametrize(
     ("max_s", "period_s"),
-    [*((max_s, T) for max_s in (-1.0, 0.05, 1.1, math.nan, math.inf)), (1.2, 0.3)],
+    [*((max_s, T) for max_s in (-1.0, 0.05, 1.1, math.nan, math.inf)), (1.2, 0.3), (0.5, 0.02)],
 )
 def test_a_ride_is_one_period_to_one_second_at_any_rate(max_s, period_s):
-    limits, words = shared_limits([PEDAL], {}), f"use {period_s} to 1 s, or 0 for off"
+    limits, most_s = shared_limits([PEDAL], {}), 0.2 if period_s == 0.02 else 1
+    words = f"use {period_s} to {most_s} s, or 0 for off"  # at most ten periods
     with pytest.raises(UserError, match=f"ride_through.max_s .* {words}"):
         Ride(max_s, period_s, limits, plays=True)
-    assert Ride(1.0, 0.3, limits, plays=True).periods == 3
+    assert [Ride(1.0, at_s, limits, plays=True).periods for at_s in (0.3, T)] == [3, 10]
 
 
 def said(order):

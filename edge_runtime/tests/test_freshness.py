@@ -70,11 +70,21 @@ def test_a_clock_that_is_set_counts_as_lag_until_the_round_trip_of_a_stop_shows_
     ahead = [(0.0, 0.0), (T, T), (9.2, 0.2), (9.3, 0.3)]
     assert lags(*ahead, trips=trips)[2:] == near(9, 9)
     assert lags(*ahead, trips={**trips, 2: -1.0}, stands={2, 3})[2:] == near(9, 0)
+    # In the stop itself: the trip alone tells, all of what it has above the quickest.
+    assert lags(*ahead[:3], trips={**trips, 2: 0.35}, stands={2})[2:] == near(0.3)
+    # No clock was set where a state is somewhat quicker, whatever the two clocks' offset.
+    quicker = [(0.0, 0.05), (T, 0.05)]
+    assert lags(*quicker, trips={0: 0.2, 1: 0.35}, stands={1}) == near(0, 0)
 
 
 def test_a_round_trip_is_held_against_the_quickest_whose_state_did_not_lag():
     back = [(0.0, 0.0), (T, 0.3), (-9.8, 0.4), (-9.7, 0.5)]
     assert lags(*back, trips={1: 0.25, 3: 0.25}, stands={2, 3})[2:] == near(10.2, 0.2)
+    # The first trip is the quickest, however quick or late its state was.
+    early = [(0.0, 0.2), (T, 0.2), (2 * T, 0.3)]
+    assert lags(*early, trips={1: 0.3, 2: 0.75}, stands={2})[2:] == near(0.45 - LIMIT_S)
+    late = [(0.0, 0.0), (T, 0.3), (2 * T, 0.2)]
+    assert lags(*late, trips={1: 0.1, 2: 0.5}, stands={2})[2:] == near(0.5 - LIMIT_S)
     # What is measured only while a clock may have been set shows nothing.
     assert lags(*back, trips={2: 2.0, 3: 2.0}, stands={3})[2:] == near(10.2, 10.2)
 
@@ -109,6 +119,14 @@ def test_commands_that_are_late_in_a_stop_do_not_make_a_state_late():
     trips = {0: 0.05, 1: 0.05, 2: 0.25, 3: 0.25}
     assert lags(*states, trips=trips, stands=stands) == near(0, 0, 0, 0)
     assert lags(*states, trips={**trips, 2: 0.7}, stands=stands) == near(0, 0, 0.65 - LIMIT_S, 0)
+    # A lag that was driven on stays one: the least follows it.
+    assert lags(*states, trips={**trips, 2: 0.4}, stands={2})[2:] == near(*[0.35 - LIMIT_S] * 2)
+
+
+def test_the_time_for_which_the_sender_held_a_command_is_no_part_of_its_round_trip():
+    heard = {"heard": 1, "heard_sent_ns": 10**9, "heard_ns": 5 * 10**9}
+    state = make_state(3, sent_ns=5 * 10**9 + 7 * 10**8, **heard)
+    assert Received(state, 0.0, 10**9 + 9 * 10**8).trip_s == pytest.approx(0.2)
 
 
 def answered(controller, step, now_s, lag_s=0.0, output=GOOD):

@@ -257,7 +257,7 @@ def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
     wait_until(lambda: simulator.feedback[-1].speed_mps == 0.0, "it stands between two episodes")
     # No operator is needed for another episode.
     simulator.drive_until(moves, "the next drive", episode=1)
-    edge.send(signal.SIGHUP)  # as SIGTERM and SIGINT
+    edge.send(signal.SIGINT)  # as SIGTERM
     last = command_of_reason(simulator, "runtime_ended")
     assert (last.mode, last.action) == ("safe_stop", [-1.0])
     assert edge.wait() == 0
