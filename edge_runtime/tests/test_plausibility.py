@@ -45,6 +45,7 @@ def watched(asked=0.0, ticks=20, **reported):
         (0.0, {}, {"speed_mps": math.nan}, Fault.LYING),
         (0.0, {}, {"pedal": 1.1}, Fault.LYING),
         (0.0, {}, {"lamp": 1.0}, None),  # beyond its limits, an action is between -1 and 1
+        (0.0, {"lamp": -1.0}, {}, None),
         (0.0, {}, {"lamp": -1.1}, Fault.LYING),
     ],
 )
@@ -52,6 +53,17 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
     watch, now_s = watched(asked=asked, **reported)
     watch.report(report(**{**reported, **newest}), now_s + TICK_S)
     assert watch.fault(now_s + TICK_S) is fault
+
+
+def test_a_stuck_wheel_is_found_beside_a_pedal_that_the_driver_judges():
+    watch = VehicleWatch(T, MockVehicle.limits)
+    watch.begin(100.0)
+    for tick in range(20):
+        now_s = 100.0 + tick * TICK_S
+        watch.command({"pedal": 0.6, "steering": 0.5}, now_s)
+        action = {"pedal": 0.3, "steering": 0.0}
+        watch.report(VehicleReport(action, 1.0, False, [], commanded_speed_mps=1.0), now_s)
+    assert watch.fault(now_s) is Fault.STUCK
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,13 @@ def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig
     assert set(rig.speeds(count)) == {0.0}
 
 
+def test_a_vehicle_that_confirms_nothing_is_stopped_after_a_second_whenever_it_is_looked_at(rig):
+    rig.core.enable(rig.now_s)
+    for late_s, state in ((0.99, VehicleState.ENABLING), (1.37, VehicleState.STOPPED)):
+        rig.core.tick(rig.now_s + late_s)
+        assert rig.core.state is state
+
+
 TOLERANCE_RAD = 0.1 * SPEC.centre_rad(SPEC.max_inner_steering_rad)
 FOUND_WITHIN_S = 0.7
 """0.4 s to follow, 0.1 s of deviation, and 46 mrad at 1 rad/s, as for one that came from there."""
