@@ -19,7 +19,7 @@ main = program(
     "python -m bridge",
     "The simulator's side of the wire.",
     COMMANDS,
-    "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime",
+    "python -m bridge simulate --env Pendulum-v1 --episodes 5 --clock realtime",
     "python -m bridge view --serve",
 )
 

@@ -193,6 +193,7 @@ SETTINGS = {
     "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages, _write_outages),
 }
 """Name in a specification -> setting."""
+SHORT_GRAMMAR = "50ms+-10ms or delay=50ms,loss=1% (all settings: bridge/README.md)"
 GRAMMAR = (
     "none, 50ms+-10ms, or settings such as "
     + ",".join(f"{name}={row.example}" for name, row in SETTINGS.items())

@@ -24,7 +24,7 @@ import zenoh
 from bridge.environments import picture_of, say_once, scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
-from bridge.network import GRAMMAR, parse_spec
+from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import RecordingWriter, new_recording
 from edge_runtime import tls as access
 from edge_runtime.cli import (
@@ -276,17 +276,21 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
 _ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
-_TLS = "folder with ca.pem, cert.pem and key.pem (python -m deploy certs), for tls/... endpoints"
-_UNTIL = "stop after this time, in s (default: when no simulator is left)"
-_NETWORK = "simulated network: " + GRAMMAR.replace("%", "%%")
+_TLS = "folder of this party's certificate, from `deploy certs`; turns TLS on (tls/HOST:PORT)"
+_UNTIL = "stop after this many seconds (default: when the last simulator has left)"
+_NETWORK = "simulated network, for example " + SHORT_GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--listen": {**ENDPOINT, "help": "endpoint for edge runtimes and viewers"},
-    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": "simulator or router"},
+    "--listen": {**ENDPOINT, "help": "endpoint on which edge runtimes and viewers connect"},
+    "--connect": {
+        **ENDPOINT,
+        "default": DEFAULT_ENDPOINT,
+        "help": "endpoint of the simulator or router",
+    },
     "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
-    "--vehicle-id": {**_ID, "help": "the vehicle"},
-    "--wait-s": {**_SECONDS, "default": 10.0, "help": "longest wait for a simulator, in s"},
+    "--vehicle-id": {**_ID, "help": "id of the vehicle"},
+    "--wait-s": {**_SECONDS, "default": 10.0, "help": "seconds to wait for a simulator"},
     "--duration-s": {**_SECONDS, "help": _UNTIL},
-    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "longest wait for an edge, in s"},
+    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "seconds to wait for an edge runtime"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
     "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "random seed"},
     "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
@@ -318,7 +322,7 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "settings from a file for zenohd, in the place of other options"
+    config = "a settings file of zenohd, instead of all other options"
     parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
@@ -346,9 +350,9 @@ ROUTER = Subcommand(examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router
 
 
 def _add_record_arguments(parser: Any) -> None:
-    add, one = parser.add_argument, "record this vehicle only (otherwise all)"
-    linger = "longest wait for a simulator that has gone to come back, in s"
-    out = "the recording, which must not exist yet"
+    add, one = parser.add_argument, "record only this vehicle (default: all)"
+    linger = "seconds to wait for a simulator that has left to come back"
+    out = "recording to write; the file must not exist yet"
     add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     add_options(parser, "--vehicle-id", default=None, help=one)

@@ -58,7 +58,7 @@ from edge_runtime.wire import State
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 PEDAL = "pedal"
 EXAMPLE = examples(
-    "python -m bridge simulate --env SCENARIO --episodes 5 --clock realtime --latency 50ms+-10ms",
+    "python -m bridge simulate --env Pendulum-v1 --episodes 5 --clock realtime --latency 50ms+-10ms",
     "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle --vehicle-id car-a",
 )
 
@@ -79,10 +79,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
-    add_options(where, "--connect", default=None, help="a router to share with other vehicles")
+    add_options(
+        where, "--connect", default=None, help="connect to this router instead of listening"
+    )
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
-    add_options(parser, "--vehicle-id", help="the vehicle to simulate")
-    add_options(parser, "--seed", help="episode i is reset with seed + i")
+    add_options(parser, "--vehicle-id", help="id of the vehicle to simulate")
+    add_options(parser, "--seed", help="random seed of the first episode; each next episode adds 1")
 
 
 def run(asked: Namespace) -> int:

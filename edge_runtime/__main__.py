@@ -133,7 +133,7 @@ REARM = Subcommand(
     _rearm,
 )
 COMMANDS = {
-    "check": (CHECK, "say whether a policy may drive, and how fast it is"),
+    "check": (CHECK, "check whether a policy may drive, and measure its inference time"),
     "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
     "status": (STATUS, "print the status of a running edge runtime"),
     "rearm": (REARM, "let a vehicle drive again after a safe stop"),

@@ -77,15 +77,14 @@ def examples(*commands: str) -> str:
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
 
 
-def add_public_key(parser: Any) -> None:
+def add_public_key(parser: Any, more: str = "") -> None:
     """Add ``--public-key``, of every command that reads a policy, to a parser or group."""
     parser.add_argument(
         "--public-key",
         metavar="FILE",
         type="path",
-        help="public key that verifies the policy's signature, Ed25519 as PEM (default:"
-        " keys/policy.pub where it exists; with --allow-unsigned first policy.pub beside the"
-        " policy)",
+        help="Ed25519 public key (PEM) that verifies the signature (default: keys/policy.pub"
+        + f"{more})",
     )
 
 

@@ -60,17 +60,20 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 # The settings that are flags as well: metavar and help.
 _FLAGS: Dict[str, Tuple[str, str]] = {
     "policy": ("POLICY.onnx", "policy file to drive; its signature is POLICY.onnx.sig beside it"),
-    "connect": ("PROTOCOL/HOST:PORT", "address at which the simulator or its router listens"),
+    "connect": (
+        "PROTOCOL/HOST:PORT",
+        "endpoint of the simulator or router, for example tcp/10.0.0.2:7447",
+    ),
     "tls": (
         "DIR",
-        "encrypt the connection: directory with this party's certificate (ca.pem, cert.pem and"
-        " key.pem of `python -m deploy certs`); --connect must then be tls/HOST:PORT",
+        "folder of this party's certificate, from `deploy certs`; turns TLS on, so --connect must"
+        " be tls/HOST:PORT",
     ),
-    "vehicle_id": ("ID", "name of the vehicle; simulator, runtime and operator must use the same"),
+    "vehicle_id": ("ID", "id of the vehicle; simulator, runtime and operator must use the same"),
     "vehicle": (
         "NAME",
         f"vehicle to move: {', '.join((NONE, *BUILT_IN))}, the name of an installed driver, or"
-        " MODULE:CLASS of your own; none answers the simulator only",
+        " your own as MODULE:CLASS; with none the runtime only answers the simulator",
     ),
     "bus": ("INTERFACE:CHANNEL", "CAN bus of --vehicle hunter, such as socketcan:can0"),
     "log_level": ("LEVEL", f"log events of this level or above: {', '.join(log.LEVELS)}"),
@@ -89,8 +92,10 @@ def add_flags(parser: Any, *names: str) -> None:
 
 def add_trust(parser: Any) -> None:
     """Add the flags that say which policy may drive to a parser or group."""
-    add_public_key(parser)
-    text = "also drive a policy that is not signed, or whose signer's public key is not known"
+    beside = "; with --allow-unsigned, policy.pub in the policy's folder comes first"
+    add_public_key(parser, beside)
+    text = "also drive a policy without a signature or without a known key; a wrong signature is "
+    text += "still refused"
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
@@ -101,7 +106,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     add_flags(parser.add_argument_group("simulator"), "connect", "tls", "vehicle_id")
     add_flags(parser.add_argument_group("vehicle"), "vehicle", "bus")
     more = parser.add_argument_group("settings and log")
-    text = "settings file (edge_runtime/config.example.toml explains each); options override it"
+    text = "settings file (edge_runtime/config.example.toml explains it); options override it"
     more.add_argument("--config", metavar="FILE.toml", help=text)
     add_flags(more, "log_level")
 

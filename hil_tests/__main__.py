@@ -7,13 +7,25 @@ import sys
 from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "doctor": ("hil_tests.doctor", "what this machine can and cannot do, and how to get the rest"),
+    "doctor": (
+        "hil_tests.doctor",
+        "list what this machine can and cannot do, and how to install the rest",
+    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
-    "campaign": ("hil_tests.commands:campaign", "every fault, every latency row, one report"),
-    "envelope": ("hil_tests.commands:envelope", "the smallest networks that break a policy"),
-    "mock_hunter": ("hil_tests.mock_hunter.process", "a Hunter on a CAN bus, with all its faults"),
-    "conformance": ("hil_tests.conformance", "a vehicle's driver against the rules that stop it"),
-    "bench": ("hil_tests.bench_loop", "the loop's latency beside a bare Zenoh callback"),
+    "campaign": (
+        "hil_tests.commands:campaign",
+        "inject every fault, test every simulated network, and write a report",
+    ),
+    "envelope": (
+        "hil_tests.commands:envelope",
+        "find the delay, jitter and loss that a policy can bear",
+    ),
+    "mock_hunter": (
+        "hil_tests.mock_hunter.process",
+        "run a simulated Hunter on a CAN bus, with its faults",
+    ),
+    "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),
+    "bench": ("hil_tests.bench_loop", "measure the loop's latency beside a bare Zenoh callback"),
 }
 
 

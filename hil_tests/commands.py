@@ -16,16 +16,21 @@ from trainer.environments import CONDITIONS
 )
 def campaign(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    out = "report as JSON; R.md and a picture go beside it"
+    out = "report to write, as JSON; R.md and a picture are written beside it"
     add("--out", required=True, metavar="R.json", help=out)
     add_scenario(parser)
     _add_common(parser, "SCENARIO")
-    add("--runs", type=cli.whole_number(2), default=100, help="episodes on each network")
-    add("--target", type=cli.share, default=0.98, help="share of successes that is asked for")
+    add("--runs", type=cli.whole_number(2), default=100, help="episodes per network")
+    add(
+        "--target",
+        type=cli.share,
+        default=0.98,
+        help="success rate that a network must keep, 0 to 1",
+    )
     add("--only", choices=("latency", "faults"), help="run one part (default: both)")
     rows = "run only these networks and faults, by name or pattern (delay, hunter_*); an unknown"
     add("--rows", metavar="NAME,...", help=f"{rows} name lists all")
-    add("--tries", type=cli.positive, default=10, help="tries of each fault")
+    add("--tries", type=cli.positive, default=10, help="repetitions of each fault")
 
 
 @command(
@@ -35,11 +40,11 @@ def campaign(parser: argparse.ArgumentParser) -> None:
 def envelope(parser: argparse.ArgumentParser) -> None:
     inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
     add = parser.add_argument
-    add("--out", required=True, metavar="F.json", type="path", help="the envelope, as JSON")
-    add("--env", default="left_turn", help="scenario, gymnasium id or module:id")
+    add("--out", required=True, metavar="F.json", type="path", help="envelope to write, as JSON")
+    add("--env", default="left_turn", help="scenario, gymnasium id or MODULE:ID")
     _add_common(parser, "ENV")
-    add("--promise", type=inner, default=0.95, help="share of successes to be kept")
-    add("--confidence", type=inner, default=0.95, help="confidence of each axis's limit")
+    add("--promise", type=inner, default=0.95, help="success rate that the policy must keep")
+    add("--confidence", type=inner, default=0.95, help="statistical confidence of each limit")
 
 
 def _add_common(parser: argparse.ArgumentParser, env: str) -> None:
@@ -47,6 +52,8 @@ def _add_common(parser: argparse.ArgumentParser, env: str) -> None:
     policy = f"policy file (default: results/policies/{env}.onnx)"
     add("--policy", metavar="P.onnx", help=policy)
     add_public_key(parser)
-    add("--condition", choices=CONDITIONS, default=NOMINAL, help="condition of the scene")
+    add(
+        "--condition", choices=CONDITIONS, default=NOMINAL, help="traffic and noise of the scenario"
+    )
     add("--seed", type=count, default=0, help="seed of the first drive")
-    add("--jobs", type=count, default=0, help="drives or faults at the same time; 0: one a core")
+    add("--jobs", type=count, default=0, help="parallel drives or faults; 0: one per core")

@@ -14,7 +14,7 @@ from typing import Any
 
 from bridge.environments import scenarios
 from bridge.fork import add_place
-from bridge.network import GRAMMAR
+from bridge.network import SHORT_GRAMMAR
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command, program, run_cli
 from trainer.environments import CONDITIONS
@@ -48,7 +48,8 @@ def train(parser: argparse.ArgumentParser) -> None:
     what = parser.add_argument_group("what to train")
     add = what.add_argument
     add_scenario(what)
-    rows = f"learning algorithm: {', '.join(ALGORITHMS)}; of an installed package; or module:ROW"
+    rows = f"learning algorithm: {', '.join(ALGORITHMS)}, a name from an installed package, or "
+    rows += "MODULE:ROW (trainer/README.md explains the names)"
     add("--algorithm", default=DEFAULTS.algorithm, metavar="NAME", help=rows)
     add_seed(what)
     add_fields(what, DEFAULTS, *EXTENT)
@@ -63,21 +64,21 @@ def train(parser: argparse.ArgumentParser) -> None:
     add(
         "--period", action=_Set, dest="set", default=[], metavar="SECONDS",
         type=lambda text: f"period_s={cli.positive_number(text)}",
-        help="control period, the seconds of a step (default: the environment's own, else from"
-        f" its render_fps, else {PERIOD_S})",
+        help="seconds of one step (default: the environment's own; else 1 / render_fps; else"
+        f" {PERIOD_S})",
     )  # fmt: skip
-    add_latency(what, "simulated network between policy and vehicle, also in validation")
+    add_latency(what, "simulated network in training and validation")
     guide = parser.add_argument_group("who guides")
-    whose = f"expert|module:Class|HUMAN_DIR|{'|'.join(HUMANS)}"
-    known = "who takes over from the policy: the environment's scripted expert, module:Class of "
-    known += "another expert, a model trained by `trainer human`, or you, in the browser"
+    whose = f"expert|MODULE:CLASS|HUMAN_DIR|{'|'.join(HUMANS)}"
+    known = "who takes over from the policy: the environment's scripted expert, your own expert as "
+    known += "MODULE:CLASS, a model trained by `trainer human`, or you, in the browser (web)"
     guide.add_argument("--human", default=DEFAULTS.human, metavar=whose, help=known)
     add_person(parser)
     how = parser.add_argument_group("the run")
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
-    on = "go on from the last checkpoint in RUN_DIR, with the options that the run had"
+    on = "continue from the last checkpoint in RUN_DIR with the run's own options"
     how.add_argument("--resume", action="store_true", help=on)
-    add_time_limit(how, "stop at the end of the episode in which this time is over")
+    add_time_limit(how, "stop after this many minutes, at the end of the running episode")
     add_device(how)
     add_threads(how)
     shown = "show the training in the rerun viewer: spawn opens a window, serve a page on this "
@@ -107,21 +108,21 @@ class _Set(argparse.Action):
     "python -m trainer drive --from drive.mcap --at 3s --out runs/drives",
 )
 def drive(parser: argparse.ArgumentParser) -> None:
-    add_scenario(parser, "what was recorded")
+    add_scenario(parser, "the scenario of the recording")
     add = parser.add_argument
     device = "how you drive: in the browser, with keyboard, touch, gamepad or wheel"
     add("--human", "--device", dest="human", choices=HUMANS, default=HUMANS[0], help=device)
     driver = "policy that drives until you take over, as in `trainer evaluate` (default: none)"
     add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
-    forked = "repeat this recorded drive until --at in each episode, and drive on from there"
+    forked = "repeat this recorded drive until --at, then drive on from there, in each episode"
     add("--from", dest="recording", metavar="F.mcap", type="path", help=forked)
     add_place(parser)
-    out = "directory of the recordings; each sitting adds one"
+    out = "directory of the recordings; each run of this command adds one file"
     add("--out", metavar="REC_DIR", type="path", default="runs/drives", help=out)
     number = "number of episodes (default: no end)"
     add("--episodes", type=cli.positive, metavar="N", help=number)
-    add_seed(parser, " of the episodes, which are others in every sitting")
+    add_seed(parser, " of the episodes; each run of this command drives different ones")
     add_person(parser)
     add_threads(parser)
 
@@ -140,7 +141,7 @@ def human(parser: argparse.ArgumentParser) -> None:
     person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
     person += "their directories, or such a training run (default: imitate the scripted expert)"
     add("--from", dest="recordings", nargs="+", metavar="RECORDING", type="path", help=person)
-    last = "begin no episode after this time; the refining steps are reduced in proportion"
+    last = "begin no episode after this many minutes; the refining steps shrink in proportion"
     add_time_limit(parser, last)
     add_threads(parser)
 
@@ -152,19 +153,19 @@ def human(parser: argparse.ArgumentParser) -> None:
 )
 def evaluate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    policy = "an .onnx file, a RUN_DIR, a HUMAN_DIR, expert, module:Class of another expert, or "
-    policy += "constant:ACTION, one action from -1 to 1 throughout"
+    policy = "an .onnx file, a RUN_DIR, a HUMAN_DIR, expert, your own expert as "
+    policy += "MODULE:CLASS, or constant:ACTION, the same action from -1 to 1 in every step"
     add("policy", metavar="POLICY", help=policy)
     add_public_key(parser)
-    add_scenario(parser, "what the policy was trained in")
+    add_scenario(parser, "the scenario of the policy's training")
     scenes = "; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items())
     scenes = scenes.replace("%", "%%")
     add("--condition", choices=CONDITIONS, default="nominal", help=scenes)
     add_latency(parser, "simulated network between policy and vehicle")
     count = "number of episodes"
     add("--runs", type=cli.positive, default=50, metavar="N", help=count)
-    add_seed(parser, " of the first episode; each next episode has one more")
-    out = "write the report and the results of each episode to this file; do not print it"
+    add_seed(parser, " of the first episode; each next episode adds 1")
+    out = "write the report with the results of each episode to this file instead of stdout"
     add("--out", metavar="R.json", type="path", help=out)
 
 
@@ -174,8 +175,8 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
 )
 def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_dir", metavar="RUN_DIR", help="directory of a training run")
-    add_scenario(parser, "what the run was trained in")
-    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
+    add_scenario(parser, "the scenario of the run")
+    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="policy file to write")
     parser.add_argument("--key", metavar="KEY", help="private key (PEM) that signs the policy")
 
 
@@ -185,7 +186,9 @@ def export(parser: argparse.ArgumentParser) -> None:
 )
 def bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
-    parser.add_argument("--quick", action="store_true", help="take few rounds: a look only")
+    parser.add_argument(
+        "--quick", action="store_true", help="measure only a few rounds, for a rough look"
+    )
     add_threads(parser)
 
 
@@ -215,7 +218,9 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     ray = "compute on a Ray cluster instead of this machine: HOST:PORT, auto or local"
     how.add_argument("--ray", metavar="ADDRESS", help=ray)
     add_device(how)
-    last = "stop every run after its next episode once this time is over; the same command resumes"
+    last = (
+        "stop every run at the end of its episode after this many minutes; the same command resumes"
+    )
     add_time_limit(how, last)
     where = parser.add_argument_group("where it is kept")
     results = "tables, figures and page (default: results/paper, or results/guidance)"
@@ -231,15 +236,18 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
 )
 def plot(parser: argparse.ArgumentParser) -> None:
-    runs = "directory of a training run; several are drawn thinly, and their mean"
+    runs = "directory of a training run; with several, the mean is drawn over thin single curves"
     parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
-    out = f"the picture (default: RUN_DIR/{CURVE_FILE})"
+    out = f"picture to write (default: RUN_DIR/{CURVE_FILE})"
     parser.add_argument("--out", metavar="F.png", help=out)
 
 
 def add_scenario(parser: Group, known: str = "") -> None:
     """Add ``--scenario``; ``known`` says in words where it comes from if not given."""
-    what = f"environment: {', '.join(scenarios())}, a gymnasium id, or module:id"
+    what = (
+        f"environment: {', '.join(scenarios())}, a gymnasium id such as Pendulum-v1, or MODULE:ID "
+    )
+    what += "(MODULE is imported first)"
     what += f" (default: {known}, else left_turn)" if known else ""
     default = None if known else "left_turn"
     parser.add_argument("--scenario", default=default, metavar="NAME", help=what)
@@ -251,13 +259,13 @@ def add_seed(parser: Group, what: str = "") -> None:
 
 
 def add_threads(parser: Group) -> None:
-    said = "processor threads for PyTorch; 0: its own default"
+    said = "processor threads for PyTorch; 0: PyTorch decides"
     kind = cli.whole_number(0, MOST_THREADS)
     parser.add_argument("--threads", type=kind, default=0, metavar="N", help=said)
 
 
 def add_latency(parser: Group, what: str) -> None:
-    said = f"{what}: {GRAMMAR}".replace("%", "%%")
+    said = f"{what}, for example {SHORT_GRAMMAR}".replace("%", "%%")
     parser.add_argument("--latency", metavar="SPEC", default="none", help=said)
 
 
@@ -301,10 +309,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.__main__:train", "train a policy with human guidance"),
     "drive": ("trainer.__main__:drive", "drive yourself, or take over from a policy; recorded"),
     "human": ("trainer.__main__:human", "train the human model from interventions (DAgger)"),
-    "evaluate": ("trainer.__main__:evaluate", "drive test episodes and report how well it does"),
-    "export": ("trainer.__main__:export", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.__main__:plot", "draw the learning curve of a run"),
-    "bench": ("trainer.__main__:bench", "measure learner, environments and training"),
+    "evaluate": (
+        "trainer.__main__:evaluate",
+        "drive test episodes with a policy and report its success",
+    ),
+    "export": ("trainer.__main__:export", "write the policy file of a training run"),
+    "plot": ("trainer.__main__:plot", "draw the learning curve of training runs"),
+    "bench": ("trainer.__main__:bench", "measure the speed of learner, environments and training"),
     "experiment": ("trainer.__main__:experiment", "run the paper's experiments or another table"),
 }
 

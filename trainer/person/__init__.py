@@ -126,10 +126,10 @@ class Person(Protocol):
 def add_person(parser: argparse.ArgumentParser) -> None:
     """Declare the person's options of ``drive`` and ``train``."""
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
-    here = "address on which the cockpit listens; by default only this machine reaches it"
+    here = "address on which the cockpit listens; the default admits only this machine"
     port = "port of the cockpit; 0: any free port"
     speed = number(f"a number from {SLOWEST} to {FASTEST}", lambda x: SLOWEST <= x <= FASTEST)
-    slow = "simulated seconds in a real second; 0.5 is slow motion"
+    slow = "simulated seconds per real second; 0.5 is half speed"
     group.add_argument("--host", default="127.0.0.1", help=here)
     group.add_argument("--port", type=whole_number(0, 65535), default=0, metavar="N", help=port)
     group.add_argument("--speed", type=speed, default=1.0, metavar="X", help=slow)

@@ -47,7 +47,7 @@ class RunConfig:
     episodes: int = 400
     """Maximum number of training episodes (table A5: 400)."""
     steps: int = 0
-    """Environment steps to train, to the end of the episode under way; 0: only episodes count."""
+    """Stop after this many environment steps, at the end of the running episode; 0: no limit."""
     human: str = "expert"
     """The guide: the word expert, ``module:Class`` of another expert, a human model's directory, or
     the word person."""
