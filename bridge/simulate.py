@@ -84,7 +84,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
     add_options(parser, "--vehicle-id", help="id of the vehicle to simulate")
-    add_options(parser, "--seed", help="random seed of the first episode; each next episode adds 1")
+    add_options(parser, "--seed", help="seed of the first episode; each next episode adds 1")
 
 
 def run(asked: Namespace) -> int:
