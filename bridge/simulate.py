@@ -58,7 +58,8 @@ from edge_runtime.wire import State
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 PEDAL = "pedal"
 EXAMPLE = examples(
-    "python -m bridge simulate --env Pendulum-v1 --episodes 5 --clock realtime --latency 50ms+-9ms",
+    "python -m bridge simulate --env Pendulum-v1 --episodes 5 \\\n"
+    "      --clock realtime --latency 50ms+-10ms",
     "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle --vehicle-id car-a",
 )
 
