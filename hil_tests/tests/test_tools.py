@@ -89,7 +89,8 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
     assert (status["whole"], status["service"]) == ("yes", "not run by the installer")
     assert episode["policy_id"] == status["policy_id"]
     assert episode["answered_states"] > 0
-    assert set(episode["rejected"]) <= {"stale", "foreign_session"}  # a busy machine's
+    # A busy machine's; and states that came before the runtime had seen the listener's certificate.
+    assert set(episode["rejected"]) <= {"stale", "foreign_session", "certificate"}
     assert not opt.exists()
 
 

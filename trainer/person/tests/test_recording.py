@@ -13,6 +13,7 @@ import msgspec
 import pytest
 from msgspec import structs
 
+from bridge.tests.recordings import flip_chunk
 from edge_runtime.util import UserError
 from hil_tests.processes import wait_until
 from trainer.person import recording
@@ -33,6 +34,19 @@ def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
         flushed = sum(end <= length for end in ends)
         # The cut may lie in what follows a step's chunk: then that step is whole, too.
         assert indices in (list(range(flushed)), list(range(flushed + 1)))
+
+
+@pytest.mark.parametrize("damaged", range(3))
+def test_a_flipped_bit_costs_the_episode_it_is_in_and_is_said(tmp_path, capsys, damaged):
+    steps = [
+        recorded_step(1, 3 * episode + step, step=step, terminated=step == 2)
+        for episode in range(3)
+        for step in range(3)
+    ]
+    path = record(tmp_path, steps)
+    flip_chunk(path, 3 + damaged)
+    assert [step.index for step in read_steps(path)] == [0, 1, 2, 6, 7, 8]
+    assert "1 damaged place" in capsys.readouterr().err
 
 
 def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_path):
