@@ -1,11 +1,13 @@
 """The loop on a scripted road: what is stored, when it learns, validates and ends."""
 
 import math
+import tempfile
 import threading
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from trainer.evaluation import CHECKPOINT_FILE
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Transition
 from trainer.learner.td3 import Losses
@@ -30,7 +32,9 @@ from trainer.tests.loops import (
 )
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
-from trainer.training.metrics import MetricsWriter
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter
+from trainer.training.run import Validation
+from trainer.util import load_torch
 
 
 @pytest.mark.parametrize(
@@ -217,3 +221,37 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurr
     assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert state["human"].tolist() == [False, False, False, True, False]
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=12), st.data())
+def test_when_a_run_was_stopped_does_not_decide_which_actor_it_ends_with(scores, data):
+    """Each episode: the success that a validation finds, and whether a validation is due."""
+
+    def judge(validation, episode, score, due):
+        ends = [
+            SimpleNamespace(outcome="goal" if n < score else "timeout", reward=0.0, distance_m=0.0)
+            for n in range(3)
+        ]
+        actor: Any = SimpleNamespace(state_dict=lambda: {"number": torch.tensor(episode)})
+        validation.take(ends, actor, EpisodeMetrics(episode), episode, due)
+
+    with tempfile.TemporaryDirectory() as folder:
+        kept = {}
+        for name, stops in (("unbroken", False), ("stopped", True)):
+            run_dir = Path(folder, name)
+            run_dir.mkdir()
+            validation = Validation(CONFIG, run_dir, cast(Any, None))
+            for episode, (score, due) in enumerate(scores):
+                if due:
+                    judge(validation, episode, score, due=True)
+                if stops and data.draw(st.booleans()):
+                    if not due:  # A run that stops validates what it leaves behind.
+                        judge(validation, episode, score, due=False)
+                    state, validation = (
+                        validation.state_dict(),
+                        Validation(CONFIG, run_dir, cast(Any, None)),
+                    )
+                    validation.load_state_dict(state)
+            path = run_dir / BEST_FILE
+            kept[name] = load_torch(path)["episode"] if path.exists() else None
+    assert kept["stopped"] == kept["unbroken"]
