@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import signal
 import threading
 import time
@@ -163,6 +164,9 @@ class _Runtime:
             threading.Thread(target=self._stop_when, args=(until,), daemon=True).start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
+        # What is loaded stays: the collector need not look at it again in the middle of a drive.
+        gc.collect()
+        gc.freeze()
         try:
             if self._vehicle is not None:
                 self._vehicle.start(self._config.is_armed_at_start)
@@ -209,6 +213,7 @@ class _Runtime:
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
         self._over.set()
+        gc.unfreeze()  # In Python another drive may follow.
         self._notifier.tell("STOPPING=1")
         ended = self._loop.close()
         if self._vehicle is not None:

@@ -96,7 +96,8 @@ def test_a_ride_is_one_period_to_one_second_at_any_rate(max_s, period_s):
     words = f"use {period_s} to {most_s} s, or 0 for off"  # at most ten periods
     with pytest.raises(UserError, match=f"ride_through.max_s .* {words}"):
         Ride(max_s, period_s, limits, plays=True)
-    assert [Ride(1.0, at_s, limits, plays=True).periods for at_s in (0.3, T)] == [3, 10]
+    rides = (1.0, 0.3), (1.0, T), (T, T)
+    assert [Ride(*ride, limits, plays=True).periods for ride in rides] == [3, 10, 1]
 
 
 def said(order):

@@ -5,6 +5,7 @@ import itertools
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hil_tests.testing.messages import make_state
@@ -127,6 +128,43 @@ def test_the_time_for_which_the_sender_held_a_command_is_no_part_of_its_round_tr
     heard = {"heard": 1, "heard_sent_ns": 10**9, "heard_ns": 5 * 10**9}
     state = make_state(3, sent_ns=5 * 10**9 + 7 * 10**8, **heard)
     assert Received(state, 0.0, 10**9 + 9 * 10**8).trip_s == pytest.approx(0.2)
+    for unknown in ("heard_sent_ns", "heard_ns"):
+        said = msgspec.structs.replace(state, **{unknown: None})
+        assert Received(said, 0.0, 10**9).trip_s is None
+
+
+def late_controller(*late):
+    """One that has answered a state, and then so many states late by 3 s."""
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T))
+    for step, lag_s in enumerate([0.0, *late]):
+        answered(controller, step, 1000.0 + T * step, lag_s)
+    return controller
+
+
+def test_a_gap_between_late_states_is_no_news_in_the_stop_that_they_made():
+    controller = late_controller(*[3.0] * 4)
+    assert controller.safety.reason == "state_late"
+    answered(controller, 9, 1005.0, 3.0)
+    assert controller.safety.reason == "state_late"
+
+
+def test_another_sender_is_news_in_a_stop_that_late_states_made():
+    controller = Controller(ControllerConfig(shared_limits([PEDAL], MockVehicle.limits), T, True))
+    for step, lag_s in enumerate([0.0, 3.0, 3.0, 3.0, 3.0]):
+        answered(controller, step, 1000.0 + T * step, lag_s)
+    state = make_state(0, sent_ns=round((1000.8 + DECADES_S) * 1e9), session="another")
+    controller.begin(Received(state, 1000.8, 0), 1000.8)
+    assert controller.safety.reason == "other_session"
+
+
+@pytest.mark.parametrize(("late", "mode"), [([], "standby"), ([3.0] * 4, "safe_stop")])
+def test_a_late_final_state_ends_a_drive_and_no_stop(late, mode):
+    controller = late_controller(*late)
+    now_s = 1000.0 + T * (1 + len(late))
+    state = make_state(9, sent_ns=round((now_s - 3.0 + DECADES_S) * 1e9), final=True)
+    controller.begin(Received(state, now_s, 0), now_s)
+    controller.finish(GOOD, 1, now_s)
+    assert controller.safety.mode.value == mode
 
 
 def answered(controller, step, now_s, lag_s=0.0, output=GOOD):
