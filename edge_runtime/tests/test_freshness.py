@@ -54,6 +54,8 @@ def test_clocks_that_drift_are_followed_and_each_session_has_its_own_quickest_st
     drifting = [(s, s * (1 + DRIFT)) for s in range(0, 3601, 60)]
     assert max(lags(*drifting)) == 0.0
     assert lags((0.0, 0.0), (100.0, 100.3)) == near(0, 0.28)
+    # The quickest trip creeps, too: one clock reads more of it by then.
+    assert lags((0.0, 0.0), (1e3, 1e3), trips={0: 0.05, 1: 0.25}, stands={1}) == near(0, 0)
     freshness = Freshness(LIMIT_S)
     states = (("a", 0.0, 0.0), ("b", 500.0, 0.1), ("a", 0.2, 2.0))
     assert [freshness.lag_s(*state, None, False) for state in states] == near(0, 0, 1.8)
