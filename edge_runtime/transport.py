@@ -88,9 +88,10 @@ def open_session(
         why = why_no_link(connect, tls)[1]
         first = "start the simulator or router there first, or name another address with --connect"
         raise UserError(f"no {link}{why and f' ({why})'}; {first}") from None
-    if connect is not None and tls is not None and not listens:
-        answers, why = why_no_link(connect, tls)  # A peer would go on trying for ever.
-        if answers and why:
+    if connect is not None and tls is not None and not session.info.routers_zid():
+        # A peer goes on trying for ever, also where it will never be let in: say so now.
+        answers, why = why_no_link(connect, tls)
+        if answers and why and not session.info.routers_zid():
             session.close()
             raise UserError(f"no {link}: {why}")
     return session
