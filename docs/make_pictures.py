@@ -32,7 +32,7 @@ from trainer.util import kept
 MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
-TAKE_OVERS = 12  # Before the picture of the cockpit: the coach needs something to say
+TAKE_OVERS = 3  # Before the picture of the cockpit
 
 
 def moment(scenario: str) -> tuple[Any, Any]:

@@ -95,7 +95,6 @@ class View:
     late_ticks: int = 0  # Control periods of this sitting that began too late
     paused: bool = False
     progress: str = ""  # One line on the learner; empty without one
-    coach: Any = None  # ``coach.Coaching``: episodes, learning curve and advice; None: nothing yet
     message: str = ""
     """A line for the page, such as "saving" or "episode ended: goal"; mostly empty."""
     picture: NDArray[np.uint8] | None = None

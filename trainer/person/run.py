@@ -13,7 +13,7 @@ from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -27,12 +27,11 @@ from trainer.human.guide import BY_PERSON, Intervention, Stepped, make_transitio
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
 from trainer.person import vector, web
-from trainer.person.coach import Coach, typical_curve
 from trainer.person.recording import DIRECTORY, RecordedStep, Recorder, read_episodes, steps_since
 from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
-from trainer.training.metrics import EpisodeMetrics, read_metrics, spent
+from trainer.training.metrics import EpisodeMetrics, read_metrics
 from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_vehicle
 from trainer.util import die_with_parent, interrupts_blocked
 
@@ -65,7 +64,7 @@ def training_with_person(
             _recover(training, sitting)
         else:
             training.save()  # So that a run killed in its first episode can be resumed.
-        _recall(training, sitting)
+        sitting.episode = training.episode
         yield training, sitting
         print(sitting.summary(), file=sys.stderr)
 
@@ -102,20 +101,6 @@ def restore_step(training: TrainingRun, step: RecordedStep) -> None:
     )  # fmt: skip
 
 
-def _recall(training: TrainingRun, sitting: Sitting) -> None:
-    """Tell the sitting of the episodes that the run has driven before it."""
-    before = read_metrics(training.run_dir)[: training.episode]
-    given = spent(before, training.env.control_period_s)
-    sitting.episode = training.episode
-    sitting.cost = {
-        "human_s": given["human_s"],
-        "takeovers": given["takeovers"],
-        "failures": sum(given["failures"].values()),
-    }
-    curve = typical_curve(training.config.scenario, training.config.algorithm)
-    sitting.coach = Coach(curve, learning=True)
-
-
 def check_settings(config: RunConfig) -> None:
     """Refuse what a person cannot be a part of; raises UserError."""
     row = find_algorithm(config.algorithm)
@@ -126,12 +111,8 @@ def check_settings(config: RunConfig) -> None:
             raise UserError(f"{name} is of a scripted human; with a person it must be {default}")
 
 
-class Candidate(NamedTuple):
-    """An actor, after so many episodes and so much of the person's time."""
-
-    actor: Actor
-    episode: int
-    human_s: float
+Candidate = tuple[Actor, int]
+"""An actor, and after how many episodes."""
 
 
 class PersonValidation(Validation):
@@ -142,6 +123,7 @@ class PersonValidation(Validation):
     ) -> None:
         super().__init__(config, run_dir, learning, sitting.env)
         self.sitting, self._behind = sitting, BehindTheScenes(config)
+        self._alone = ""  # Success of the policy alone, in words
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
@@ -149,9 +131,9 @@ class PersonValidation(Validation):
         learned = f"not learning yet ({added} of {warmup} steps)"
         if not math.isnan(metrics.critic_loss):
             learned = f"critic loss {metrics.critic_loss:.3f}"
-        self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}"
         if not at_end:
             self._beside(metrics, episode, due)
+            self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}{self._alone}"
             return
         every = self.config.evaluate_every_steps
         try:
@@ -171,13 +153,12 @@ class PersonValidation(Validation):
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
         """Take the validation that is done, into this episode's row, and begin one that is due."""
         if (found := self._behind.take()) is not None:
-            candidate, drives = found
-            self.take(drives, candidate.actor, metrics, candidate.episode)
-            point = candidate.human_s, metrics.validation_success
-            self.sitting.coach.curve.append(point)
+            (actor, then), drives = found
+            self.take(drives, actor, metrics, then)
+            self._alone = f", the policy alone succeeds in {metrics.validation_success:.0%}"
         if due and metrics.updates and not self._behind.busy:
             actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
-            self._behind.begin(Candidate(actor, episode, self.sitting.cost["human_s"]))
+            self._behind.begin((actor, episode))
 
 
 class BehindTheScenes:
@@ -194,7 +175,7 @@ class BehindTheScenes:
 
     def begin(self, candidate: Candidate) -> None:
         # Not as tensors: torch would share their memory with the process.
-        weights = {name: value.numpy() for name, value in candidate.actor.state_dict().items()}
+        weights = {name: value.numpy() for name, value in candidate[0].state_dict().items()}
         try:
             with interrupts_blocked(), _without_script():
                 answer = self._process.submit(_validate, self._config, weights)

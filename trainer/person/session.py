@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
-from bridge.outcomes import DISCARDED, RESTARTED, STOPPED, failed
+from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError, counted
@@ -34,7 +34,6 @@ from trainer.person import (
     vector,
     web,
 )
-from trainer.person.coach import Coach, SittingEpisode
 from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
@@ -84,13 +83,9 @@ class Sitting(Guide):
         self.stop = self.closed = False
         self.episode = 0  # The number of the episode, or of the next one
         self.progress = ""
-        self.driven: list[SittingEpisode] = []  # In this sitting
-        self.cost: dict[str, float] = {"human_s": 0.0, "takeovers": 0, "failures": 0}
-        """What the person has given so far, seconds of simulated time, in discarded episodes, too,
-        and the episodes that missed the goal. A run that goes on adds what it had."""
+        self.outcomes = Counter[str]()  # In this sitting
         self.saved_at = 0, 0
         """Sitting and step up to which the checkpoint knows what was recorded."""
-        self.coach = Coach()
         self._paused = False
         self._rest = amount(env.rest_action)
         self._seen: tuple[Observation, dict[str, Any]] | None = None
@@ -98,8 +93,7 @@ class Sitting(Guide):
         self._forget()
 
     def _forget(self) -> None:
-        self._step = self._human_steps = self._takeovers = self._read_ns = 0
-        self._taken_over_at = math.nan  # The step at which the last take-over began
+        self._step = self._read_ns = 0
         self._take_over = TakeOver()
         self._intent = Intent(self._rest)
         self._reading = Reading(self._rest)
@@ -153,13 +147,6 @@ class Sitting(Guide):
     def moved(self, observation: Observation, info: dict[str, Any]) -> str:
         """Take what a step has led to; return how the person ends the episode, else nothing."""
         self._seen = observation, info
-        if self._intervention is not None:
-            self._human_steps += 1
-            self.cost["human_s"] += self.env.control_period_s
-            if self._intervention.first:
-                self._takeovers += 1
-                self._taken_over_at = float(self._step)
-                self.cost["takeovers"] += 1
         self._step += 1
         return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
 
@@ -188,9 +175,8 @@ class Sitting(Guide):
 
     def end_episode(self, outcome: str) -> str:
         """Show how the episode ended, which the person may still discard; return how it ended."""
-        period_s = self.env.control_period_s
         # Counted in periods: on a machine that stands still, too, the person is asked.
-        for _ in range(math.ceil(REST_S / period_s)):
+        for _ in range(math.ceil(REST_S / self.env.control_period_s)):
             if self.stop:
                 break
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
@@ -198,11 +184,7 @@ class Sitting(Guide):
                 self.recorder.end_episode(discarded=True)
         self.recorder.end_episode(self._discard)
         outcome = DISCARDED if self._discard else outcome
-        self.cost["failures"] += failed(outcome)
-        since_s = (self._step - self._taken_over_at) * period_s
-        human_s = self._human_steps * period_s
-        self.driven.append(SittingEpisode(self.episode, outcome, human_s, self._takeovers, since_s))
-        self.coach.episodes.append(self.driven[-1])
+        self.outcomes[outcome] += 1
         self.episode += 1
         return outcome
 
@@ -223,7 +205,6 @@ class Sitting(Guide):
             late_ticks=self.pacer.late,
             paused=self._paused,
             progress=self.progress,
-            coach=self.coach.show(self.cost),
             message=message,
         )
         self.person.show(view)
@@ -232,8 +213,7 @@ class Sitting(Guide):
         """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
-        outcomes = Counter(episode.outcome for episode in self.driven)
-        listed = ", ".join(f"{count} {word}" for word, count in outcomes.items())
+        listed = ", ".join(f"{count} {word}" for word, count in self.outcomes.items())
         late = counted(self.pacer.late, "control period")
         return f"episodes: {listed or 'none'}; {late} late: {self.recorder.path}"
 

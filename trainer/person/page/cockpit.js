@@ -1,6 +1,5 @@
 // The cockpit: joins the hands, the link to the trainer, and what is drawn.
 
-import { showCoach } from "./coach.js";
 import { FIELDS, Gamepads } from "./gamepad.js";
 import { Keyboard, list, OFF, Pad, ways } from "./hands.js";
 import { Link } from "./link.js";
@@ -99,7 +98,6 @@ function draw() {
   byId("frames").parentElement.hidden = !view.frames;
   if (view.frames) drawFrames(frames, view.frames);
   history.draw();
-  showCoach(view.coach);
   bar("policy", view.policy_action);
   bar("applied", view.applied_action);
   byId("place").textContent = `episode ${view.episode + 1}, ${view.time_s.toFixed(1)} s`;

@@ -12,7 +12,7 @@ from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
 from trainer.person.recording import DIRECTORY
-from trainer.person.run import BehindTheScenes, Candidate
+from trainer.person.run import BehindTheScenes
 from trainer.person.tests.people import record, recorded_step
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
@@ -23,7 +23,7 @@ from trainer.training.run import Parts, TrainingRun, Validation
 def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):
     behind = BehindTheScenes(RunConfig())
     for _ in range(2):
-        behind.begin(Candidate(Actor(), 1, 0.0))
+        behind.begin((Actor(), 1))
         behind.kill()
         wait_until(lambda: not behind.busy, "the answer's absence")
         assert behind.take() is None
