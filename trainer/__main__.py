@@ -16,9 +16,9 @@ from bridge.environments import scenarios
 from bridge.fork import add_place
 from bridge.network import SHORT_GRAMMAR
 from edge_runtime import cli
-from edge_runtime.cli import add_public_key, command, program, run_cli
+from edge_runtime.cli import Subcommand, add_public_key, command, program, run_cli
+from trainer import experiments as plan
 from trainer.environments import CONDITIONS
-from trainer.experiments import plan
 from trainer.human import FIELDS, HumanModelConfig
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.person import HUMANS, add_person
@@ -55,9 +55,6 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_fields(what, DEFAULTS, *EXTENT)
     start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
-    file = "read options and settings from this file, such as the config.toml of a run; options "
-    file += "on the command line win; a setting in it wins over one of --preset or --algorithm"
-    add("--config", metavar="F.toml", help=file)
     change = "change a setting; may be repeated; --set alone lists all settings with their "
     change += "defaults and meanings"
     add("--set", action=_Set, nargs="?", default=[], metavar="NAME=VALUE", help=change)
@@ -85,7 +82,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     shown += "machine, F.rrd is a file to write"
     how.add_argument("--rerun", metavar="spawn|serve|F.rrd", help=shown)
     for action in parser._actions:
-        if action.dest in TYPED:  # Only what is typed wins over a config file.
+        if action.dest in TYPED:  # Only what is typed wins over a run's own config.
             action.help = f"{action.help} (default: {action.default})"
             action.default = argparse.SUPPRESS
 
@@ -305,18 +302,15 @@ def add_device(parser: Group) -> None:
     parser.add_argument("--device", choices=DEVICES, default=DEVICES[0], help=said)
 
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("trainer.__main__:train", "train a policy with human guidance"),
-    "drive": ("trainer.__main__:drive", "drive yourself, or take over from a policy; recorded"),
-    "human": ("trainer.__main__:human", "train the human model from interventions (DAgger)"),
-    "evaluate": (
-        "trainer.__main__:evaluate",
-        "drive test episodes with a policy and report its success",
-    ),
-    "export": ("trainer.__main__:export", "write the policy file of a training run"),
-    "plot": ("trainer.__main__:plot", "draw the learning curve of training runs"),
-    "bench": ("trainer.__main__:bench", "measure the speed of learner, environments and training"),
-    "experiment": ("trainer.__main__:experiment", "run the paper's experiments or another table"),
+COMMANDS: dict[str, tuple[Subcommand, str]] = {
+    "train": (train, "train a policy with human guidance"),
+    "drive": (drive, "drive yourself, or take over from a policy; recorded"),
+    "human": (human, "train the human model from interventions (DAgger)"),
+    "evaluate": (evaluate, "drive test episodes with a policy and report its success"),
+    "export": (export, "write the policy file of a training run"),
+    "plot": (plot, "draw the learning curve of training runs"),
+    "bench": (bench, "measure the speed of learner, environments and training"),
+    "experiment": (experiment, "run the paper's experiments or another table"),
 }
 
 main = program(

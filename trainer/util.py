@@ -11,6 +11,7 @@ import os
 import platform
 import signal
 import subprocess
+import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -155,17 +156,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-@contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Keep ^C, which a terminal sends to all, from processes started here: the parent ends them.
-
-    Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def begin_process(niceness: int) -> None:
+    """Leave ^C, which a terminal sends to all, to the parent; end with it; be nice to others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=die_with_parent, daemon=True).start()
+    os.nice(niceness)
 
 
 def die_with_parent() -> None:

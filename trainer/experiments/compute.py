@@ -9,19 +9,14 @@ import argparse
 import json
 import math
 import multiprocessing
-import os
-import signal
 import sys
-import tempfile
-import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -32,9 +27,10 @@ import torch
 
 from bridge.outcomes import GOAL
 from bridge.report import ProgressBar
-from edge_runtime.files import make_directory, write_atomic, write_json
+from edge_runtime.files import make_directory, write_json
 from edge_runtime.util import UserError, read_bytes, read_json
 from trainer import evaluation, util
+from trainer import experiments as plan
 from trainer.environments import make_environment
 from trainer.evaluation import (
     BEST_FILE,
@@ -45,8 +41,7 @@ from trainer.evaluation import (
     load_actor,
     load_driver,
 )
-from trainer.experiments import plan, records, report
-from trainer.experiments.plan import STUDIES, TASKS, Study, Unit
+from trainer.experiments import STUDIES, TASKS, Study, Unit, records, report
 from trainer.experiments.records import RECORD_FILE, Record, Store
 from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
@@ -64,7 +59,7 @@ TIMES = ["environment_s", "acting_s", "storing_s", "waiting_s"]
 """Columns of the metrics that add up to the time that a training took."""
 UNLIMITED_EPISODES = 10**6  # So many that steps decide
 TOGETHER = 50  # Test drives side by side
-Files = dict[str, bytes]
+NICENESS = 5  # Keeps the machine usable for others
 
 
 @dataclass(frozen=True)
@@ -115,7 +110,8 @@ def _store(arguments: argparse.Namespace, study: Study) -> Store:
     runs = Path(arguments.runs or util.kept(f"runs/{study.name}"))
     if arguments.quick:
         study, results, runs = study.quick(), runs / "quick/results", runs / "quick"
-    return Store(study, results, runs, Path(arguments.humans))
+    # Absolute: a node of a cluster works in another directory.
+    return Store(study, results, runs.absolute(), Path(arguments.humans).absolute())
 
 
 def compute_missing(arguments: argparse.Namespace, store: Store, wanted: Sequence[Unit]) -> int:
@@ -145,8 +141,8 @@ def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str
     Raises UserError where a process dies: nothing tells which unit's it was.
     """
     pool = ProcessPoolExecutor(
-        processes or util.cores(), multiprocessing.get_context("spawn"), _begin_process,
-        max_tasks_per_child=1,
+        processes or util.cores(), multiprocessing.get_context("spawn"), util.begin_process,
+        (NICENESS,), max_tasks_per_child=1,
     )  # fmt: skip
     try:
         work = {pool.submit(compute, job): job for job in jobs}
@@ -161,13 +157,6 @@ def run_here(jobs: Sequence[Job], processes: int = 0) -> Iterator[tuple[Job, str
             process.kill()
         raise
     pool.shutdown()
-
-
-def _begin_process() -> None:
-    """Leave ^C to the parent, end with it, and keep the machine usable for others."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=util.die_with_parent, daemon=True).start()
-    os.nice(5)
 
 
 def _end(job: Job, result: Callable[[], str]) -> str:
@@ -191,6 +180,7 @@ def run_on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str]]:
     """Compute units as Ray tasks of one processor each; yield how each ends.
 
     ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
+    All nodes see the directories of the runs and of the human models under the same paths.
 
     Raises UserError: Ray is not installed, or nothing answers at the address.
     """
@@ -208,41 +198,10 @@ def run_on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str]]:
         ray.init(address=address, runtime_env=modules, log_to_driver=False)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise UserError(f"--ray {address}: no cluster answers: {error}") from error
-    remote = ray.remote(num_cpus=1, max_retries=3)(compute_there)  # For nodes that die
-    work = {remote.remote(job, files_of(job, [job.human_model])).future(): job for job in jobs}
+    remote = ray.remote(num_cpus=1, max_retries=3)(compute)  # For nodes that die
+    work = {remote.remote(job).future(): job for job in jobs}
     for future in as_completed(work):
-        job = work[future]
-        yield job, _end(job, partial(take, job, future.result))
-
-
-def compute_there(job: Job, files: Files) -> tuple[str, Files]:
-    """Compute a unit on a node; return how it ended, and the files that it leaves."""
-    with tempfile.TemporaryDirectory() as root:
-        store = replace(job.store, runs=Path(root) / "runs", humans=Path(root))
-        job = replace(job, store=store)
-        write_files(job, files)
-        return compute(job), files_of(job, [])
-
-
-def files_of(job: Job, more: Iterable[Path]) -> Files:
-    paths = [*job.run_dir.glob("*"), *more]
-    return {path.name: path.read_bytes() for path in paths if path.is_file()}
-
-
-def write_files(job: Job, files: Files) -> None:
-    for name, data in files.items():
-        path = job.human_model if name == MODEL_FILE else job.run_dir / name
-        make_directory(path.parent)
-        write_atomic(path, data)
-
-
-def take(job: Job, there: Callable[[], tuple[str, Files]]) -> str:
-    """Keep what a node made; return how it ended."""
-    end, files = there()
-    write_files(job, files)
-    if end == FINISHED:
-        (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return end
+        yield work[future], _end(work[future], future.result)
 
 
 def compute(job: Job) -> str:

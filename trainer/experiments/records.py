@@ -23,7 +23,7 @@ from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_json
 from trainer import util
 from trainer.environments import CONDITIONS
-from trainer.experiments.plan import FULL_PATH_M, PAPER_TESTS, Line, Study, Unit
+from trainer.experiments import FULL_PATH_M, PAPER_TESTS, Line, Study, Unit
 from trainer.training.metrics import LEARNED as LEVELS
 from trainer.training.metrics import is_reached
 

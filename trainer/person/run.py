@@ -3,9 +3,7 @@
 import argparse
 import copy
 import math
-import os
 import sys
-import threading
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -33,7 +31,7 @@ from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics
 from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_vehicle
-from trainer.util import die_with_parent, interrupts_blocked
+from trainer.util import begin_process
 
 SCRIPTED = (
     "guided_share", "guided_until_episode", "poor_guidance_share",
@@ -111,19 +109,17 @@ def check_settings(config: RunConfig) -> None:
             raise UserError(f"{name} is of a scripted human; with a person it must be {default}")
 
 
-Candidate = tuple[Actor, int]
-"""An actor, and after how many episodes."""
-
-
 class PersonValidation(Validation):
-    """Validates behind the scenes, and once more at a sitting's end, when the page is closed."""
+    """Validates in a process of its own, and once more at a sitting's end, the page closed."""
 
     def __init__(
         self, config: RunConfig, run_dir: Path, learning: LearningThread, sitting: Sitting
     ) -> None:
         super().__init__(config, run_dir, learning, sitting.env)
-        self.sitting, self._behind = sitting, BehindTheScenes(config)
-        self._alone = ""  # Success of the policy alone, in words
+        self.sitting, self._alone = sitting, ""  # Success of the policy alone, in words
+        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start_validating)
+        self._begun: tuple[Actor, int, Future[list[EpisodeResult]]] | None = None
+        """What is being validated, after how many episodes, and its drives to come."""
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
@@ -148,58 +144,31 @@ class PersonValidation(Validation):
                 print("validation left out", file=sys.stderr)
 
     def close(self) -> None:
-        self._behind.close()
-
-    def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
-        """Take the validation that is done, into this episode's row, and begin one that is due."""
-        if (found := self._behind.take()) is not None:
-            (actor, then), drives = found
-            self.take(drives, actor, metrics, then)
-            self._alone = f", the policy alone succeeds in {metrics.validation_success:.0%}"
-        if due and metrics.updates and not self._behind.busy:
-            actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
-            self._behind.begin((actor, episode))
-
-
-class BehindTheScenes:
-    """The parent's side of the validation process; only ``close`` waits for it, and kills it."""
-
-    def __init__(self, config: RunConfig) -> None:
-        self._config = config
-        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start_validating)
-        self._begun: tuple[Candidate, Future[list[EpisodeResult]]] | None = None
-
-    @property
-    def busy(self) -> bool:
-        return self._begun is not None and not self._begun[1].done()
-
-    def begin(self, candidate: Candidate) -> None:
-        # Not as tensors: torch would share their memory with the process.
-        weights = {name: value.numpy() for name, value in candidate[0].state_dict().items()}
-        try:
-            with interrupts_blocked(), _without_script():
-                answer = self._process.submit(_validate, self._config, weights)
-            self._begun = candidate, answer
-        except BrokenExecutor:
-            self._begun = None  # It was killed; `take` has said so.
-
-    def take(self) -> tuple[Candidate, list[EpisodeResult]] | None:
-        """Return a validation's result; None: nothing new, or it failed, as stderr then says."""
-        if self._begun is None or self.busy:
-            return None
-        (candidate, answer), self._begun = self._begun, None
-        if error := answer.exception():
-            print(f"no validation beside the drive: {error}", file=sys.stderr)
-            return None
-        return candidate, answer.result()
-
-    def close(self) -> None:
+        """Kill the process: a person does not wait for it."""
         self.kill()
         self._process.shutdown(cancel_futures=True)
 
     def kill(self) -> None:
         for process in list((self._process._processes or {}).values()):
             process.kill()
+
+    def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
+        """Take the validation that is done, into this episode's row, and begin one that is due."""
+        if self._begun is not None and self._begun[2].done():
+            (actor, then, drives), self._begun = self._begun, None
+            if error := drives.exception():
+                print(f"no validation beside the drive: {error}", file=sys.stderr)
+            else:
+                self.take(drives.result(), actor, metrics, then)
+                self._alone = f", the policy alone succeeds in {metrics.validation_success:.0%}"
+        if due and metrics.updates and self._begun is None:
+            actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
+            # Not as tensors: torch would share their memory with the process.
+            weights = {name: value.numpy() for name, value in actor.state_dict().items()}
+            # A process that was killed: stderr has said so.
+            with suppress(BrokenExecutor), _without_script():
+                answer = self._process.submit(_validate, self.config, weights)
+                self._begun = actor, episode, answer
 
 
 @contextmanager
@@ -214,8 +183,7 @@ def _without_script() -> Iterator[None]:
 
 
 def _start_validating() -> None:
-    threading.Thread(target=die_with_parent, daemon=True).start()
-    os.nice(NICENESS)
+    begin_process(NICENESS)
     torch.set_num_threads(1)
 
 
@@ -223,7 +191,7 @@ _trials = cache(Trials)  # Of the one config
 
 
 def _validate(config: RunConfig, weights: dict[str, NDArray[Any]]) -> list[EpisodeResult]:
-    """Drive what `BehindTheScenes.begin` asks for, in its process."""
+    """Drive the validation of an actor, in a process beside the person."""
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)

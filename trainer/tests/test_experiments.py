@@ -17,11 +17,11 @@ import pytest
 from bridge.outcomes import COLLISION, GOAL
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import call, refusal
+from trainer import experiments as plan
 from trainer.environments import CONDITIONS
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE
-from trainer.experiments import compute, figures, plan, records, report
+from trainer.experiments import GUIDANCE, PAPER, Line, Unit, compute, records, report
 from trainer.experiments.compute import FAILED, FINISHED, STOPPED, Job
-from trainer.experiments.plan import GUIDANCE, PAPER, Line, Unit
 from trainer.experiments.records import RECORD_FILE, Store
 from trainer.human import MODEL_FILE, HumanModelConfig
 from trainer.human.model import HumanModel
@@ -153,17 +153,11 @@ class TestUnit:
         assert compute.compute(Job(UNIT, store)) == FINISHED
         assert record_of(store) == record_of(straight)
 
-    def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(self, store, straight):
-        """Stopped before its time began, in a process and on a node."""
-        assert compute.compute(Job(UNIT, store, stop_at_s=1.0)) == STOPPED
-        assert compute.compute(Job(UNIT, store, stop_at_s=Soon(1e18))) == STOPPED
-        for stop_at_s, end in ((Soon(1e18), STOPPED), (1e18, FINISHED)):
-            job = Job(UNIT, store, stop_at_s)
-            files = compute.files_of(job, [])
-            assert CHECKPOINT_FILE in files
-            assert compute.take(job, partial(compute.compute_there, job, files)) == end
+    def test_one_that_is_out_of_time_goes_on_to_the_same_record(self, store, straight):
+        """Stopped before its time began, and in the midst of it."""
+        for stop_at_s, end in ((1.0, STOPPED), (Soon(1e18), STOPPED), (1e18, FINISHED)):
+            assert compute.compute(Job(UNIT, store, stop_at_s)) == end
         assert record_of(store) == record_of(straight)
-        assert CHECKPOINT_FILE not in compute.files_of(job, [])
 
     def test_a_foreign_task_is_learned_and_reported_beside_its_expert(self, tmp_path, one_thread):
         store = store_in(tmp_path, GUIDANCE.quick())
@@ -184,8 +178,8 @@ def test_a_failure_is_one_units_and_one_line(store, capfd):
     bad = GUIDED._replace(scenario="congestion")
     write_human(store, bad.scenario).write_bytes(b"no human")
     units = [bad, UNIT._replace(algorithm=plan.HUMAN_MODEL, seed=0)]
-    ends = {job.unit: end for job, end in compute.run_here([Job(unit, store) for unit in units], 2)}
-    assert ends == {bad: FAILED, units[1]: FINISHED}
+    jobs = [Job(unit, store) for unit in units]
+    assert [compute._end(job, partial(compute.compute, job)) for job in jobs] == [FAILED, FINISHED]
     found = store.load(units, 1)
     assert found.found == units[1:]
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
@@ -313,13 +307,13 @@ class TestNumbers:
         drives = pd.DataFrame({
             "condition": "noise", "outcome": [GOAL] * 50 + [COLLISION] * 50,
             "distance_m": [21.4] * 50 + [1.0] * 50, "reward": 1.0,
-            "time_s": [4.0] * 50 + [1.0] * 50, figures.LATERAL: None, figures.LONGITUDINAL: 0.5,
+            "time_s": [4.0] * 50 + [1.0] * 50, report.LATERAL: None, report.LONGITUDINAL: 0.5,
         })  # fmt: skip
         (row,) = records.summarise_tests("left_turn", drives).to_dict("records")
         assert (row["success"], row["paper_success"], row["distance_m"]) == (0.5, 1.0, 11.0)
         assert (row["paper_distance_m"], row["paper_distance_sd_m"]) == (21.0, 0.0)
         assert row["time_s"] == 4.0
-        assert np.isnan(row[figures.LATERAL])
+        assert np.isnan(row[report.LATERAL])
 
     @pytest.mark.parametrize(
         ("cheaper", "behind", "default"),
@@ -359,8 +353,8 @@ class TestCommand:
         store = store_in(tmp_path, PAPER)
         write_human(store)
         leave(store, PAPER.units(2, "left_turn", ["fig9", "fig7", "floor"]))
-        write = figures.write
-        monkeypatch.setattr(figures, "write", lambda figure, path: (
+        write = report.write_figure
+        monkeypatch.setattr(report, "write_figure", lambda figure, path: (
             write(figure, path) if path.name == "fig10.png" else path.touch()  # pixels take long
         ))  # fmt: skip
         places = ("--results", store.results, "--runs", tmp_path, "--humans", store.humans)
@@ -371,7 +365,7 @@ class TestCommand:
         assert str(tmp_path) not in page
 
     def test_what_is_missing_is_computed_and_reported(self, tmp_path, capsys, monkeypatch):
-        monkeypatch.setitem(figures.FIGURES, "paper", {})
+        monkeypatch.setitem(report.FIGURES, "paper", {})
         more = ("--quick", "--scenario", "left_turn", "--runs", tmp_path)
         status, out, _ = call(capsys, "experiment", "floor", *more)
         results = tmp_path / "quick/results"

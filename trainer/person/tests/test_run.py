@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 from msgspec import structs
@@ -12,22 +13,29 @@ from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor
 from trainer.person import run as person_run
 from trainer.person.recording import DIRECTORY
-from trainer.person.run import BehindTheScenes
+from trainer.person.run import PersonValidation
 from trainer.person.tests.people import record, recorded_step
 from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
+from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import Parts, TrainingRun, Validation
 
 
-def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(capsys):
-    behind = BehindTheScenes(RunConfig())
+def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(
+    capsys, tmp_path
+):
+    learning: Any = SimpleNamespace(learner=SimpleNamespace(target_actor=Actor()))
+    validation = PersonValidation(RunConfig(), tmp_path, learning, Mock())
+    metrics = EpisodeMetrics(0, updates=1)
     for _ in range(2):
-        behind.begin((Actor(), 1))
-        behind.kill()
-        wait_until(lambda: not behind.busy, "the answer's absence")
-        assert behind.take() is None
-    behind.close()
+        validation._beside(metrics, 1, due=True)
+        validation.kill()
+        if validation._begun:
+            wait_until(validation._begun[2].done, "the answer's absence")
+        validation._beside(metrics, 2, due=False)
+    validation.close()
+    assert np.isnan(metrics.validation_success)
     assert capsys.readouterr().err.count("no validation beside the drive") == 1
 
 
