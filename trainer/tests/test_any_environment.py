@@ -182,24 +182,6 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     seen = env.reset(seed=3)[0]
     raw = policy.act({name: seen[name] for name in seen.dtype.names})
     np.testing.assert_allclose(outer(env.action_range, driver.act(seen)), raw, atol=1e-5)
-    # What it wrote is all that it takes to go on; what is given goes before it.
-    directory = str(run.directory)
-    words = ["--config", f"{directory}/config.toml", "--episodes", "5", "--resume"]
-    words += ["--out", directory]
-    assert main(["train", *words]) == 0
-    assert len(run.metrics) == 5
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [("learner = 3", "learner"), ("late_to_s = 0.1\nlate_from_s = 0.3", "late_to_s")],
-)
-def test_what_a_file_for_config_may_say_is_checked_like_options(tmp_path, text, says):
-    (tmp_path / "config.toml").write_text(f"{text}\n")
-    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "run")]
-    with pytest.raises(UserError, match=says):
-        main(["train", *words])
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])
@@ -334,7 +316,7 @@ def test_experts_rows_and_keys_are_found_by_name(monkeypatch):
 def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     env, hands = make_environment(ROVER), Reading((1.0, 0.5), engaged=True)
     off = Reading(controls_of(ROVER).rest)
-    person = Puppet([off] * 3 + [hands] * 5, then=off)
+    person: Any = Puppet([off] * 3 + [hands] * 5, then=off)
     sitting = Sitting(person, env, Recorder(tmp_path), speed=QUICK)
     drive(sitting, constant_driver(0.0, 2), abs, 1)
     sitting.close()

@@ -21,7 +21,8 @@ CONGESTION = POLICY.replace("left_turn", "congestion")
 WRONG = [
     *(f"train --out {{tmp}}/x {words}" for words in (
         "--scenario moon", "--algorithm magic", "--human {tmp}/nobody", "--max-minutes nan",
-        "--resume", "--set gamma=nan", "--set replay_capacity=99999999999999",
+        "--resume", "--set gamma=nan", "--set late_from_s=0.3",
+        "--set replay_capacity=99999999999999",
     )),
     *(f"evaluate {words}" for words in (
         "{tmp}/nothing.onnx", "{tmp}/file", "expert --runs -1", "expert --out /dev/null/r.json",

@@ -20,7 +20,7 @@ from bridge.outcomes import GOAL
 from bridge.report import ProgressBar
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
-from edge_runtime.util import UserError, counted, name_in_file, read_json, read_toml
+from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer import util
 from trainer.environments import scenario_of
 from trainer.evaluation import CHECKPOINT_FILE, located
@@ -62,11 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = {name: value for name, value in vars(arguments).items() if name in TYPED}
     own = Path(arguments.out) / CONFIG_FILE
     in_file: dict[str, Any] = {}
-    if arguments.config is not None:
-        found = read_toml(Path(arguments.config), "config")
-        in_file = settings_in(found, arguments.config)
-        in_file |= {name: value for name, value in found.items() if name == "preset"}
-    elif arguments.resume and own.is_file():
+    if arguments.resume and own.is_file():
         in_file = settings_in(read_json(own, "run config"), str(own))
         for name in {"scenario", "algorithm", "human"} - given.keys():
             # A name of a module must be typed: no file imports one.

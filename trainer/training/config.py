@@ -1,7 +1,6 @@
 """A training run's settings: all that decides its result, from options, files and presets."""
 
 import difflib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -28,9 +27,7 @@ EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides; all else is changed by ``--set``."""
 TYPED = (*OPTIONS, *EXTENT, "preset")
-CONFIG_FILE, CONFIG_TOML = "config.json", "config.toml"
-"""A run's settings in its directory; the first with the source's revision, the second for
-``--config``."""
+CONFIG_FILE = "config.json"  # A run's settings in its directory, with the source's revision
 RANDOM, BIASED = GUIDANCE = ("random", "biased")
 """How a human of poor guidance is wrong: each time another way, or always the same."""
 
@@ -102,16 +99,6 @@ class RunConfig:
         if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
-
-    def as_toml(self) -> str:
-        """Return a file for ``--config``."""
-        values = asdict(self)
-        parts = values, values.pop("learner")
-        own, learner = (
-            [f"{n} = {json.dumps(v, ensure_ascii=False)}" for n, v in part.items()]
-            for part in parts
-        )
-        return "\n".join([*own, "", "[learner]", *learner, ""])
 
     @property
     def kept_actor(self) -> str:

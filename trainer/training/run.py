@@ -15,7 +15,7 @@ from bridge.environments import finite
 from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL
 from bridge.report import EpisodeResult
-from edge_runtime.files import write_atomic, write_json
+from edge_runtime.files import write_json
 from trainer import util
 from trainer.environments import (
     DelayedVehicle,
@@ -52,7 +52,7 @@ from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.scenarios import SCENARIOS
-from trainer.training.config import BIASED, CONFIG_FILE, CONFIG_TOML, RunConfig
+from trainer.training.config import BIASED, CONFIG_FILE, RunConfig
 from trainer.training.learning import LearningThread, diverged
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -235,7 +235,6 @@ class TrainingRun:
         if not self.over:  # Else another revision has trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
-            write_atomic(self.run_dir / CONFIG_TOML, self.config.as_toml().encode())
         metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
