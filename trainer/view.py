@@ -9,8 +9,8 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -52,21 +52,18 @@ EPISODES = {
 """Plot -> its title, and the fields of an episode's metrics in it."""
 DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
-
-
 Entry = Callable[["TrainingLog"], None]
 
 
 @contextmanager
 def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], None]]:
     """Show a run for as long as it lasts; call what is yielded after each episode."""
-
-    @contextmanager
-    def opened() -> Iterator[TrainingLog]:
-        with open_sink(sink, "phil_hil_training", lay_out(None)) as recording:
-            yield TrainingLog(recording)
-
+    waiting: queue.Queue[Entry | None] = queue.Queue(MOST_WAITING)
     number, pace = run.steps, Pace(draw.PICTURE_INTERVAL_S)
+
+    def put(entry: Entry) -> None:
+        with suppress(queue.Full):
+            waiting.put_nowait(entry)
 
     def record(
         seen: Transition, intervention: Intervention | None, info: Mapping[str, Any]
@@ -75,16 +72,32 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
         number, at = number + 1, number
         driver, speed_mps = intervention.reason if intervention else "policy", info["speed_mps"]
         shown = _shown(run.env, seen) if pace.due(time.monotonic()) else {}
-        background.put(lambda log: log.draw_step(at, seen, driver, speed_mps, **shown))
+        put(lambda log: log.draw_step(at, seen, driver, speed_mps, **shown))
 
     with sigterm_as_interrupt():  # Here, as signals are the main thread's.
-        background = Background(opened)
+        entries = iter(waiting.get, None)
+        thread = threading.Thread(target=draw_all, args=(entries, sink), name="viewer", daemon=True)
+        thread.start()
         run.recorders.append(record)
         try:
-            yield lambda metrics: background.put(lambda log: log.draw_episode(metrics))
+            yield lambda metrics: put(lambda log: log.draw_episode(metrics))
         finally:
             run.recorders.remove(record)
-            background.close()
+            waiting.put(None)  # After what still waits
+            thread.join()
+
+
+def draw_all(entries: Iterable[Entry], sink: str) -> None:
+    """Draw entries in order; an error is reported once, and ends the drawing, not the run."""
+    try:
+        with open_sink(sink, "phil_hil_training", lay_out(None)) as recording:
+            log = TrainingLog(recording)
+            for entry in entries:
+                entry(log)
+    except BaseException as error:  # a panic of rerun's Rust is no Exception
+        print(f"{error}; the run is unharmed", file=sys.stderr, flush=True)
+        for _ in entries:
+            pass  # Else the last one would wait for ever for its place in the queue.
 
 
 def _shown(env: Any, seen: Transition) -> dict[str, Any]:
@@ -94,40 +107,6 @@ def _shown(env: Any, seen: Transition) -> dict[str, Any]:
         scene = env.scene()
         found |= {"picture": env.render()} if scene is None else {"scene": read_scene(scene)}
     return found
-
-
-class Background:
-    """Opens a view, draws each entry in order, and closes it, in a thread of its own.
-
-    An error in any of it is reported once, and ends the drawing, not the run.
-    """
-
-    def __init__(self, opened: Callable[[], AbstractContextManager[Any]]) -> None:
-        self._opened = opened
-        self._queue: queue.Queue[Entry | None] = queue.Queue(MOST_WAITING)
-        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
-        self._thread.start()
-
-    def put(self, entry: Entry) -> None:
-        """Hand an entry over; never blocks."""
-        with suppress(queue.Full):
-            self._queue.put_nowait(entry)
-
-    def close(self) -> None:
-        """Draw what still waits, and close the view."""
-        self._queue.put(None)
-        self._thread.join()
-
-    def _work(self) -> None:
-        entries: Iterator[Entry] = iter(self._queue.get, None)
-        try:
-            with self._opened() as log:
-                for entry in entries:
-                    entry(log)
-        except BaseException as error:  # a panic of rerun's Rust is no Exception
-            print(f"{error}; the run is unharmed", file=sys.stderr, flush=True)
-            for _ in entries:
-                pass  # Empty the queue all the same, or close() would wait for ever.
 
 
 def lay_out(scene: SeenScene | None) -> rrb.Blueprint:

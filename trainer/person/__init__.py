@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import threading
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -23,7 +23,7 @@ Amount = float | tuple[float, ...]
 Wish = Literal["pause", "restart", "discard", "quit"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard`` also
 marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting."""
-WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
+WISHES: tuple[Wish, ...] = get_args(Wish)
 Control = Literal["policy", "human", "returning"]
 """What decides the applied action; ``returning``: the person has let go, and the action is on its
 way back to the policy's, which still counts as the person's."""
@@ -99,27 +99,6 @@ class View:
     """A line for the page, such as "saving" or "episode ended: goal"; mostly empty."""
     picture: NDArray[np.uint8] | None = None
     """What the environment draws, [height, width, 3], where it has no scene."""
-
-
-class Person(Protocol):
-    """Hands and eyes: a device to ask, a display to show.
-
-    The loop's thread calls all of it, once a control period; nothing may block for longer than a
-    few milliseconds.
-    """
-
-    @property
-    def present(self) -> bool:
-        """Whether a browser has the wheel: an episode waits for it."""
-
-    def poll(self, now_s: float) -> Reading:
-        """Return the hands at ``now_s`` (``time.monotonic``); at rest without a device."""
-
-    def show(self, view: View) -> None:
-        """Show the newest view, unless there is no time for it."""
-
-    def close(self) -> None:
-        """Close device and display; a second call does nothing."""
 
 
 def add_person(parser: argparse.ArgumentParser) -> None:

@@ -26,7 +26,6 @@ from trainer.person import (
     Amount,
     Control,
     Intent,
-    Person,
     Reading,
     TakeOver,
     View,
@@ -76,7 +75,12 @@ class Sitting(Guide):
     """
 
     def __init__(
-        self, person: Person, env: Any, recorder: Recorder, alone: bool = False, speed: float = 1.0
+        self,
+        person: web.Cockpit,
+        env: Any,
+        recorder: Recorder,
+        alone: bool = False,
+        speed: float = 1.0,
     ) -> None:
         self.person, self.env, self.recorder, self.alone = person, env, recorder, alone
         self.pacer = Pacer(env.control_period_s / speed)

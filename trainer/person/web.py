@@ -128,9 +128,10 @@ class Page:
 
 
 class Cockpit:
-    """A person in a browser. Everything but the public methods runs in the server's thread.
+    """A person in a browser: hands to ask, eyes to show views to.
 
-    Raises UserError where the address cannot be listened on.
+    The loop's thread calls the public methods, once a control period; none blocks. All else runs in
+    the server's thread. Raises UserError where the address cannot be listened on.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
@@ -160,9 +161,11 @@ class Cockpit:
 
     @property
     def present(self) -> bool:
+        """Whether a browser has the wheel: an episode waits for it."""
         return self.seat.is_heard(time.monotonic())
 
     def poll(self, now_s: float) -> Reading:
+        """Return the hands at ``now_s`` (``time.monotonic``); at rest without a browser."""
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
@@ -170,7 +173,7 @@ class Cockpit:
         self._tell(self._take_view, self._shown, view)
 
     def close(self) -> None:
-        """Tell the pages that it is over, and end the thread."""
+        """Tell the pages that it is over, and end the thread; a second call does nothing."""
         self._tell(self._closing.set)
         self._thread.join(4 * CLOSING_S)
 

@@ -233,7 +233,6 @@ class LeftTurnEnv(DrivingEnv):
             "road_width_m": width_m,
             "path": [[pose.x, pose.y] for pose in path],
             "goal": [goal.x, goal.y],
-            "stop_line": list(self.path.pose(c.stop_line_m + 0.5 * self.ego.LENGTH)[:2]),
             "vehicles": self._vehicles(),
         }
 

@@ -2,7 +2,6 @@
 
 import threading
 from contextlib import nullcontext
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock, Mock
@@ -84,34 +83,31 @@ def test_the_view_holds_the_run(shown):
     assert {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)} == view.DRIVERS
 
 
-def test_a_slow_view_holds_nobody_up():
-    drawn: list[int] = []
-    go_on = threading.Event()
-
-    def draw(number, log):
-        go_on.wait(10.0)
-        drawn.append(number)
-
-    background = view.Background(nullcontext)
-    for number in range(view.MOST_WAITING + 100):
-        background.put(partial(draw, number))
-    go_on.set()
-    background.close()
-    assert drawn[: view.MOST_WAITING] == list(range(view.MOST_WAITING))
-    assert len(drawn) - view.MOST_WAITING in (0, 1)  # One may have been in its hands already.
-
-
 class PanicError(BaseException):
     """As pyo3's, of which rerun is made: no Exception."""
 
 
-def test_a_view_that_fails_does_not_end_the_run(capsys):
-    background = view.Background(nullcontext)
-    for _ in range(3):
-        background.put(Mock(side_effect=PanicError("disk full")))
-    background.close()
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "disk full" in line
+@pytest.mark.parametrize("ends", [None, PanicError("disk full")])
+def test_a_view_that_is_slow_or_fails_holds_nobody_up(ends, monkeypatch, capsys):
+    drawn: list[int] = []
+    go_on, run = threading.Event(), Mock(steps=0, recorders=[])
+
+    def draw(log, number):
+        go_on.wait(10.0)
+        drawn.append(number)
+        if ends:
+            raise ends
+
+    monkeypatch.setattr(view, "open_sink", lambda *_: nullcontext(MagicMock()))
+    monkeypatch.setattr(view.TrainingLog, "draw_episode", draw)
+    with view.watched(run, "sink") as on_episode:
+        for number in range(view.MOST_WAITING + 100):
+            on_episode(number)
+        go_on.set()
+    assert run.recorders == []
+    assert drawn[: view.MOST_WAITING] == ([0] if ends else list(range(view.MOST_WAITING)))
+    assert len(drawn) <= view.MOST_WAITING + 1  # One may have been in its hands already.
+    assert capsys.readouterr().err == ("disk full; the run is unharmed\n" if ends else "")
 
 
 def test_numbers_and_the_picture_of_any_environment_are_drawn():

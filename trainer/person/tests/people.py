@@ -66,7 +66,7 @@ def wish(*wishes) -> Reading:
 QUIT = wish("quit")
 
 
-def make_sitting(directory: Path, person: Puppet, alone: bool = False) -> Sitting:
+def make_sitting(directory: Path, person: Any, alone: bool = False) -> Sitting:
     return Sitting(person, make_environment("left_turn"), Recorder(directory), alone, QUICK)
 
 

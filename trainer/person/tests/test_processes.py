@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 import subprocess
 import sys
 import time
@@ -16,44 +17,39 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from edge_runtime.util import UserError
+from hil_tests.processes import wait_until
 from trainer.evaluation import CHECKPOINT_FILE
 from trainer.person import vector
 from trainer.person.recording import DIRECTORY, RecordedStep, read_steps, sittings
 from trainer.person.tests.browser import address, page, say
+from trainer.person.tests.people import LET_GO, Puppet
 from trainer.util import load_torch
 
 SOON_S = 60.0
-SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_steps=0"]
-"""A learner that leaves the processor to the others."""
+TRAIN = [
+    "train", "--human", "web", "--threads", "1", "--set", "batch_size=4",
+    "--set", "evaluate_every_steps=0", "--out",
+]  # fmt: skip
+"""With a learner that leaves the processor to the others."""
 
 
 class Training:
     """A ``trainer train`` with a person in it."""
 
-    def __init__(self, run_dir: Path, *more: str):
+    def __init__(self, run_dir: Path):
         self.run_dir = run_dir
-        words = ["train", "--human", "web", "--out", str(run_dir), *SMALL, *more]
-        pipes: Any = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "trainer", *words], **pipes, text=True
-        )
+        words = [sys.executable, "-m", "trainer", *TRAIN, str(run_dir)]
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
 
     def close(self) -> None:
         self.process.kill()
         self.process.communicate()
 
-    def wait_for_step(self, wanted: Callable[[RecordedStep], bool]) -> RecordedStep:
-        end_s = time.monotonic() + SOON_S
-        while time.monotonic() < end_s and self.process.poll() is None:
-            for step in newest_sitting(self.run_dir):
-                if wanted(step):
-                    return step
-            time.sleep(0.3)
-        raise AssertionError(f"no such step: {self.process.poll()}")
+    def wait_for_step(self, wanted: Callable[[RecordedStep], bool]) -> None:
+        def found() -> bool:
+            return any(map(wanted, newest_sitting(self.run_dir)))
 
-    def end(self) -> tuple[int, str]:
-        _, errors = self.process.communicate(timeout=SOON_S)
-        return self.process.returncode, errors
+        wait_until(found, "such a step", SOON_S, 0.3)
 
 
 def newest_sitting(run_dir: Path) -> list[RecordedStep]:
@@ -97,7 +93,12 @@ async def at_the_wheel(training):
         speaking.cancel()
 
 
-async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
+def until_terminated():
+    yield from [LET_GO] * 3
+    signal.raise_signal(signal.SIGTERM)
+
+
+async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path, sit_down):
     run_dir = tmp_path / "run"
     with closing(Training(run_dir)) as training:
         async with at_the_wheel(training) as places:
@@ -113,13 +114,8 @@ async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_p
     killed = newest_sitting(run_dir)
     assert killed[first_of_the_persons(killed)].time_ns >= began_ns
 
-    with closing(Training(run_dir, "--resume")) as training:
-        async with at_the_wheel(training):
-            await asyncio.to_thread(
-                training.wait_for_step, lambda step: step.sitting == 2 and step.step >= 1
-            )
-            training.process.terminate()  # Which is quitting, too.
-            status, errors = training.end()
+    # Which is quitting, too.
+    status, _, errors = sit_down(Puppet(until_terminated()), *TRAIN, str(run_dir), "--resume")
     assert status == 0, errors
     human = sum(step.human for step in killed)
     assert f"{len(killed)} recorded steps after the checkpoint, {human} of them yours" in errors
