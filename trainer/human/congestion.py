@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.human.guide import Expert, Reason
+from trainer.scenarios.base import Observation, footprint
 from trainer.scenarios.congestion import CongestionEnv
-from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
-from trainer.scenarios.traffic import footprint
 
 
 class CongestionHuman(Expert):

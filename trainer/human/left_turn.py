@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.human.guide import Expert, Reason
-from trainer.scenarios.environment import EgoVehicle, Observation
+from trainer.scenarios.base import EgoVehicle, Observation
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
 

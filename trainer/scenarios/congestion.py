@@ -10,22 +10,12 @@ import numpy as np
 from highway_env.road.road import Road
 from numpy.typing import NDArray
 
-from trainer.scenarios import traffic
-from trainer.scenarios.environment import (
-    Action,
-    DrivingEnv,
-    EgoVehicle,
-    Range,
-    ScenarioConfig,
-    Scene,
-    Step,
-)
+from trainer.scenarios import Scene, base
 from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import TrafficVehicle
 
 
 @dataclass(frozen=True)
-class CongestionConfig(ScenarioConfig):
+class CongestionConfig(base.ScenarioConfig):
     """Numbers of the scenario, each with its reason."""
 
     scaled = "steer_weight"
@@ -36,30 +26,30 @@ class CongestionConfig(ScenarioConfig):
     """Front-wheel angle at full action: eq. 29's 5 lambda pi. With 5 pi rad of steering wheel for
     the front wheels' 45 degrees, lambda is 0.19. At 5 m/s the heading then changes by at most
     0.015 rad a step: enough to save a car 2 s before it touches its neighbour."""
-    start_offset_m: Range = (-0.3, 0.3)  # The ego car's place in its lane at the start
-    start_heading_rad: Range = (-0.05, 0.05)
+    start_offset_m: base.Range = (-0.3, 0.3)  # The ego car's place in its lane at the start
+    start_heading_rad: base.Range = (-0.05, 0.05)
     """Its heading: at the edges of this range the wheels held straight lead 4 m aside."""
-    ego_speed_mps: Range = (4.0, 6.0)  # Initial speed of the ego car
+    ego_speed_mps: base.Range = (4.0, 6.0)  # Initial speed of the ego car
     desired_speed_mps: float = 6.0
     """Target of the IDM on the ego car's pedals (section VI-A), and of cars with a leader."""
     brake_mps2: float = 4.0
     """Maximum deceleration of the ego car, also of a safe stop."""
-    traffic_speed_mps: Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
-    jam_speed_mps: Range = (4.5, 5.5)  # Speed of the whole jam
-    lane_speed_mps: Range = (-0.5, 0.5)
+    traffic_speed_mps: base.Range = (4.0, 6.0)  # Initial speeds of traffic (section VI-A)
+    jam_speed_mps: base.Range = (4.5, 5.5)  # Speed of the whole jam
+    lane_speed_mps: base.Range = (-0.5, 0.5)
     """Speed of each lane's first car relative to the jam. Lanes that drifted apart at 2 m/s would
     leave the ego car alone before half of the way."""
     side_cars: int = 3
     """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
     cars_behind: int = 1
     """In the ego car's lane; they follow it. Cars in other lanes never react to it."""
-    traffic_mix: traffic.Mix = traffic.CARS_ONLY
-    side_front_m: Range = (9.0, 13.0)
+    traffic_mix: base.Mix = base.CARS_ONLY
+    side_front_m: base.Range = (9.0, 13.0)
     """Distance to each neighbouring lane's first car, centre to centre."""
-    gap_m: Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
-    ahead_gap_m: Range = (4.0, 9.0)  # From the ego car to the one ahead of it
+    gap_m: base.Range = (3.5, 5.5)  # Between bumpers in a lane, at the start
+    ahead_gap_m: base.Range = (4.0, 9.0)  # From the ego car to the one ahead of it
     time_gap_factor: float = 0.5  # Share of a vehicle's usual time gap that is kept in the jam
-    lane_offset_m: Range = (-0.2, 0.2)
+    lane_offset_m: base.Range = (-0.2, 0.2)
     """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
     ego car in mid-lane, in the variant 1.1 m."""
     steer_weight: float = 0.1
@@ -79,7 +69,7 @@ class CongestionConfig(ScenarioConfig):
 
 SCENES: dict[Scene, CongestionConfig] = {
     "nominal": CongestionConfig(),
-    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=traffic.MIXED),
+    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=base.MIXED),
     # A jam in lanes as narrow as at roadworks, in which cars keep to their lane's middle, and lanes
     # to the jam's speed, about half as well as usual. The narrowest gap leaves 0.5 m to each side
     # of an ego car in mid-lane instead of 1.25, and its walls move; were it narrower, cars of two
@@ -96,21 +86,21 @@ REACH_M = 200.0  # How far the road goes on before start and goal
 
 
 def spawn_traffic(
-    road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
-) -> list[TrafficVehicle]:
+    road: Road, ego: base.EgoVehicle, config: CongestionConfig, random: np.random.Generator
+) -> list[base.TrafficVehicle]:
     """Surround the ego car with cars ahead, beside and behind."""
     jam_mps = float(random.uniform(*config.jam_speed_mps))
-    cars: list[TrafficVehicle] = []
+    cars: list[base.TrafficVehicle] = []
     for lane in range(LANES):
         first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
         types, x = (_own_lane if lane == EGO_LANE else _side_lane)(config, random)
         speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
-        own = traffic.queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
+        own = base.queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
         for car in own:
             car.target_speed = config.desired_speed_mps
         if lane == EGO_LANE and config.cars_behind:
             own[1].leader = ego
-        traffic.equip(own, types, config.time_gap_factor)
+        base.equip(own, types, config.time_gap_factor)
         # A lane's first car goes with the jam; the others would go faster if they could.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
@@ -121,21 +111,21 @@ def spawn_traffic(
 
 def _side_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[traffic.VehicleType], list[float]]:
+) -> tuple[list[base.VehicleType], list[float]]:
     """Draw a neighbouring lane's vehicles, and their places along it in m."""
-    types = traffic.draw_types(config.traffic_mix, config.side_cars, random)
+    types = base.draw_types(config.traffic_mix, config.side_cars, random)
     x = [float(random.uniform(*config.side_front_m))]
     for ahead, behind in itertools.pairwise(types):
-        x.append(x[-1] - traffic.bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
+        x.append(x[-1] - base.bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
     return types, x
 
 
 def _own_lane(
     config: CongestionConfig, random: np.random.Generator
-) -> tuple[list[traffic.VehicleType], list[float]]:
+) -> tuple[list[base.VehicleType], list[float]]:
     """Draw the ego lane's vehicles and places, one ahead; those behind follow the ego car."""
-    types = traffic.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
-    nose_m = 0.5 * EgoVehicle.LENGTH
+    types = base.draw_types(config.traffic_mix, 1 + config.cars_behind, random)
+    nose_m = 0.5 * base.EgoVehicle.LENGTH
     x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
     tail_m = -nose_m
     for kind in types[1:]:
@@ -144,7 +134,7 @@ def _own_lane(
     return types, x
 
 
-class CongestionEnv(DrivingEnv):
+class CongestionEnv(base.DrivingEnv):
     """Congestion as a gymnasium environment.
 
     The action is the steering angle (eq. 29) in shares of ``lambda_rad``, negative to the left.
@@ -165,7 +155,7 @@ class CongestionEnv(DrivingEnv):
         c = self.config
         self.road_width_m = LANES * c.lane_width_m
         middles_m = [(lane - EGO_LANE) * c.lane_width_m for lane in range(LANES)]
-        self.network = traffic.straight_lanes(
+        self.network = base.straight_lanes(
             ("start", "end"), -REACH_M, c.goal_m + REACH_M, middles_m, c.lane_width_m
         )
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
@@ -179,15 +169,15 @@ class CongestionEnv(DrivingEnv):
         """The IDM, not the action, sets the throttle; the action +1 turns right."""
         c = self.config
         return {
-            "throttle_mps2": traffic.CAR.acceleration_mps2,
+            "throttle_mps2": base.CAR.acceleration_mps2,
             "brake_mps2": c.brake_mps2,
             "max_speed_mps": c.desired_speed_mps,
             "full_steering_rad": -c.lambda_rad,
-            "wheelbase_m": EgoVehicle.LENGTH,
+            "wheelbase_m": base.EgoVehicle.LENGTH,
         }
 
     @property
-    def brake_action(self) -> Action:
+    def brake_action(self) -> base.Action:
         """Applied when commands stop: the last steering; ``press_brake`` brakes."""
         return np.array([self._steering], dtype=np.float32)
 
@@ -195,7 +185,7 @@ class CongestionEnv(DrivingEnv):
         """Full brake instead of the IDM, until released or reset: the simulator's safe stop."""
         self._braking = pressed
 
-    def step(self, action: Action) -> Step:
+    def step(self, action: base.Action) -> base.Step:
         """Hold the steering angle for one control interval."""
         c = self.config
         self._last_steering = self._steering
@@ -224,7 +214,7 @@ class CongestionEnv(DrivingEnv):
             float(random.uniform(*limits))
             for limits in (c.start_offset_m, c.start_heading_rad, c.ego_speed_mps)
         )
-        self.ego = EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
+        self.ego = base.EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
         self.traffic = spawn_traffic(self.road, self.ego, c, random)
         self._steering = self._last_steering = 0.0
         self._braking = False
@@ -240,12 +230,12 @@ class CongestionEnv(DrivingEnv):
             gap_m -= 0.5 * (leader.LENGTH + self.ego.LENGTH)
             closing_mps = self.ego.speed - leader.speed
         speed_mps, wanted_mps = self.ego.speed, c.desired_speed_mps
-        idm = traffic.idm_acceleration(
-            traffic.CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor
+        idm = base.idm_acceleration(
+            base.CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor
         )
         return max(idm, -c.brake_mps2)
 
-    def _leader(self) -> TrafficVehicle | None:
+    def _leader(self) -> base.TrafficVehicle | None:
         """The nearest vehicle ahead in the ego car's corridor, whatever the lane."""
         x, y = self.ego.position.tolist()
         room = self.ego.WIDTH

@@ -9,18 +9,8 @@ import numpy as np
 from highway_env.road.road import LaneIndex
 from highway_env.utils import wrap_to_pi
 
-from trainer.scenarios import traffic
-from trainer.scenarios.environment import (
-    Action,
-    DrivingEnv,
-    EgoVehicle,
-    Range,
-    ScenarioConfig,
-    Scene,
-    Step,
-)
+from trainer.scenarios import Scene, base
 from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
-from trainer.scenarios.traffic import TrafficVehicle
 
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
@@ -85,7 +75,7 @@ class LeftTurnPath:
 
 
 @dataclass(frozen=True)
-class LeftTurnConfig(ScenarioConfig):
+class LeftTurnConfig(base.ScenarioConfig):
     """Numbers of the scenario, each with its reason where there is one."""
 
     scaled = "speed_weight"
@@ -95,19 +85,19 @@ class LeftTurnConfig(ScenarioConfig):
     goal_m: float = 21.0  # Path length from start to goal
     stop_line_m: float = 6.0
     """Place of a waiting car; its nose is then 1.5 m short of the main road."""
-    ego_speed_mps: Range = (3.0, 5.0)  # Initial speed of the ego car
+    ego_speed_mps: base.Range = (3.0, 5.0)  # Initial speed of the ego car
     max_speed_mps: float = 6.0
     throttle_mps2: float = 3.0  # Acceleration at full pedal (+1)
     brake_mps2: float = 4.0  # Deceleration at full brake (-1)
     traffic_cars: int = 3
-    traffic_mix: traffic.Mix = traffic.CARS_ONLY
-    traffic_speed_mps: Range = (4.0, 6.0)
+    traffic_mix: base.Mix = base.CARS_ONLY
+    traffic_speed_mps: base.Range = (4.0, 6.0)
     """Initial and desired speed of each car of the main road (section VI-A)."""
-    first_car_m: Range = (2.0, 12.0)
+    first_car_m: base.Range = (2.0, 12.0)
     """Distance of the first car before the middle of the crossing: too near to turn before it."""
-    short_gap_m: Range = (10.0, 16.0)
+    short_gap_m: base.Range = (10.0, 16.0)
     """A gap too short for anybody, centre to centre of cars; longer vehicles keep the room."""
-    long_gap_m: Range = (32.0, 42.0)  # A gap long enough for a driver who is ready
+    long_gap_m: base.Range = (32.0, 42.0)  # A gap long enough for a driver who is ready
     long_gap_share: float = 0.5  # How often a gap is a long one
     target_speed_mps: float = 5.0  # Target of the reward's speed term (eq. 31).
     speed_weight: float = 0.02
@@ -125,7 +115,7 @@ class LeftTurnConfig(ScenarioConfig):
 SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
     # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
-    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=traffic.MIXED, max_steps=300),
+    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=base.MIXED, max_steps=300),
     # A longer queue whose gaps all come from one range, neither clearly long nor clearly short. The
     # scripted expert takes no gap under 16 m and every gap over 25 m; between them the two cars'
     # speeds decide, so a policy that has only met gaps up to 16 m and from 32 m on must have
@@ -136,7 +126,7 @@ SCENES: dict[Scene, LeftTurnConfig] = {
 }
 
 
-class LeftTurnEnv(DrivingEnv):
+class LeftTurnEnv(base.DrivingEnv):
     """The left turn as a gymnasium environment; the action is the pedal aperture (eq. 30)."""
 
     scenario = "left_turn"
@@ -166,7 +156,7 @@ class LeftTurnEnv(DrivingEnv):
         ]
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
         # The one lane in which there is traffic; y = 0 is its left edge.
-        self.network = traffic.straight_lanes(
+        self.network = base.straight_lanes(
             NEAR_LANE[:2], -LANE_REACH_M, LANE_REACH_M, [half], c.lane_width_m
         )
         self._offset_m = self._integral_ms = 0.0
@@ -179,11 +169,11 @@ class LeftTurnEnv(DrivingEnv):
             "throttle_mps2": c.throttle_mps2,
             "brake_mps2": c.brake_mps2,
             "max_speed_mps": c.max_speed_mps,
-            "full_steering_rad": EgoVehicle.MAX_STEERING_RAD,
-            "wheelbase_m": EgoVehicle.LENGTH,
+            "full_steering_rad": base.EgoVehicle.MAX_STEERING_RAD,
+            "wheelbase_m": base.EgoVehicle.LENGTH,
         }
 
-    def step(self, action: Action) -> Step:
+    def step(self, action: base.Action) -> base.Step:
         """Hold the pedal for one control interval."""
         c = self.config
         pedal = min(max(float(action[0]), -1.0), 1.0)
@@ -240,24 +230,24 @@ class LeftTurnEnv(DrivingEnv):
         self.traffic = self._spawn_traffic()
         start = self.path.pose(0.0)
         speed_mps = float(self.np_random.uniform(*self.config.ego_speed_mps))
-        self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
+        self.ego = base.EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
         self._offset_m = self._integral_ms = 0.0
 
-    def _spawn_traffic(self) -> list[TrafficVehicle]:
+    def _spawn_traffic(self) -> list[base.TrafficVehicle]:
         c, random = self.config, self.np_random
         crossing_m = LANE_REACH_M + 0.5 * c.lane_width_m
-        types = traffic.draw_types(c.traffic_mix, c.traffic_cars, random)
+        types = base.draw_types(c.traffic_mix, c.traffic_cars, random)
         positions: list[float] = []
         for number in range(c.traffic_cars):
             if positions:
                 gap_m = c.long_gap_m if random.random() < c.long_gap_share else c.short_gap_m
-                longer_m = traffic.bodies_m(types[number], types[number - 1]) - traffic.CAR.length_m
+                longer_m = base.bodies_m(types[number], types[number - 1]) - base.CAR.length_m
                 positions.append(positions[-1] - float(random.uniform(*gap_m)) - longer_m)
             else:
                 positions.append(crossing_m - float(random.uniform(*c.first_car_m)))
         speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=c.traffic_cars)]
-        cars = traffic.queue(self.road, NEAR_LANE, positions, speeds)
-        traffic.equip(cars, types)
+        cars = base.queue(self.road, NEAR_LANE, positions, speeds)
+        base.equip(cars, types)
         return cars
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:

@@ -8,9 +8,9 @@ import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.environments import make_environment
 from trainer.human.congestion import CongestionHuman
 from trainer.person.tests.people import drive
+from trainer.scenarios.base import footprint
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners
-from trainer.scenarios.traffic import footprint
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(
