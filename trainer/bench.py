@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import json
 import os
 import tempfile
 import time
@@ -38,11 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     rounds = QUICK_ROUNDS if arguments.quick else ROUNDS
     report = measure(rounds)
     write_json_out(arguments.out, report)
-    print(f"learner: {report['learner_ms_per_update']:.1f} ms an update")
-    for scenario, steps_per_s in report["environment_steps_per_s"].items():
-        print(f"{scenario}: {steps_per_s:.0f} steps/s")
-    parts = ", ".join(f"{name} {s:.0f}" for name, s in report["train_s_per_10k_steps"].items())
-    print(f"training, s per 10,000 steps: {parts}")
+    print(json.dumps(report, indent=2))
     return 0
 
 

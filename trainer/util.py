@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from enum import IntEnum
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,6 @@ from edge_runtime.util import UserError, open_regular
 PERIOD_S = 0.1  # Of an environment that does not say how long a step is
 DEVICES = ("cpu", "cuda")
 CPU_INFO = Path("/proc/cpuinfo")
-WRITTEN = ("results/paper", "results/guidance")
-"""The experiments' own output. Human models, which decide trainings, count as source."""
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
@@ -181,16 +179,14 @@ def kept(path: str) -> str:
 def source_revision(directory: Path = Path(__file__).parent) -> str:
     """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
 
-    As of the first call. The experiments' own output does not count.
+    As of the first call.
     """
-    git = partial(subprocess.run, cwd=directory, capture_output=True, text=True)
+    describe = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        commit = git(["git", "rev-parse", "HEAD"], check=True).stdout.strip()
+        done = subprocess.run(describe, cwd=directory, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    source = (":/", *(f":(top,exclude){path}" for path in WRITTEN))
-    clean = git(["git", "diff", "--quiet", "HEAD", "--", *source]).returncode == 0
-    return commit if clean else f"{commit}-dirty"
+    return done.stdout.strip()
 
 
 def cpu_info() -> list[str]:

@@ -48,7 +48,6 @@ from trainer.experiments.records import (
     SUCCESS,
     TRAINING,
     WELL,
-    Numbers,
     Records,
     Store,
 )
@@ -381,13 +380,6 @@ def _look(line: Line, place: int) -> dict[str, Any]:
     return {"color": COLOURS.get(line.algorithm, OTHERS[place % len(OTHERS)]), "label": line.name}
 
 
-def draw_band(axis: Axes, x: Numbers, values: Numbers, style: str, **look: Any) -> None:
-    """Draw the mean of the seeds, [seeds, points], in a band of their standard deviation."""
-    mean, std = values.mean(axis=0), values.std(axis=0, ddof=min(len(values) - 1, 1))
-    axis.plot(x, mean, style, lw=1.8, **look)
-    axis.fill_between(x, mean - std, mean + std, color=look["color"], alpha=0.15, lw=0)
-
-
 def draw_curves(name: str, records: Records) -> Figure:
     """Draw a row a scenario: training episodes with the human's help, then the policy alone."""
     figure = Figure(figsize=(16.0, 6.8), layout="constrained")
@@ -399,7 +391,10 @@ def draw_curves(name: str, records: Records) -> Figure:
             # The printed reward is on another scale.
             if len(curves) and (metric, line.setting) != (REWARD, "printed"):
                 style = "-" if line.setting == NORMAL else "--"
-                draw_band(panel, records.grid(scenario), curves, style, **_look(line, place))
+                x, look = records.grid(scenario), _look(line, place)
+                mean, std = curves.mean(axis=0), curves.std(axis=0, ddof=min(len(curves) - 1, 1))
+                panel.plot(x, mean, style, lw=1.8, **look)
+                panel.fill_between(x, mean - std, mean + std, color=look["color"], alpha=0.15, lw=0)
         if metric != REWARD:
             best = 1.0 if metric == SUCCESS else FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")

@@ -92,7 +92,6 @@ class View:
     episode: int  # From 0; the page shows it from 1
     step: int
     time_s: float  # Simulated time since the episode's start
-    late_ticks: int = 0  # Control periods of this sitting that began too late
     paused: bool = False
     progress: str = ""  # One line on the learner; empty without one
     message: str = ""

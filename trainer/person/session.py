@@ -17,7 +17,7 @@ from bridge.fork import ForkedEnvironment, find_fork
 from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
-from edge_runtime.util import UserError, counted
+from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import load_driver, located, trained_in
 from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention, make_transition
@@ -40,7 +40,6 @@ from trainer.util import Purpose, episode_seed, set_threads
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
 """What an environment's scene may leave out."""
-LATE_S = 0.02  # A control period that begins later than this counts as late: a person notices
 
 
 class Pacer:
@@ -50,7 +49,6 @@ class Pacer:
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
-        self.late = 0  # Periods that began too late
         self.restart()
 
     def restart(self) -> None:
@@ -60,7 +58,6 @@ class Pacer:
         # A signal that another thread took does not wake the main thread: it is noticed afterwards.
         while (left_s := self._deadline_s - time.monotonic()) > 0.0:
             time.sleep(left_s)
-        self.late += -left_s > LATE_S
         if -left_s < self.period_s:
             self._deadline_s += self.period_s
         else:
@@ -206,7 +203,6 @@ class Sitting(Guide):
             applied_action=self.applied,
             distance_m=float(info["distance_m"]),
             goal_m=float(self.env.goal_m),
-            late_ticks=self.pacer.late,
             paused=self._paused,
             progress=self.progress,
             message=message,
@@ -218,8 +214,7 @@ class Sitting(Guide):
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
         listed = ", ".join(f"{count} {word}" for word, count in self.outcomes.items())
-        late = counted(self.pacer.late, "control period")
-        return f"episodes: {listed or 'none'}; {late} late: {self.recorder.path}"
+        return f"episodes: {listed or 'none'}: {self.recorder.path}"
 
     def quit(self) -> bool:
         """End the sitting; False where it is over already."""

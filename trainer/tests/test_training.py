@@ -1,9 +1,11 @@
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from edge_runtime.cli import INTERRUPTED, run_cli
 from edge_runtime.util import UserError
+from hil_tests.processes import wait_until
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, load_actor
@@ -122,14 +125,6 @@ def whole(tmp_path_factory) -> Path:
     return directory
 
 
-def begin(directory: Path, *extra: str, episodes: int) -> subprocess.Popen[str]:
-    process = subprocess.Popen(command(directory, *extra), stderr=subprocess.PIPE, text=True)
-    end_s = time.monotonic() + 120
-    while len(read_metrics(directory)) < episodes and time.monotonic() < end_s:
-        time.sleep(0.02)
-    return process
-
-
 def resume_and_compare(directory: Path, whole: Path, *extra: str) -> None:
     assert run_cli(main, command(directory, "--resume", *extra)[3:]) == 0
     a, b = (load_torch(d / CHECKPOINT_FILE) for d in (directory, whole))
@@ -156,9 +151,10 @@ def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fi
 
 
 def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
-    process = begin(tmp_path, episodes=3)
+    process = subprocess.Popen(command(tmp_path), stderr=subprocess.DEVNULL)
+    wait_until(lambda: len(read_metrics(tmp_path)) >= 3, "three episodes", 120.0)
     process.kill()
-    process.communicate()
+    process.wait()
     assert 3 <= len(read_metrics(tmp_path)) < 5, "killed too late to mean anything"
     resume_and_compare(tmp_path, whole)
 
@@ -179,10 +175,14 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(tmp_path)
 def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
     """Far from its next checkpoint."""
     seldom = ("--set", "checkpoint_every=100")
-    process = begin(tmp_path, *seldom, episodes=2)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED
+
+    def interrupt():
+        wait_until(lambda: len(read_metrics(tmp_path)) >= 2, "two episodes", 120.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(interrupt)
+        assert run_cli(main, command(tmp_path, *seldom)[3:]) == INTERRUPTED
     driven = len(read_metrics(tmp_path))
     assert 2 <= driven < 5
     assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == driven

@@ -34,22 +34,17 @@ def test_a_flipped_bit_of_a_checkpoint_is_refused_or_in_nothing_that_is_read(tmp
     assert refused > 100
 
 
-def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
-    def git(*arguments):
-        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
-        return done.stdout.strip()
+def test_a_revision_is_a_commit_dirty_where_files_differ(tmp_path):
+    def git(*words):
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *words]
+        return subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
 
-    code, written = tmp_path / "trainer/code.py", tmp_path / "results/paper/left_turn.jsonl"
-    for path in (code, written):
-        path.parent.mkdir(parents=True)
-        path.write_text("as committed")
-    for words in ("init -q", "add -A", "commit -qm all"):
+    revision_of, code = util.source_revision.__wrapped__, tmp_path / "code.py"
+    code.write_text("as committed")
+    for words in ("init -q", "add -A", "commit -qm all", "tag -am all v1"):
         git(*words.split())
-    commit = git("rev-parse", "HEAD")
-    written.write_text("a run has written")
-    revision_of = util.source_revision.__wrapped__
-    assert revision_of(code.parent) == commit
+    commit = git("rev-parse", "HEAD").stdout.strip()
+    assert revision_of(tmp_path) == commit
     code.write_text("changed")
-    assert revision_of(code.parent) == f"{commit}-dirty"
+    assert revision_of(tmp_path) == f"{commit}-dirty"
     assert revision_of(tmp_path.parent) == "unknown"

@@ -100,7 +100,8 @@ def test_a_view_that_is_slow_or_fails_holds_nobody_up(ends, monkeypatch, capsys)
 
     monkeypatch.setattr(view, "open_sink", lambda *_: nullcontext(MagicMock()))
     monkeypatch.setattr(view.TrainingLog, "draw_episode", draw)
-    with view.watched(run, "sink") as on_episode:
+    with view.watched(run, "sink") as shown:
+        on_episode: Any = shown
         for number in range(view.MOST_WAITING + 100):
             on_episode(number)
         go_on.set()

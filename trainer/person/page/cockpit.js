@@ -104,7 +104,6 @@ function draw() {
   byId("speed-value").textContent = view.speed_mps?.toFixed(1) ?? "–";
   const way = view.goal_m === null ? "" : `${view.distance_m.toFixed(1)} of ${view.goal_m.toFixed(0)} m`;
   byId("distance").textContent = way;
-  byId("late").textContent = view.late_ticks ? `${view.late_ticks} late` : "";
   byId("progress").textContent = view.progress;
   byId("message").textContent = view.paused ? view.message || "paused" : view.message;
   document.querySelector("[data-wish=pause]").textContent = view.paused ? "Go on" : "Pause";
