@@ -188,7 +188,7 @@ def test_a_failure_is_one_units_and_one_line(store, capfd):
 @pytest.fixture(scope="module")
 def cluster():
     """A head without a processor of its own and two nodes of one each."""
-    pytest.importorskip("ray")
+    ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
@@ -196,6 +196,7 @@ def cluster():
         cluster.add_node(num_cpus=1)
     cluster.wait_for_nodes()
     yield cluster
+    ray.shutdown()
     cluster.shutdown()
 
 

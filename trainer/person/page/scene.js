@@ -10,12 +10,12 @@ const COLOURS = {
   glass: "rgba(10, 12, 15, 0.75)",
 };
 // The colours of what decides are the same in every view: colours.css has them.
-export const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
+const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;
 
 // A canvas as sharp as the screen; returns its pen with the scale in its units.
-export function sharp(canvas, width, height) {
+function sharp(canvas, width, height) {
   const ratio = devicePixelRatio || 1;
   const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
@@ -58,7 +58,7 @@ export function drawPicture(canvas, base64) {
   image.src = `data:image/jpeg;base64,${base64}`;
 }
 
-export function line(pen, points, colour, width) {
+function line(pen, points, colour, width) {
   pen.beginPath();
   for (const [x, y] of points) pen.lineTo(x, y);
   pen.strokeStyle = colour;

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,23 +33,8 @@ TRAIN = [
 """With a learner that leaves the processor to the others."""
 
 
-class Training:
-    """A ``trainer train`` with a person in it."""
-
-    def __init__(self, run_dir: Path):
-        self.run_dir = run_dir
-        words = [sys.executable, "-m", "trainer", *TRAIN, str(run_dir)]
-        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-
-    def wait_for_step(self, wanted: Callable[[RecordedStep], bool]) -> None:
-        def found() -> bool:
-            return any(map(wanted, newest_sitting(self.run_dir)))
-
-        wait_until(found, "such a step", SOON_S, 0.3)
+def wait_for_step(run_dir: Path, wanted: Callable[[RecordedStep], bool]) -> None:
+    wait_until(lambda: any(map(wanted, newest_sitting(run_dir))), "such a step", SOON_S, 0.3)
 
 
 def newest_sitting(run_dir: Path) -> list[RecordedStep]:
@@ -78,9 +63,9 @@ def first_of_the_persons(steps: Sequence[RecordedStep]) -> int:
 
 
 @asynccontextmanager
-async def at_the_wheel(training):
+async def at_the_wheel(process):
     """A page whose wheel is where the list says, and which speaks as often as a page does."""
-    url, places = address(training.process), [0.0]
+    url, places = address(process), [0.0]
 
     async def speak(link):
         while True:
@@ -100,17 +85,19 @@ def until_terminated():
 
 async def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path, sit_down):
     run_dir = tmp_path / "run"
-    with closing(Training(run_dir)) as training:
-        async with at_the_wheel(training) as places:
-            await asyncio.to_thread(training.wait_for_step, lambda step: step.step >= 2)
+    words = [sys.executable, "-m", "trainer", *TRAIN, str(run_dir)]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    try:
+        async with at_the_wheel(process) as places:
+            await asyncio.to_thread(wait_for_step, run_dir, lambda step: step.step >= 2)
             began_ns = time.time_ns()
             places.append(-1.0)
             await asyncio.to_thread(
-                training.wait_for_step,
-                lambda step: step.human and vector(step.action)[0] < -0.99,
+                wait_for_step, run_dir, lambda step: step.human and vector(step.action)[0] < -0.99
             )
-            training.process.kill()
-            training.process.wait()
+    finally:
+        process.kill()
+        process.communicate()
     killed = newest_sitting(run_dir)
     assert killed[first_of_the_persons(killed)].time_ns >= began_ns
 
