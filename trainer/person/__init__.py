@@ -78,8 +78,8 @@ class View:
 
     scenario: str
     scene: dict[str, Any] | None
-    """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first.
-    None: there is ``picture`` instead."""
+    """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first; of
+    another environment parts may lack. None: there is ``picture`` instead."""
     frames: NDArray[np.uint8] | None
     """What the policy sees: [2, 45, 80], the older frame first; None: something else."""
     policy_action: Amount | None  # None where the person drives alone

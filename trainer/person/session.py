@@ -38,8 +38,6 @@ from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
 
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
-BARE: dict[str, Any] = {"roads": (), "road_width_m": 4.0, "path": (), "goal": None, "vehicles": ()}
-"""What an environment's scene may leave out."""
 
 
 class Pacer:
@@ -197,7 +195,7 @@ class Sitting(Guide):
         scene = self.env.scene()
         view = View(
             **self._now(),
-            scene=None if scene is None else {**BARE, **scene},
+            scene=scene,
             picture=self.env.render() if scene is None else None,
             frames=frames if self.env.layout.stacked else None,
             applied_action=self.applied,

@@ -31,8 +31,7 @@ from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
 from trainer.environments import make_environment
-from trainer.person import Amount, Input, Reading, Seat, View, amount, vector
-from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
+from trainer.person import Amount, Input, Reading, Seat, View, amount
 
 PAGE = Path(__file__).parent / "page"
 TOKEN_BYTES = 16
@@ -51,11 +50,6 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """The address holds the token: no browser may keep it, pass it on, or frame the page."""
-HINTS = (
-    "or slide on the pad, or use a gamepad or wheel",
-    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
-    "    Q: quit, all is kept",
-)
 RESERVED = {"p", "r", "q", "escape", "backspace", "space"}  # Of the wishes and of Space
 INPUT = msgspec.json.Decoder(Input)
 _ENCODER = msgspec.json.Encoder(enc_hook=plain)
@@ -70,17 +64,6 @@ class Controls:
     rest: Amount  # Hands off
     rate_per_s: float  # How quickly a key presses
     names: tuple[str, ...]  # Of the actions
-
-    @property
-    def help(self) -> str:
-        """A line for the page: which key does what."""
-        held: dict[str, list[str]] = {}
-        for key, added in self.keys.items():
-            action = zip(self.names, vector(amount(np.add(self.rest, added))), strict=True)
-            words = ", ".join(f"{name} {value:+g}" for name, value in action)
-            held.setdefault(words, []).append(key.capitalize())
-        what = (f"{' / '.join(keys)}: {words}" for words, keys in held.items())
-        return "    ".join(["hold to take over", *what, "Space: hands off"])
 
 
 @cache
@@ -136,7 +119,6 @@ class Cockpit:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
         self.controls = controls_of(scenario)
-        self.help = (self.controls.help, *HINTS)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
@@ -205,7 +187,7 @@ class Cockpit:
         await runner.cleanup()
 
     def _take_view(self, number: int, view: View) -> None:
-        self._newest = (number, encode_view(view, number, self.help))
+        self._newest = (number, encode_view(view, number))
         for page in self._pages:
             page.wake.set()
 
@@ -314,30 +296,18 @@ def _encode(kind: str, **fields: Any) -> str:
     return _ENCODER.encode({"kind": kind, **fields}).decode()
 
 
-def encode_view(view: View, number: int, hints: tuple[str, ...]) -> str:
-    """Encode view ``number``, from 1; ``hints`` say what to press for what, one line each.
+def encode_view(view: View, number: int) -> str:
+    """Encode view ``number``, from 1.
 
-    ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` of a JPEG; ``ground`` is shown.
+    ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` of a JPEG.
     """
-    left_m, top_m = _corner(view.scene or {})
     frames = None if view.frames is None else view.frames.tobytes()
     fields = vars(view) | {"frames": frames, "controls": controls_of(view.scenario)}
     if view.picture is not None:
         jpeg = io.BytesIO()
         Image.fromarray(view.picture).save(jpeg, "JPEG")
         fields["picture"] = jpeg.getvalue()
-    ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
-    return _encode("view", number=number, help=hints, ground=ground, **fields)
-
-
-def _corner(scene: Mapping[str, Any]) -> tuple[float, float]:
-    """Return where the ground shown begins, m: as the scene says, or around an ego car outside."""
-    left_m, top_m = scene.get("view", VIEW)
-    for car in scene.get("vehicles", ()):
-        inside = 0.0 <= car["x"] - left_m <= WIDTH_M and 0.0 <= car["y"] - top_m <= HEIGHT_M
-        if car.get("ego") and "view" not in scene and not inside:
-            return car["x"] - WIDTH_M / 2, car["y"] - HEIGHT_M / 2
-    return left_m, top_m
+    return _encode("view", number=number, **fields)
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:

@@ -323,7 +323,7 @@ def test_a_person_drives_two_numbers_and_is_recorded_and_imitated(tmp_path):
     steps = list(read_steps(sitting.recorder.path))
     assert [step.action for step in steps[2:5]] == [(0.0, 0.0), (0.5, 0.5), (1.0, 0.5)]
     assert steps[4].next_observation.tobytes() == steps[5].observation.tobytes()
-    assert json.loads(encode_view(person.views[4], 1, ()))["picture"]
+    assert json.loads(encode_view(person.views[4], 1))["picture"]
     model = HumanModel(HumanModelConfig(batch_size=4), 0, 2, env.observation_space)
     assert demonstrate(model, [sitting.recorder.path], ROVER) == 1
     assert np.isfinite(model.learn(2))

@@ -74,7 +74,7 @@ function show() {
   else requestAnimationFrame(draw);
 }
 
-function enter({ scenario, controls, help }) {
+function enter({ scenario, controls }) {
   keyboard.controls = touch.controls = gamepads.controls = controls;
   gamepads.scenario = scenario;
   const { aside, along } = ways(controls);
@@ -85,7 +85,7 @@ function enter({ scenario, controls, help }) {
   }
   byId("pad").className = aside ? "level" : "upright";
   byId("pad").hidden = !aside && !along;
-  byId("help").replaceChildren(...help.map((text) => item(text)));
+  byId("keys").replaceChildren(...help(controls).map(span));
   changed(); // a key may be down already
 }
 
@@ -169,13 +169,22 @@ byId("full-screen").hidden = !document.fullscreenEnabled; // as on iPhones
 byId("full-screen").addEventListener("click", () => document.fullscreenElement
   ? document.exitFullscreen() : document.documentElement.requestFullscreen());
 
-function item(text) {
-  const element = document.createElement("li");
-  // A line breaks between the keys, not between a key and what it does.
-  element.replaceChildren(...text.split("    ").map((part) => {
-    const span = document.createElement("span");
-    span.textContent = part;
-    return span;
-  }));
+// Which key does what, a part each: a line breaks between them.
+function help({ keys, rest, names }) {
+  const held = {};
+  for (const [key, added] of Object.entries(keys)) {
+    const words = list(added).map((more, i) => {
+      const value = Number((list(rest)[i] + more).toPrecision(6));
+      return `${names[i]} ${value < 0 ? "" : "+"}${value}`;
+    }).join(", ");
+    (held[words] ??= []).push(key[0].toUpperCase() + key.slice(1));
+  }
+  const what = Object.entries(held).map(([words, pressed]) => `${pressed.join(" / ")}: ${words}`);
+  return ["hold to take over", ...what, "Space: hands off"];
+}
+
+function span(text) {
+  const element = document.createElement("span");
+  element.textContent = text;
   return element;
 }

@@ -11,6 +11,7 @@ const COLOURS = {
 };
 // The colours of what decides are the same in every view: colours.css has them.
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
+const [WIDTH_M, HEIGHT_M, VIEW] = [46, 25, [-30, -7]]; // as in trainer/scenarios/picture.py
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;
 
@@ -24,15 +25,25 @@ function sharp(canvas, width, height) {
   return pen;
 }
 
+// Where the ground shown begins, m: as the scene says, or around an ego car outside.
+function corner({ view, vehicles }) {
+  const [left, top] = VIEW;
+  const inside = ({ x, y }) => x >= left && x <= left + WIDTH_M && y >= top && y <= top + HEIGHT_M;
+  const lost = vehicles.find((car) => car.ego && !inside(car));
+  return view ?? (lost ? [lost.x - WIDTH_M / 2, lost.y - HEIGHT_M / 2] : VIEW);
+}
+
 export function drawScene(canvas, view) {
-  const { scene, ground } = view;
+  // An environment's scene may leave out any of it.
+  const scene = { roads: [], road_width_m: 4, path: [], vehicles: [], ...view.scene };
+  const [left, top] = corner(scene);
   const width = canvas.clientWidth;
-  const scale = width / ground.width_m;
-  const pen = sharp(canvas, width, ground.height_m * scale);
+  const scale = width / WIDTH_M;
+  const pen = sharp(canvas, width, HEIGHT_M * scale);
   pen.fillStyle = COLOURS.ground;
-  pen.fillRect(0, 0, width, ground.height_m * scale);
+  pen.fillRect(0, 0, width, HEIGHT_M * scale);
   pen.scale(scale, scale); // metres from here on
-  pen.translate(-ground.left_m, -ground.top_m);
+  pen.translate(-left, -top);
   pen.lineJoin = "round";
   for (const road of scene.roads) line(pen, road, COLOURS.road, scene.road_width_m);
   for (const marking of scene.lane_lines ?? []) dashes(pen, marking, 0);

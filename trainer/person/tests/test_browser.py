@@ -150,7 +150,8 @@ async def test_what_is_shown_is_drawn_and_a_second_page_watches_until_the_end(br
     cockpit.show(view)
     await until(browser, "document.getElementById('progress').textContent === '94%'")
     for place, shown in (("#who", "You drive"), ("#speed-value", "4.3"), ("#message", "saving"),
-                         (".bar.policy output", "0.25")):  # fmt: skip
+                         (".bar.policy output", "0.25"),
+                         ("#keys span:nth-child(2)", "Up / W: pedal +1")):  # fmt: skip
         assert await browser.text_content(place) == shown
     # The newer frame's pixels are the policy's own.
     pixel = (
