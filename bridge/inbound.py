@@ -1,15 +1,13 @@
 """The vehicle's side of the safety rules: what the simulator believes, holds and brakes for. Pure.
 
-`CommandCheck`, `FeedbackCheck` and `EdgeCounts` read what comes back over the wire, and count by
-reason what is not believed. `CommandHold` is the contract's rule on every clock: the newest command
+`CommandCheck` and `FeedbackCheck` read what comes back over the wire, and count by reason what is
+not believed. `CommandHold` is the contract's rule on every clock: the newest command
 is held from tick to tick; when none has arrived for 2 T, or when the command itself says
 ``safe_stop``, the vehicle brakes.
 """
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +21,10 @@ from edge_runtime.wire import (
     SAFE_STOP,
     Command,
     Feedback,
-    Health,
     Reason,
     Rejection,
     decode_command,
     decode_feedback,
-    decode_health,
 )
 
 BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
@@ -260,43 +256,3 @@ class FeedbackCheck:
             return Reason.DUPLICATE.value
         in_order = now_s - self._newest_s <= self._silence_s
         return Reason.STALE.value if in_order and feedback.sent_ns < newest_ns else ""
-
-
-class EdgeCounts:
-    """Adds up how the edge's counts of rejected states grow from the first health on.
-
-    Two threads report here: health messages on Zenoh's, answers to the status query on the
-    caller's. The public values are only ever replaced, so readers need no lock.
-    """
-
-    def __init__(self) -> None:
-        self.rejected: Counter[str] = Counter()  # States that the edge rejected, by reason
-        self.unreadable: Counter[str] = Counter()  # Health messages, as ``health_REASON``
-        self.newest: Health | None = None
-        self._lock = threading.Lock()
-
-    def observe_message(self, payload: bytes) -> None:
-        """Take a health message; count one that cannot be read."""
-        health = decode_health(payload)
-        if isinstance(health, Health):
-            self.observe(health)
-        else:
-            self.unreadable = self.unreadable + Counter([f"health_{health.reason.value}"])
-
-    def observe_status(self, payload: bytes) -> None:
-        """Take the JSON answer to the status query, which holds the fields of a health message."""
-        with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            self.observe(msgspec.json.decode(payload, type=Health))
-
-    def observe(self, health: Health) -> None:
-        """Add the growth since the last health; another edge runtime counts from zero."""
-        with self._lock:
-            last, before = self.newest, health.rejected
-            if last is not None:
-                is_younger = health.uptime_s < last.uptime_s
-                if is_younger and health.sent_ns < last.sent_ns:
-                    return  # A message and an answer have overtaken one another.
-                is_another = is_younger or health.policy_id != last.policy_id
-                before = {} if is_another else last.rejected
-            self.rejected = self.rejected + (Counter(health.rejected) - Counter(before))
-            self.newest = health

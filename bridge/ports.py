@@ -13,6 +13,7 @@ import secrets
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,7 +23,6 @@ import msgspec
 import zenoh
 
 from bridge.environments import picture_of, say_once, scene_of
-from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import RecordingWriter, new_recording
@@ -40,7 +40,7 @@ from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, counted
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
@@ -64,6 +64,17 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
     return encode_scene({}, stamps)
 
 
+class EdgeStatus(Health, frozen=True, kw_only=True):
+    """The edge runtime's answer to the status query."""
+
+    manifest: Manifest
+
+    def rejected_since(self, before: EdgeStatus) -> Counter[str]:
+        """Return the states rejected in between, by reason; a restarted one counts from zero."""
+        is_same = self.policy_id == before.policy_id and self.uptime_s >= before.uptime_s
+        return Counter(self.rejected) - Counter(before.rejected if is_same else {})
+
+
 class SimulatorPort:
     """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
 
@@ -71,7 +82,7 @@ class SimulatorPort:
         self, zenoh_session: zenoh.Session, vehicle_id: str, tls: TlsFiles | None = None
     ) -> None:
         self._zenoh, self.vehicle_id, self._tls = zenoh_session, vehicle_id, tls
-        self.session, self.edge_counts = secrets.token_hex(8), EdgeCounts()
+        self.session = secrets.token_hex(8)
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
         self._states, self._scenes = (
@@ -80,7 +91,6 @@ class SimulatorPort:
         )
         token = zenoh_session.liveliness().declare_token(f"phil/{vehicle_id}/simulator")
         self._declared: list[Any] = [self._states, self._scenes, token]
-        self.hear("health", self.edge_counts.observe_message)
 
     def hear(self, topic: str, handler: Callable[[bytes], None]) -> None:
         """Call ``handler(payload)``, which must be quick, for every message of the topic."""
@@ -100,33 +110,25 @@ class SimulatorPort:
         if somebody.matching:
             self._scenes.put(scene_payload(environment, stamps))
 
-    def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
+    def wait_for_edge(self, limit_s: float, endpoint: str) -> EdgeStatus:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
-        while not any(True for _ in self._statuses()):
+        while (status := self.edge_status()) is None:
             if time.monotonic() >= give_up_s:
                 raise UserError(
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
                     f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
                 )
             time.sleep(RETRY_S)
+        return status
 
-    def note_edge_counts(self) -> None:
-        for status in self._statuses():
-            self.edge_counts.observe_status(status)
-
-    def edge_manifest(self) -> Manifest | None:
-        """Return the manifest of the edge runtime's policy; None without an answer."""
-        for status in self._statuses():
-            with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError, KeyError):
-                fields = msgspec.json.decode(status, type=dict[str, msgspec.Raw])
-                return msgspec.json.decode(fields["manifest"], type=Manifest)
-        return None
-
-    def _statuses(self) -> Iterator[bytes]:
+    def edge_status(self) -> EdgeStatus | None:
+        """Ask the edge runtime how it is; None without an answer that can be read."""
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
-            if reply.ok is not None:
-                yield reply.ok.payload.to_bytes()
+            with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
+                if reply.ok is not None:
+                    return msgspec.json.decode(reply.ok.payload.to_bytes(), type=EdgeStatus)
+        return None
 
     def close(self) -> None:
         """Undeclare everything: a callback left open hangs the process at its end."""
@@ -322,26 +324,22 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "a settings file of zenohd, instead of all other options"
-    parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
-    listens, config = arguments.listen or [DEFAULT_ENDPOINT], arguments.config
+    listens = arguments.listen or [DEFAULT_ENDPOINT]
     tls, rules = tls_for(arguments.tls, *listens), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
-    with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
-        try:  # As zenohd would
-            session = zenoh.open(zenoh.Config.from_file(config)) if config else None
-        except zenoh.ZError as error:
-            raise UserError(f"Zenoh opens no router with {config}: {error}") from None
-        session = session or open_session(listen=listens, mode="router", tls=tls, access=rules)
-        with closing(session):
-            print(f"ready {config or ','.join(listens)}", flush=True)
-            wait_to_be_told(tls)
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        sigterm_as_interrupt(),
+        closing(open_session(listen=listens, mode="router", tls=tls, access=rules)),
+    ):
+        print(f"ready {','.join(listens)}", flush=True)
+        wait_to_be_told(tls)
     return 0
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from bridge.environments import (
 from bridge.inbound import CommandCheck, Decision
 from bridge.messages import Origin, Scene
 from bridge.outcomes import outcome_of
-from bridge.ports import SimulatorPort, add_options, open_port
+from bridge.ports import EdgeStatus, SimulatorPort, add_options, open_port
 from bridge.report import (
     EpisodeResult,
     ProgressBar,
@@ -104,43 +105,45 @@ def run(asked: Namespace) -> int:
         check = CommandCheck(port.session, task)
         clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
         port.hear("command", clock.receive)
-        port.wait_for_edge(wait_s, endpoint)
+        edge = port.wait_for_edge(wait_s, endpoint)
         if isinstance(clock, VehicleClock):
             port.hear("feedback", clock.receive_feedback)
             clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-        report = _drive(asked, environment, port, clock)
+        report = _drive(asked, environment, port, clock, edge)
     write_json_out(asked.out, report)
     print(summary_line(report))
     return 0
 
 
 def _drive(
-    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock
+    asked: Namespace,
+    environment: Environment,
+    port: SimulatorPort,
+    clock: Clock,
+    edge: EdgeStatus,
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop")}
     how["standing"] = vehicle is not None
-    network, task, manifest = str(asked.latency), clock.task, port.edge_manifest()
-    if manifest is not None and manifest.text == task.text:
-        task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
+    network, task = str(asked.latency), clock.task
+    if is_same := edge.manifest.text == task.text:
+        task = msgspec.structs.replace(task, action=edge.manifest.action)  # with the policy's stops
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
     apply = vehicle_action if vehicle else policy_action
     runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin, apply)
-    # Without a manifest, the edge runtime itself compares what the states say.
-    if manifest is not None and manifest.text != task.text:
+    if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
         raise other_task(task)
     results = []
-    port.note_edge_counts()
     with ProgressBar("episodes", asked.episodes) as bar:
         for episode in range(asked.episodes):
             if vehicle is not None:
                 vehicle.wait_for_standstill()
             results.append(runner.run(episode, asked.seed + episode))
             bar.advance({"last": results[-1].outcome})
-    port.note_edge_counts()
-    edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
+    after, by_simulator = port.edge_status(), clock.rejected()
+    by_edge = after.rejected_since(edge) if after else Counter[str]()
     facts = {
         "scenario": task.task,
         **how,
@@ -150,8 +153,8 @@ def _drive(
         "ridden_steps": runner.ridden_steps,
         "missed_ticks": clock.missed_ticks,
         "wall_clock_stalls": clock.wall_clock_stalls,
-        "rejected": dict(edge.rejected + by_simulator),
-        "rejected_by_edge": dict(edge.rejected),
+        "rejected": dict(by_edge + by_simulator),
+        "rejected_by_edge": dict(by_edge),
         "rejected_by_simulator": dict(by_simulator),
         "vehicle": vehicle.log.report() if vehicle else None,
     }
