@@ -280,8 +280,8 @@ def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_pat
     recordings.flip_chunk(path, 3)
     assert main(["view", str(path), "--save", str(out)]) == 0
     found, said = verify(out), capsys.readouterr()
-    entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
-                "latency/inference", "mode/reason", "rejected/edge")  # fmt: skip
+    entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/inference",
+                "mode/reason", "rejected/edge")  # fmt: skip
     assert [entity for entity in entities if entity not in found] == []
     assert said.out == f"wrote {out}\n"
     assert len(said.err.splitlines()) == 1
