@@ -38,7 +38,6 @@ from bridge.network import (
     VirtualLink,
     make_network,
 )
-from bridge.report import STANDSTILL_MPS, VehicleLog
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
@@ -48,6 +47,7 @@ Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must 
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Stop reasons of wall time. In lock-step they mean that the machine stalled."""
 POLL_S = 0.02
+STANDSTILL_MPS = 0.05
 STANDSTILL_WAIT_S = 5.0
 """Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
 
@@ -261,10 +261,11 @@ class RealTimeClock(_Clock):
 
 
 class VehicleClock(RealTimeClock):
-    """The clock of ``--loop vehicle``; ``log`` keeps what the vehicle said of itself."""
+    """The clock of ``--loop vehicle``; it keeps the vehicle's name and faults for the report."""
 
     def __post_init__(self) -> None:
-        self.log = VehicleLog()
+        self.vehicle = ""
+        self.faults: Counter[str] = Counter()  # By the feedback messages that held them
         self.feedback_check = FeedbackCheck(self.check)
         super().__post_init__()
 
@@ -303,7 +304,8 @@ class VehicleClock(RealTimeClock):
         with self._arrived:
             feedback = self.feedback_check.read(payload, time.monotonic())
             if feedback is not None:
-                self.log.observe(feedback)
+                self.vehicle = feedback.vehicle
+                self.faults.update(feedback.faults)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Return whether a feedback, of any session, satisfies ``holds`` before ``limit_s``."""

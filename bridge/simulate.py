@@ -156,7 +156,7 @@ def _drive(
         "rejected": dict(by_edge + by_simulator),
         "rejected_by_edge": dict(by_edge),
         "rejected_by_simulator": dict(by_simulator),
-        "vehicle": vehicle.log.report() if vehicle else None,
+        "vehicle": vehicle and {"name": vehicle.vehicle, "faults": dict(vehicle.faults)},
     }
     return make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
 

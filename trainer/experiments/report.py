@@ -13,8 +13,8 @@ import jinja2
 import numpy as np
 import pandas as pd
 
+from bridge.outcomes import Estimate, mean_estimate
 from bridge.report import markdown_table
-from bridge.statistics import Estimate, mean_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.environments import CONDITIONS
