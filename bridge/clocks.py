@@ -23,21 +23,8 @@ from functools import partial
 
 import msgspec
 
-from bridge.inbound import (
-    BRAKE_PERIODS,
-    CommandCheck,
-    CommandHold,
-    Decision,
-    FeedbackCheck,
-)
-from bridge.network import (
-    COMMAND_WINDOW,
-    Arrival,
-    LatencyModel,
-    LatencySpec,
-    VirtualLink,
-    make_network,
-)
+from bridge import inbound, network
+from bridge.inbound import Decision
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
@@ -60,8 +47,8 @@ class _Clock:
     """
 
     publish: Publish
-    check: CommandCheck
-    spec: LatencySpec
+    check: inbound.CommandCheck
+    spec: network.LatencySpec
     task: Task
     latencies_ms: list[float] = field(default_factory=list)
     """From state sent to command received, injected delays included; one per answered state."""
@@ -73,8 +60,8 @@ class _Clock:
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
-        self._silence_s = BRAKE_PERIODS * self._period_s
-        self._hold = CommandHold(0.0, self._period_s)
+        self._silence_s = inbound.BRAKE_PERIODS * self._period_s
+        self._hold = inbound.CommandHold(0.0, self._period_s)
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
@@ -112,7 +99,7 @@ class LockStepClock(_Clock):
 
     def begin(self, episode: int, seed: int) -> None:
         self.check.begin(episode)
-        self._link: VirtualLink[State] = VirtualLink(
+        self._link: network.VirtualLink[State] = network.VirtualLink(
             self.spec,
             seed,
             self._period_s,
@@ -135,7 +122,7 @@ class LockStepClock(_Clock):
             self._arrive_at_edge(arrival)
         return self._link.decide(self._edge_silent)
 
-    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
+    def _arrive_at_edge(self, arrival: network.Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = self._stamped(arrival.message)
         # What came between two ticks is read all the same, so that faults are counted.
@@ -184,7 +171,7 @@ class RealTimeClock(_Clock):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._window_s = COMMAND_WINDOW * self._period_s
+        self._window_s = network.COMMAND_WINDOW * self._period_s
         self._line = DelayLine()
         self.begin(episode=0, seed=0)
 
@@ -192,8 +179,8 @@ class RealTimeClock(_Clock):
         with self._arrived:
             self.check.begin(episode)
             self._start_s = self._begun_s = time.monotonic()
-            self._network = make_network(self.spec, seed)
-            self._hold = CommandHold(self._start_s, self._period_s)
+            self._network = network.make_network(self.spec, seed)
+            self._hold = inbound.CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
@@ -226,7 +213,7 @@ class RealTimeClock(_Clock):
         self._send(self._network.up, payload, self.publish)
         return tick_s
 
-    def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
+    def _send(self, direction: network.LatencyModel, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
         for arrival_s in direction.arrivals(sent_s, len(payload)):
@@ -266,14 +253,14 @@ class VehicleClock(RealTimeClock):
     def __post_init__(self) -> None:
         self.vehicle = ""
         self.faults: Counter[str] = Counter()  # By the feedback messages that held them
-        self.feedback_check = FeedbackCheck(self.check)
+        self.feedback_check = inbound.FeedbackCheck(self.check)
         super().__post_init__()
 
     def begin(self, episode: int, seed: int) -> None:
         super().begin(episode, seed)
         with self._arrived:
             # Its own stream, so that commands meet the same luck as without it.
-            self._feedback_way = make_network(self.spec, seed + 1).down
+            self._feedback_way = network.make_network(self.spec, seed + 1).down
 
     def receive_feedback(self, payload: bytes) -> None:
         self._send(self._feedback_way, payload, self._feedback_arrives)

@@ -14,18 +14,9 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
+from edge_runtime import wire
 from edge_runtime.manifest import Action, Task
-from edge_runtime.wire import (
-    DRIVE,
-    MAX_RIDE_S,
-    SAFE_STOP,
-    Command,
-    Feedback,
-    Reason,
-    Rejection,
-    decode_command,
-    decode_feedback,
-)
+from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Feedback, Reason, Rejection
 
 BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
 ROUNDING_S = 1e-9
@@ -141,7 +132,7 @@ class CommandCheck:
 
         An answer after its episode's end is no fault. ``now_ns`` is the wall clock.
         """
-        command = decode_command(payload)
+        command = wire.decode_command(payload)
         if isinstance(command, Rejection):
             self.reject(command.reason.value)
             return None
@@ -172,7 +163,7 @@ class CommandCheck:
         for action in (command.action, *plan) if command.mode == DRIVE else ():
             if fault := _action_fault(action, self.actions):
                 return fault
-        if len(plan) * self.period_s > MAX_RIDE_S + ROUNDING_S:
+        if len(plan) * self.period_s > wire.MAX_RIDE_S + ROUNDING_S:
             return "plan_too_long"  # It would keep the vehicle going for longer than any may
         if (command.episode, command.step) > self.newest:
             return UNKNOWN_STEP
@@ -211,7 +202,7 @@ class FeedbackCheck:
 
     def read(self, payload: bytes, now_s: float) -> Feedback | None:
         """Return the feedback if it is this vehicle's newest, else None; ``now_s`` is monotonic."""
-        feedback = decode_feedback(payload)
+        feedback = wire.decode_feedback(payload)
         if isinstance(feedback, Rejection):
             self.rejected[feedback.reason.value] += 1
             return None

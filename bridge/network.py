@@ -20,16 +20,8 @@ import msgspec
 import numpy as np
 
 from bridge.inbound import ROUNDING_S, CommandHold, Decision
+from edge_runtime import safety
 from edge_runtime.latest import Freshness
-from edge_runtime.safety import (
-    Event,
-    Mode,
-    Safety,
-    advance,
-    classify_arrival,
-    classify_fresh,
-    note_arrival,
-)
 from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, Command
 
@@ -192,7 +184,8 @@ def parse_spec(text: str) -> LatencySpec:
             prefix, dot, rest = part.partition(".")
             if not dot or prefix not in DIRECTIONS:
                 prefix, rest = "", part
-            pairs = [tuple(rest.partition("=")[::2])]
+            name, _, word = rest.partition("=")
+            pairs = [(name, word)]
             if short := re.fullmatch(r"(\d[^=]*?)(?:(?:\+-|±)(.*))?", rest):
                 pairs = [("delay", short[1])] + ([] if short[2] is None else [("jitter", short[2])])
             for name, word in pairs:
@@ -205,7 +198,8 @@ def parse_spec(text: str) -> LatencySpec:
                     given[prefix][row.field] = row.read(word)
                 except ValueError:
                     raise UserError(f"{part!r}: write it like {name}={row.example}") from None
-        return LatencySpec(*(DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS), text)
+        up, down = (DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS)
+        return LatencySpec(up, down, text)
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
 
@@ -350,7 +344,7 @@ class VirtualLink(Generic[Message]):
         self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
         self._numbers = itertools.count()
         self._newest_at_edge = -1
-        self._safety = Safety(period_s)
+        self._safety = safety.Safety(period_s)
         self._freshness = Freshness(self._safety.answer_s)
         self._unanswered = -1  # The step of a state that came too late to be driven on
         self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
@@ -378,7 +372,7 @@ class VirtualLink(Generic[Message]):
         """
         if arrival.step == self._unanswered:
             return
-        if self._safety.mode is Mode.SAFE_STOP:
+        if self._safety.mode is safety.Mode.SAFE_STOP:
             command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
         if command.plan:  # as long as the edge runtime's own silence
             ride_s = len(command.plan) * self._period_s
@@ -404,18 +398,18 @@ class VirtualLink(Generic[Message]):
 
     def _judge(self, step: int, now_s: float) -> None:
         """Let the edge runtime's safety machine judge the arrival of a newest state."""
-        gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
+        gap = safety.classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
-            self._safety = advance(self._safety, gap)
-        stands, sent_s = self._safety.mode is Mode.SAFE_STOP, step * self._period_s
+            self._safety = safety.advance(self._safety, gap)
+        stands, sent_s = self._safety.mode is safety.Mode.SAFE_STOP, step * self._period_s
         lag_s = self._freshness.lag_s("", sent_s, now_s, None, stands)
         if lag_s > self._safety.answer_s + ROUNDING_S:
-            self._safety = advance(self._safety, Event.LATE)
-            self._unanswered = step if self._safety.mode is Mode.DRIVE else -1
+            self._safety = safety.advance(self._safety, safety.Event.LATE)
+            self._unanswered = step if self._safety.mode is safety.Mode.DRIVE else -1
             return
-        self._safety = note_arrival(self._safety, "", now_s)
-        fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
-        self._safety = advance(self._safety, fresh)
+        self._safety = safety.note_arrival(self._safety, "", now_s)
+        fresh = safety.classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = safety.advance(self._safety, fresh)
 
     def _arrive_at_vehicle(self, command: Command, computing_s: float, now_s: float) -> None:
         answered_step = self.hold.newest_step

@@ -26,15 +26,8 @@ from bridge.environments import picture_of, say_once, scene_of
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import RecordingWriter, new_recording
+from edge_runtime import cli
 from edge_runtime import tls as access
-from edge_runtime.cli import (
-    Subcommand,
-    examples,
-    not_negative,
-    quit_on_signals,
-    seconds,
-    sigterm_as_interrupt,
-)
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
@@ -276,7 +269,7 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
-_SECONDS = {"metavar": "SECONDS", "type": seconds}
+_SECONDS = {"metavar": "SECONDS", "type": cli.seconds}
 _ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
 _TLS = "folder of this party's certificate, from `deploy certs`; turns TLS on (tls/HOST:PORT)"
 _UNTIL = "stop after this many seconds (default: when the last simulator has left)"
@@ -294,7 +287,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--duration-s": {**_SECONDS, "help": _UNTIL},
     "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "seconds to wait for an edge runtime"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
-    "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "random seed"},
+    "--seed": {"metavar": "N", "type": cli.not_negative, "default": 0, "help": "random seed"},
     "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
 }
 """Options of several commands; their types raise UserError for a bad value."""
@@ -335,7 +328,7 @@ def _run_router(arguments: Any) -> int:
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     with (
         contextlib.suppress(KeyboardInterrupt),
-        sigterm_as_interrupt(),
+        cli.sigterm_as_interrupt(),
         closing(open_session(listen=listens, mode="router", tls=tls, access=rules)),
     ):
         print(f"ready {','.join(listens)}", flush=True)
@@ -344,7 +337,7 @@ def _run_router(arguments: Any) -> int:
 
 
 ROUTER_EXAMPLE = "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router"
-ROUTER = Subcommand(examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
+ROUTER = cli.Subcommand(cli.examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
 
 
 def _add_record_arguments(parser: Any) -> None:
@@ -354,7 +347,7 @@ def _add_record_arguments(parser: Any) -> None:
     add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     add_options(parser, "--vehicle-id", default=None, help=one)
-    add("--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger)
+    add("--linger-s", metavar="SECONDS", type=cli.seconds, default=LINGER_S, help=linger)
 
 
 def _run_record(arguments: Any) -> int:
@@ -362,14 +355,14 @@ def _run_record(arguments: Any) -> int:
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
-        sigterm_as_interrupt(),
+        cli.sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
         closing(RecordingWriter(path)) as writer,
     ):
         print(f"recording {path}", flush=True)
         try:
             # A signal is the ordinary way to end a recording: it must not cut a message in two.
-            with quit_on_signals(listener.stop):
+            with cli.quit_on_signals(listener.stop):
                 _listen(listener, writer, arguments)
                 writer.finish()
         except OSError as error:
@@ -395,4 +388,4 @@ def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> 
 
 
 RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
-RECORD = Subcommand(examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)
+RECORD = cli.Subcommand(cli.examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)

@@ -19,37 +19,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bridge import messages
+from bridge import rerun as shown
 from bridge.inbound import BRAKE_PERIODS
-from bridge.messages import (
-    DECODERS,
-    Heard,
-    Pace,
-    Point,
-    Scene,
-    SeenCar,
-    SeenScene,
-    decode,
-    images_of,
-    is_picture,
-)
+from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene
 from bridge.recording import Recording, choose_vehicle, heard_of
-from bridge.rerun import (
-    APPLIED,
-    GLASS,
-    GOAL,
-    GROUND,
-    LOOPBACK,
-    MARKING,
-    PATH,
-    POLICY,
-    ROAD,
-    SERVE,
-    SUFFIX,
-    Colour,
-    check_sink,
-    open_sink,
-    shades,
-)
+from bridge.rerun import Colour
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link import link_words
@@ -84,8 +59,8 @@ class Canvas:
         self._states, self._ground = dict.fromkeys(states, ""), object()
         for path, of in states.items():
             names, colours = list(of), list(of.values())
-            shown = rr.StateConfiguration(values=names, labels=names, colors=colours)
-            self.log(path, shown, static=True)
+            look = rr.StateConfiguration(values=names, labels=names, colors=colours)
+            self.log(path, look, static=True)
 
     def stand_at(self, step: int, **seconds: float) -> None:
         """Set the time of all that is drawn next: the step, and seconds by timeline."""
@@ -99,7 +74,7 @@ class Canvas:
 
     def style(self, path: str, colour: Colour, names: Sequence[str]) -> None:
         """Name the lines at one path, and give them shades of a colour."""
-        colours, widths = shades(colour, len(names)), [2.0] * len(names)
+        colours, widths = shown.shades(colour, len(names)), [2.0] * len(names)
         self.log(path, rr.SeriesLines(colors=colours, names=names, widths=widths), static=True)
 
     def state(self, path: str, value: str) -> None:
@@ -116,7 +91,7 @@ class Canvas:
     def observation(self, entries: Mapping[str, np.ndarray]) -> None:
         """Draw what the policy sees: its pictures, the newest last, and the first numbers."""
         for name, array in entries.items():
-            if (images := images_of(array)) is None:
+            if (images := messages.images_of(array)) is None:
                 self.scalar(f"observation/{name}", *array.ravel()[:MOST_LINES])
                 continue
             for place, image in zip(("now", "before"), images[::-1], strict=False):
@@ -136,19 +111,19 @@ class Canvas:
             self.log("road/picture", picture)
             return
         self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene), 0.0]))
-        for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
+        for name, colour in (("traffic", shown.APPLIED), ("ego", ego_colour)):
             cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
             half_m, bodies = [car.width_m / 2 for car in cars], list(map(body, cars))
             self._strips(f"road/{name}/body", bodies, colour, half_m, order=3.0)
-            self._strips(f"road/{name}/glass", map(windscreen, cars), GLASS, 0.3, order=4.0)
+            self._strips(f"road/{name}/glass", map(windscreen, cars), shown.GLASS, 0.3, order=4.0)
 
     def _draw_ground(self, scene: SeenScene) -> None:
-        self._strips("road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
-        self._strips("road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
-        self._strips("road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
+        self._strips("road/roads", scene.roads, shown.ROAD, scene.road_width_m / 2, order=0.0)
+        self._strips("road/lanes", scene.lane_lines, shown.MARKING, 0.06, order=0.5)
+        self._strips("road/path", [scene.path] if scene.path else [], shown.PATH, 0.15, order=1.0)
         if scene.goal is not None:
-            look: Any = {"colors": [GOAL], "radii": [0.9], "labels": ["goal"], "draw_order": 2.0}
-            self.log("road/goal", rr.Points2D([scene.goal], **look))
+            goal: Any = {"colors": [shown.GOAL], "radii": [0.9], "labels": ["goal"]}
+            self.log("road/goal", rr.Points2D([scene.goal], **goal, draw_order=2.0))
 
     def _strips(self, path: str, strips: Any, colour: Colour, radii_m: Any, order: float) -> None:
         look: Any = {"colors": [colour], "radii": radii_m, "draw_order": order}
@@ -200,7 +175,7 @@ def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
 
 def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
     """Make the view from above: of the scene's path, moving on with a car that leaves it."""
-    look: dict[str, Any] = {"name": "From above", "background": list(GROUND)}
+    look: dict[str, Any] = {"name": "From above", "background": list(shown.GROUND)}
     if scene is None or not scene.path:
         return rrb.Spatial2DView(origin="road", **look)
     x_range, y_range = bounds_of(scene.path)
@@ -239,9 +214,9 @@ PLOTS = (
     ("rejected", "Messages rejected so far, by either side"),
 )
 """From top to bottom."""
-ACTIONS = {"action/asked": POLICY, "action/achieved": APPLIED}
+ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
 NO_COMMAND, NO_REASON = "no command", "-"
-MODES = {DRIVE: POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
+MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
 STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
 INFO, WARN = rr.TextLogLevel.INFO, rr.TextLogLevel.WARN
 
@@ -288,7 +263,7 @@ class WireLog:
         """Draw one message as it came; a token shows as silence."""
         if heard.topic not in DECODERS:
             return
-        message = decode(heard)
+        message = messages.decode(heard)
         if isinstance(message, wire.Rejection):
             self.left_out += 1
         else:
@@ -352,7 +327,7 @@ class WireLog:
 
     def _lay_out(self, scene: SeenScene | None) -> rrb.Blueprint:
         entries = self._task.observation.values() if self._task else ()
-        return lay_out(scene, not entries or any(map(is_picture, entries)))
+        return lay_out(scene, not entries or any(map(messages.is_picture, entries)))
 
     def _stand_at(self, session: str, episode: int, step: int) -> None:
         step += self._starts.setdefault((session, episode), self._end_step)
@@ -389,22 +364,22 @@ def run(arguments: Any) -> int:
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
     sink, opened = "", _foxglove
     if not arguments.foxglove:
-        sink, opened = check_sink(arguments.sink, arguments.port), _rerun
+        sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
     source = _recorded if arguments.recording else _live
     with (
         sigterm_as_interrupt(),
         opened(arguments, sink) as show,
-        source(arguments, sink) as messages,
+        source(arguments, sink) as all_heard,
     ):
-        for heard in messages:
+        for heard in all_heard:
             show(heard)
-    if sink.endswith(SUFFIX):
+    if sink.endswith(shown.SUFFIX):
         print(f"wrote {sink}")
     return 0
 
 
 @contextlib.contextmanager
-def _live(arguments: Any, _sink: str) -> Iterator[Iterator[Heard]]:
+def _live(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
     from bridge.ports import open_listener  # It loads zenoh, which a training goes without.
     from edge_runtime.transport import tls_for
 
@@ -427,7 +402,7 @@ def _recorded(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
     file = Recording(Path(arguments.recording))
     yield heard_of(file, choose_vehicle(file, arguments.vehicle_id))
     file.say_trouble()
-    if sink == SERVE:
+    if sink == shown.SERVE:
         print("all of it is there; ^C ends", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             wait_to_be_told()
@@ -435,8 +410,8 @@ def _recorded(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
 
 @contextlib.contextmanager
 def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
-    all_of_it = arguments.recording or sink.endswith(SUFFIX)
-    with open_sink(sink, "phil_hil", lay_out(None), arguments.port) as recording:
+    all_of_it = arguments.recording or sink.endswith(shown.SUFFIX)
+    with shown.open_sink(sink, "phil_hil", lay_out(None), arguments.port) as recording:
         log = WireLog(recording, 0.0 if all_of_it else PICTURE_INTERVAL_S)
         yield log.write
     if log.left_out:
@@ -445,7 +420,7 @@ def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
 
 
 @contextlib.contextmanager
-def _foxglove(arguments: Any, _sink: str) -> Iterator[Callable[[Heard], None]]:
+def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
     """Yield what shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
@@ -465,11 +440,11 @@ def _foxglove(arguments: Any, _sink: str) -> Iterator[Callable[[Heard], None]]:
         channel(topic, schema).log(data, log_time=now_ns)
 
     try:
-        server = foxglove.start_server(name="phil", host=LOOPBACK, port=port, context=context)
+        server = foxglove.start_server(name="phil", host=shown.LOOPBACK, port=port, context=context)
     except RuntimeError as error:
         raise UserError(f"cannot serve Foxglove at port {port}: {error}") from None
     try:
-        print(f"open ws://{LOOPBACK}:{port} in Foxglove", flush=True)
+        print(f"open ws://{shown.LOOPBACK}:{port} in Foxglove", flush=True)
         yield ViewerCopies(add).write
     finally:
         server.stop()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from bridge.__main__ import main
 from bridge.environments import describe, make_environment
 from bridge.fork import ForkedDrive, RecordedEpisode
 from bridge.messages import Heard, Origin
-from bridge.recording import RecordingWriter
+from bridge.recording import RecordingWriter, whole_recording
 from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
@@ -116,13 +115,6 @@ def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
     return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
 
 
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[RecordingWriter]:
-    with contextlib.closing(RecordingWriter(path)) as writer:
-        yield writer
-        writer.finish()
-
-
 def record_in_process(
     path: Path, env: str, policy: Path, seed: int, latency: str, condition: str = "nominal"
 ) -> EpisodeResult:
@@ -133,7 +125,7 @@ def record_in_process(
     )  # fmt: skip
     environment = make_environment(env, condition)
     nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
-    with writing(path) as out:
+    with whole_recording(path) as out:
         loaded = load_policy(policy, allow_unsigned=True)
         return ForkedDrive(nothing, environment, 0, loaded, out=out).run()
 

@@ -11,12 +11,11 @@ from unittest.mock import Mock
 import msgspec
 import pytest
 
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.recording import Recording, choose_vehicle, heard_of, whole_recording
 from bridge.tests.recordings import (
     bridge_status,
     flip_chunk,
     record_in_process,
-    writing,
 )
 from hil_tests.testing.drives import LEFT_TURN, TOY, make_policy, read
 
@@ -77,7 +76,7 @@ def test_another_policy_or_network_drives_on_in_another_way(fork_of, tmp_path):
 
 def rewritten(path, out, change):
     """The recording with ``change(topic, message)`` in the place of each message, None: without."""
-    with writing(out) as writer:
+    with whole_recording(out) as writer:
         recording = Recording(path)
         for heard in heard_of(recording, choose_vehicle(recording, None)):
             message = msgspec.msgpack.decode(heard.payload)

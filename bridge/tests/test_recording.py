@@ -27,9 +27,9 @@ from mcap.writer import MCAP0_MAGIC
 from bridge import ports
 from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
-from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe
+from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe, whole_recording
 from bridge.replay import RecordedDrive, replay
-from bridge.tests.recordings import chunks, flip, health, heard, record_drive, start_record, writing
+from bridge.tests.recordings import chunks, flip, health, heard, record_drive, start_record
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -75,7 +75,7 @@ def test_the_picture_is_what_the_policy_saw_and_may_have_the_name_of_a_message(t
     frames = bytes(range(256)) * (SIZE // 256) + bytes(SIZE % 256)
     place: dict[str, Any] = {"episode": 0, "step": 3, "sim_time_s": 0.3}
     task = msgspec.structs.replace(TASK, observation={"state": TASK.observation["frames"]})
-    with writing(tmp_path / "runs" / "a.mcap") as writer:
+    with whole_recording(tmp_path / "runs" / "a.mcap") as writer:
         # It says how to read the states.
         writer.write(heard("scene", encode_scene({}, Scene(**place, task=task))))
         state = encode(make_state(3, observation={"state": frames}))
@@ -93,7 +93,7 @@ def test_the_picture_is_what_the_policy_saw_and_may_have_the_name_of_a_message(t
 
 
 def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
-    with writing(tmp_path / "a.mcap") as writer:
+    with whole_recording(tmp_path / "a.mcap") as writer:
         writer.write(heard("state", b"junk"))
         writer.write(Heard("phil/v/state", "state", b"", 2, MAX_STATE_BYTES + 1))
         writer.write(heard("alive", b"\x01"))
@@ -113,7 +113,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
         encode_scene({"vehicles": []}, Scene(episode=1, step=1, sim_time_s=0.1)),
         encode_scene({}, Scene(episode=1, step=1, sim_time_s=0.1, task=ODD)),
     ]  # fmt: skip
-    with writing(tmp_path / "a.mcap") as writer:
+    with whole_recording(tmp_path / "a.mcap") as writer:
         for number in range(3000):
             payload = bytearray(good[number % len(good)])
             for _ in range(number // 1000):
@@ -194,7 +194,7 @@ def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
     assert part == whole[: len(part)]
     read_again = Recording(torn)
     collections.deque(read_again.messages(), maxlen=0)
-    assert (read_again.cut_off, read_again.is_damaged) == (True, False)
+    assert read_again.trouble() == "was cut off"
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
@@ -237,7 +237,7 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     listener, path = WireListener(), tmp_path / "a.mcap"
     monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
 
-    with writing(path) as writer, quit_on_signals(listener.stop):
+    with whole_recording(path) as writer, quit_on_signals(listener.stop):
         copy = writer._copies.write
 
         def signalled(one):
@@ -270,7 +270,7 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
         return next(said)  # They come to an end where it listens on.
 
     monkeypatch.setattr(listener, "next", hear)
-    with writing(tmp_path / "drive.mcap") as writer:
+    with whole_recording(tmp_path / "drive.mcap") as writer:
         listen(listener, writer, 0.05)
     assert writer.messages > 0
 
@@ -294,7 +294,6 @@ def test_only_the_damaged_chunk_is_lost(tmp_path, number):
     assert told_in(copy) == whole[:first] + whole[first + sizes[number] :]
     recording = Recording(copy)
     assert list(recording.messages())
-    assert (recording.damaged_places, recording.cut_off) == (1, False)
     assert recording.trouble() == "has 1 damaged place"
 
 
@@ -310,7 +309,7 @@ def test_no_change_of_bytes_makes_a_message_or_loses_one_unsaid(tmp_path):
     """In two chunks and an index: each kind of record that `record` writes."""
     small, path = tmp_path / "small.mcap", tmp_path / "changed.mcap"
     payloads = {"state": encode(make_state(1)), "command": encode(make_command(1))}
-    with writing(small) as writer:
+    with whole_recording(small) as writer:
         for number, (topic, payload) in enumerate(payloads.items()):
             writer.write(heard(topic, payload, number))
             writer.flush()

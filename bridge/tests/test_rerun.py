@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import bridge.rerun
 from bridge import messages
 from bridge.__main__ import main
-from bridge.recording import Recording, heard_of
+from bridge.recording import Recording, heard_of, whole_recording
 from bridge.rerun import (
     APPLIED,
     POLICY,
@@ -303,7 +303,7 @@ def test_no_number_ends_a_viewer_or_makes_a_recording_unviewable(tmp_path, capsy
         if isinstance(value, int | float) and not isinstance(value, bool)
         for wrong in ABSURD
     ]
-    with recordings.writing(path) as writer:
+    with whole_recording(path) as writer:
         for at_ns, (topic, message) in enumerate([*absurd, *good.items()], 10**18):
             payload = msgspec.msgpack.encode(message)
             writer.write(messages.Heard(f"phil/v/{topic}", topic, payload, at_ns, len(payload)))
