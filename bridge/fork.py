@@ -13,7 +13,7 @@ import math
 import os
 import sys
 from argparse import Namespace
-from contextlib import ExitStack, closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -254,13 +254,12 @@ def _run_fork(asked: Namespace) -> int:
     at_s, found, policy = fork * drive.task.control_period_s, None, None
     if asked.policy is not None:
         policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
-    with ExitStack() as stack:
-        environment = stack.enter_context(closing(drive.environment(asked.env)))
+    with closing(drive.environment(asked.env)) as environment:
         if policy is None:
             ForkedEnvironment(environment, drive, drive.steps).reset()
         else:
-            out = stack.enter_context(whole_recording(asked.record)) if asked.record else None
-            found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
+            with whole_recording(asked.record) if asked.record else nullcontext() as out:
+                found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
     report = {
         "recording": asked.recording,
         "episode": drive.number,
