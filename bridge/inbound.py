@@ -44,8 +44,6 @@ class Decision:
     """Which action of its plan ``command`` has in the place of its own; 0: its own."""
     feedback: Feedback | None = None
     """The vehicle in the loop about the tick; None without a vehicle, or where it is silent."""
-    waits: bool = False
-    """The episode's first command may still be under way."""
 
 
 class CommandHold:
@@ -92,8 +90,7 @@ class CommandHold:
             if ridden:
                 command = msgspec.structs.replace(command, action=plan[ridden - 1])
         fresh, self._fresh = self._fresh, False
-        waits = command is None and not edge_silent
-        return Decision(command, fresh, brake_reason, ridden, waits=waits)
+        return Decision(command, fresh, brake_reason, ridden)
 
 
 class CommandCheck:

@@ -119,27 +119,23 @@ class SafeStopLog:
     def __init__(self) -> None:
         self.events: list[SafeStopEvent] = []
         self._open: SafeStopEvent | None = None
-        self._waits = False  # In all of the open event the first command may have been under way
+        self._episode, self._is_answered = -1, False
 
     def observe(self, episode: int, step: int, decision: Decision) -> None:
         """Note what was decided at ``step``."""
-        event, command = self._open, decision.command
-        if event is not None and event.episode != episode:
-            event = None
-        if command is None:
-            self._waits &= decision.waits
-        elif self._waits and event is not None:
-            self._waits = False
-            if command.step <= BRAKE_PERIODS:
-                self.events.remove(event)
-                event = None
+        if episode != self._episode:
+            self._episode, self._open, self._is_answered = episode, None, False
+        if decision.command is not None and not self._is_answered:
+            self._is_answered = True
+            waited = self._open is not None and self._open.reason == NO_COMMAND
+            if waited and decision.command.step <= BRAKE_PERIODS:
+                self.events.pop()
+                self._open = None
         if not decision.brake_reason:
-            event = None
-        elif event is None:
-            event = SafeStopEvent(episode, step, decision.brake_reason)
-            self.events.append(event)
-            self._waits = decision.waits and event.reason == NO_COMMAND
-        self._open = event
+            self._open = None
+        elif self._open is None:
+            self._open = SafeStopEvent(episode, step, decision.brake_reason)
+            self.events.append(self._open)
 
 
 def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
