@@ -99,14 +99,9 @@ class LockStepClock(_Clock):
 
     def begin(self, episode: int, seed: int) -> None:
         self.check.begin(episode)
-        self._link: network.VirtualLink[State] = network.VirtualLink(
-            self.spec,
-            seed,
-            self._period_s,
-            Layout(self.task).size,
-            on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
-            on_stale=lambda: self.check.reject(Reason.STALE.value),
-        )
+        size = Layout(self.task).size
+        self._link = network.VirtualLink[State](self.spec, seed, self._period_s, size)
+        self._link.latencies_ms = self.latencies_ms  # Of the whole run
         self._hold = self._link.hold
         self._heard_s = 0.0  # Monotonic time of the last answer, or of the first state
         self._edge_silent = False
@@ -120,6 +115,9 @@ class LockStepClock(_Clock):
         self._link.send_state(state.step, state)
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
+        for _ in range(self._link.stale):
+            self.check.reject(Reason.STALE.value)
+        self._link.stale = 0
         return self._link.decide(self._edge_silent)
 
     def _arrive_at_edge(self, arrival: network.Arrival[State]) -> None:

@@ -216,7 +216,6 @@ class ForkedDrive(LockStepClock):
 
 
 def add_place(parser: Any) -> None:
-    """Declare the options that say where a drive is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
     at_s = {"type": lambda text: cli.seconds(text.removesuffix("s")), "default": 0.0}
     parser.add_argument("--at", metavar="T", **at_s, help=at)
@@ -247,7 +246,6 @@ def _add_fork_arguments(parser: Any) -> None:
 
 
 def _run_fork(asked: Namespace) -> int:
-    """Fork the drive, and print and write what came of it."""
     if asked.human is not None:
         _hand_over(asked)
     drive, fork = find_fork(asked.recording, asked)

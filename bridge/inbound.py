@@ -120,7 +120,6 @@ class CommandCheck:
         self.newest = (self.newest[0], step)
 
     def end(self, final_step: int) -> None:
-        """End the episode."""
         self.sent(final_step)
         self._is_over = True
 

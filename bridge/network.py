@@ -289,8 +289,6 @@ class LatencyModel:
 
 
 class Network(NamedTuple):
-    """The two directions of one episode."""
-
     up: LatencyModel
     down: LatencyModel
 
@@ -322,9 +320,9 @@ class VirtualLink(Generic[Message]):
     time, so an edge runtime does not notice a gap in it: the link runs the safety machine itself,
     from standby at each episode's start, and turns into a safe stop what that would not drive.
 
-    ``on_heard`` is called with each newest answer's latency in s, state sent to command received,
-    ``on_stale`` for each answer that is not newer than the newest; ``period_s`` is T,
-    ``observation_bytes`` what a state carries.
+    ``latencies_ms`` has each newest answer's, from state sent to command received, ``stale`` counts
+    the answers that are not newer than the newest; ``period_s`` is T, ``observation_bytes`` what a
+    state carries.
     """
 
     def __init__(
@@ -333,13 +331,12 @@ class VirtualLink(Generic[Message]):
         seed: int,
         period_s: float,
         observation_bytes: int,
-        on_heard: Callable[[float], None] = lambda latency_s: None,
-        on_stale: Callable[[], None] = lambda: None,
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
         self._link = make_network(spec, seed)
-        self._on_heard, self._on_stale = on_heard, on_stale
+        self.latencies_ms: list[float] = []
+        self.stale = 0
         # A heap by arrival time; messages of the same time keep their order.
         self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
         self._numbers = itertools.count()
@@ -414,8 +411,9 @@ class VirtualLink(Generic[Message]):
     def _arrive_at_vehicle(self, command: Command, computing_s: float, now_s: float) -> None:
         answered_step = self.hold.newest_step
         if not self.hold.admit(command, now_s):
-            self._on_stale()
+            self.stale += 1
             return
         self._admitted_s = now_s
         if command.step > answered_step:
-            self._on_heard(now_s - command.step * self._period_s + computing_s)
+            latency_s = now_s - command.step * self._period_s + computing_s
+            self.latencies_ms.append(latency_s * 1e3)

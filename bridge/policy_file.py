@@ -46,7 +46,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Make, check and sign a policy file."""
     out, key = arguments.out, arguments.key
     check_writable(out)
     if key:

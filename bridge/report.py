@@ -122,7 +122,6 @@ class SafeStopLog:
         self._episode, self._is_answered = -1, False
 
     def observe(self, episode: int, step: int, decision: Decision) -> None:
-        """Note what was decided at ``step``."""
         if episode != self._episode:
             self._episode, self._open, self._is_answered = episode, None, False
         if decision.command is not None and not self._is_answered:
@@ -178,7 +177,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterat
 
 
 def summary_line(report: Mapping[str, Any]) -> str:
-    """Return the report in one line for a terminal."""
     latency, times = report["latency_ms"], "no command came"
     if latency["p50"] is not None:
         times = "latency p50 {p50:.1f} ms, p99 {p99:.1f} ms".format(**latency)

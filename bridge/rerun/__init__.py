@@ -102,7 +102,6 @@ def view(parser: argparse.ArgumentParser) -> None:
 
 
 def has_display() -> bool:
-    """Return whether a window can be opened here."""
     return any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
@@ -237,7 +236,6 @@ class Viewer:
 
 
 def free_port() -> int:
-    """Return a port that is not in use."""
     return int(free_endpoint().rpartition(":")[2])
 
 

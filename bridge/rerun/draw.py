@@ -162,13 +162,11 @@ def _line(car: SeenCar, *points: complex) -> list[Point]:
 
 
 def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
-    """Make the view of a plot."""
     legend, axis = rrb.Corner2D.LeftTop, rrb.TimeAxis(view_range=WHOLE)
     return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend, axis_x=axis)
 
 
 def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
-    """Make the view of states over time."""
     axis = rrb.TimeAxis(view_range=WHOLE)
     return rrb.StateTimelineView(origin=origin, name=title, time_view=axis)
 
@@ -218,22 +216,13 @@ ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
 NO_COMMAND, NO_REASON = "no command", "-"
 MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
 STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
-INFO, WARN = rr.TextLogLevel.INFO, rr.TextLogLevel.WARN
 
 
 def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
     """Lay out the views; ``pictures``: whether the policy sees any."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
-    events = rrb.TextLogView(
-        origin="events",
-        name="Events",
-        columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
-    )
-    right = rrb.Vertical(
-        lanes_view("mode", "Mode, and why it does not drive"),
-        *(plot_view(*plot) for plot in PLOTS),
-        events,
-    )
+    mode = lanes_view("mode", "Mode, and why it does not drive")
+    right = rrb.Vertical(mode, *(plot_view(*plot) for plot in PLOTS))
     return two_columns(left, right, [3, 2], "sim_time")
 
 
@@ -286,14 +275,14 @@ class WireLog:
         silent = arrived_ns - self._heard_command_ns > periods * self._period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
-            self._tell(NO_COMMAND, "the simulator brakes by itself", WARN)
+            self._tell(NO_COMMAND, "the simulator brakes by itself")
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
         self._stand_at(command.session, command.episode, command.step)
         self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
         self._canvas.scalar("action/asked", *command.action)
         self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
-        self._tell(command.mode, command.reason, INFO if command.mode == DRIVE else WARN)
+        self._tell(command.mode, command.reason)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         self._canvas.scalar("action/achieved", *feedback.action)
@@ -319,7 +308,7 @@ class WireLog:
             self._canvas.scalar("latency/round_trip", scene.round_trip_ms)
         self._canvas.scalar("rejected/simulator", sum(scene.rejected.values()))
         if scene.ridden and self._mode == DRIVE:
-            self._tell(DRIVE, "rides on the plan", WARN)
+            self._tell(DRIVE, "rides on the plan")
         if self._cars_pace.due(arrived_ns * 1e-9):
             picture = rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
             road = None if scene.picture else scene
@@ -334,15 +323,13 @@ class WireLog:
         self._end_step = max(self._end_step, step + 1)
         self._canvas.stand_at(step, sim_time=step * self._period_s)
 
-    def _tell(self, mode: str, reason: str, level: Any) -> None:
+    def _tell(self, mode: str, reason: str) -> None:
         """Draw the mode where it changes."""
         if (mode, reason) == (self._mode, self._reason):
             return
         self._mode, self._reason = mode, reason
         self._canvas.state("mode/mode", mode)
         self._canvas.state("mode/reason", reason or NO_REASON)
-        text = f"{mode}: {reason}" if reason else mode
-        self._canvas.log("events", rr.TextLog(text, level=level))
         self._draw_status()
 
     def _draw_status(self) -> None:

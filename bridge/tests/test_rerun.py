@@ -79,9 +79,9 @@ def drawings(log):
 
 
 def drawn(log, path):
-    """What was drawn at a path: the numbers of a line, or the texts of events."""
+    """What was drawn at a path: the numbers of a line, or the words of a state."""
     calls = [one for place, one in drawings(log) if place == path]
-    shown = [one for one in calls if isinstance(one, rr.Scalars | rr.TextLog)]
+    shown = [one for one in calls if isinstance(one, rr.Scalars | rr.StateChange)]
     rows = [one.as_component_batches()[0].as_arrow_array().to_pylist() for one in shown]
     return [row[0] if len(row) == 1 else row for row in rows]
 
@@ -256,12 +256,13 @@ def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_pat
 def test_only_a_missing_command_within_an_episode_is_silence(log):
     begin_ns, s = 10**18, 10**9
     log.write_state(make_state(50), begin_ns)  # A viewer that comes late.
-    assert drawn(log, "events") == []
+    assert drawn(log, "mode/reason") == []
     log.write_state(make_state(53), begin_ns + s // 2)
-    assert drawn(log, "events") == ["no command: the simulator brakes by itself"]
+    assert drawn(log, "mode/reason") == ["the simulator brakes by itself"]
     log.write_command(make_command(53), begin_ns + s)
     log.write_state(make_state(1, episode=1), begin_ns + 2 * s)  # Between two episodes.
-    assert drawn(log, "events")[1:] == ["drive"]
+    assert drawn(log, "mode/mode") == ["no command", "drive"]
+    assert drawn(log, "mode/reason")[1:] == ["-"]
 
 
 def test_a_ride_is_shown_and_no_silence(log):
@@ -271,7 +272,8 @@ def test_a_ride_is_shown_and_no_silence(log):
         log.write_state(make_state(step), 10**18 + (step - 7) * 10**8)
         log.write_scene(make_scene(ridden=ridden), 10**18)
     log.write_command(make_command(10), 10**18)
-    assert drawn(log, "events") == ["drive", "drive: rides on the plan", "drive"]
+    assert drawn(log, "mode/mode") == ["drive"]
+    assert drawn(log, "mode/reason") == ["-", "rides on the plan", "-"]
 
 
 def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(tmp_path, capsys):
