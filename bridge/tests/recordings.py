@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +63,29 @@ def start_record(endpoint: str, path: Path, *options: str) -> Process:
 
 
 def record_drive(
-    folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = (), **more: Any
+    folder: Path, env: str, policy: Path, *options: str, view: Path | None = None, **more: Any
 ) -> Path:
-    """Record a drive of the three processes; its report is ``report.json`` beside it."""
+    """Record a drive of the three processes, with its report in ``report.json`` beside it.
+
+    ``view``: the file of a view that watches it as well.
+    """
     endpoint, path = free_endpoint(), folder / "drive.mcap"
-    simulating = ("--wait-edge-s", "100", *options)
-    with (
-        start_simulate(endpoint, folder / "report.json", env, *simulating, **more) as simulator,
-        start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5") as recorder,
-        start_edge(endpoint, policy, *edge),
-    ):
+    there = ("--connect", endpoint, "--wait-s", "100")
+    with contextlib.ExitStack() as stack:
+        words = ("--wait-edge-s", "100", *options)
+        run = start_simulate(endpoint, folder / "report.json", env, *words, **more)
+        simulator = stack.enter_context(run)
+        watching = []
+        if view is not None:
+            viewer = Process("bridge", "view", "--save", str(view), *there)
+            watching.append(stack.enter_context(viewer))
+            wait_until(lambda: list(view.parent.glob(f".{view.name}*")), "the view to begin")
+        recorder = start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5")
+        watching.append(stack.enter_context(recorder))
+        stack.enter_context(start_edge(endpoint, policy))
         simulator.succeed(200.0)
-        recorder.succeed()
+        for process in watching:
+            process.succeed()
     return path
 
 

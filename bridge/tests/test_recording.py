@@ -29,7 +29,7 @@ from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe, whole_recording
 from bridge.replay import RecordedDrive, replay
-from bridge.tests.recordings import chunks, flip, health, heard, record_drive, start_record
+from bridge.tests.recordings import chunks, flip, health, heard, start_record
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -128,15 +128,8 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     assert list(replay(drive, policy, Config()))
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("drive")
-    recording = record_drive(folder, SLOW_TOY, make_policy(folder))
-    return recording, read(folder / "report.json")
-
-
 def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
-    recording, report = drive
+    recording, _, report = drive
     steps = report["per_episode"][0]["steps"]
     with recording.open("rb") as stream:
         found = make_reader(stream, validate_crcs=True).iter_messages()
@@ -167,27 +160,9 @@ def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
             assert isinstance(value, kinds[schema["properties"][name].get("type")]), name
 
 
-def test_a_kill_loses_little(tmp_path):
-    """Half a second at most on an idle machine."""
-    endpoint, recording = free_endpoint(), tmp_path / "cut.mcap"
-    with (
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime"),
-        start_record(endpoint, recording) as run,
-        start_edge(endpoint, make_policy(tmp_path)),
-    ):
-        wait_until(lambda: len(states_in(recording)) > 10, "a second")
-        time.sleep(0.7)  # Just after a flush there would be nothing to lose.
-        run.send(signal.SIGKILL)
-        killed_ns = time.time_ns()
-        run.wait()
-    states = states_in(recording)
-    assert (killed_ns - states[-1][0]) * 1e-9 < 2.0
-    assert [state.step for _, state in states] == list(range(len(states)))
-
-
 @pytest.mark.parametrize("keep", [0.2, 0.9, 0.999])
 def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
-    recording, _ = drive
+    recording, *_ = drive
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
     whole, part = states_in(recording), states_in(torn)
@@ -197,23 +172,33 @@ def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
     assert read_again.trouble() == "was cut off"
 
 
-def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
-    """A limit on the file's size stands in for the disk: the same error path of write(2)."""
-    endpoint, recording = free_endpoint(), tmp_path / "full.mcap"
+def test_a_kill_loses_little_and_a_full_disk_nothing_that_was_written(tmp_path):
+    """Half a second at most on an idle machine.
+
+    A limit on the file's size stands in for the disk: the same error path of write(2).
+    """
+    endpoint, cut, full = free_endpoint(), tmp_path / "cut.mcap", tmp_path / "full.mcap"
     out = tmp_path / "r.json"
     with (
-        start_simulate(endpoint, out, SLOW_TOY) as run,
-        start_record(endpoint, recording) as recorder,
+        start_simulate(endpoint, out, SLOW_TOY, "--clock", "realtime") as run,
+        start_record(endpoint, cut) as killed,
+        start_record(endpoint, full) as recorder,
         start_edge(endpoint, make_policy(tmp_path)),
     ):
-        wait_until(lambda: states_in(recording), "the first states")
-        written, full = states_in(recording), recording.stat().st_size + 100
-        resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (full, full))
+        wait_until(lambda: len(states_in(cut)) > 10 and states_in(full), "a second")
+        written, size = states_in(full), full.stat().st_size + 100
+        resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size, size))
+        time.sleep(0.7)  # Just after a flush there would be nothing to lose.
+        killed.send(signal.SIGKILL)
+        killed_ns = time.time_ns()
         assert recorder.wait() == 1, recorder.errors
         assert run.wait() == 0, run.errors
+    states = states_in(cut)
+    assert (killed_ns - states[-1][0]) * 1e-9 < 2.0
+    assert [state.step for _, state in states] == list(range(len(states)))
     (line,) = recorder.errors.splitlines()
     assert "File too large" in line
-    assert states_in(recording)[: len(written)] == written
+    assert states_in(full)[: len(written)] == written
     assert read(out)["per_episode"][0]["steps"] == 60  # The loop went on to its end.
 
 

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 import bridge.rerun
 from bridge import messages
 from bridge.__main__ import main
+from bridge.ports import open_port
 from bridge.recording import Recording, heard_of, whole_recording
 from bridge.rerun import (
     APPLIED,
@@ -42,7 +43,6 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import Rejection
 from hil_tests.processes import Process, wait_until
 from hil_tests.testing import drives
-from hil_tests.testing.drives import start_edge
 from hil_tests.testing.environments import ToyEnv
 from hil_tests.testing.messages import HEALTH, make_command, make_state
 from hil_tests.testing.policies import TASK
@@ -230,27 +230,24 @@ def verify(recording):
     return recordings.rerun("rrd", "stats", str(recording))
 
 
-@pytest.mark.parametrize("told", ["the drive ends", "the view is interrupted"])
-def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_path):
+def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(drive):
+    found = verify(drive[1])
+    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
+    assert [one for one in entities if one not in found] == []
+    assert list(drive[1].parent.glob(".drive*")) == []
+
+
+def test_a_view_that_is_interrupted_keeps_what_it_recorded(tmp_path):
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
     words = ("view", "--save", str(recording), "--connect", endpoint)
-    with (
-        Process("bridge", *words) as view,
-        drives.start_simulate(endpoint, tmp_path / "r.json", drives.SLOW_TOY) as run,
-    ):
+    with open_port(endpoint, "hunter01"), Process("bridge", *words) as view:
         wait_until(lambda: list(tmp_path.glob(".drive.rrd*")), "the recording to begin")
-        if told == "the drive ends":
-            with start_edge(endpoint, drives.make_policy(tmp_path, "constant")):
-                assert run.wait() == 0, run.errors
-        else:
-            time.sleep(0.3)
-            assert not recording.exists()
-            view.send(signal.SIGTERM)
+        time.sleep(0.3)
+        assert not recording.exists()
+        view.send(signal.SIGTERM)
         assert view.wait(20) == 0, view.errors
-    found = verify(recording)
-    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
-    assert told != "the drive ends" or [one for one in entities if one not in found] == []
-    assert list(tmp_path.glob(".drive*")) == []
+    verify(recording)
+    assert list(tmp_path.iterdir()) == [recording]
 
 
 def test_only_a_missing_command_within_an_episode_is_silence(log):
