@@ -326,11 +326,7 @@ class VirtualLink(Generic[Message]):
     """
 
     def __init__(
-        self,
-        spec: LatencySpec,
-        seed: int,
-        period_s: float,
-        observation_bytes: int,
+        self, spec: LatencySpec, seed: int, period_s: float, observation_bytes: int
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)

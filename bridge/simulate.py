@@ -92,11 +92,7 @@ def run(asked: Namespace) -> int:
 
 
 def _drive(
-    asked: Namespace,
-    environment: Environment,
-    port: SimulatorPort,
-    clock: Clock,
-    edge: EdgeStatus,
+    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock, edge: EdgeStatus
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop")}

@@ -12,11 +12,7 @@ import msgspec
 import pytest
 
 from bridge.recording import Recording, choose_vehicle, heard_of, whole_recording
-from bridge.tests.recordings import (
-    bridge_status,
-    flip_chunk,
-    record_in_process,
-)
+from bridge.tests.recordings import bridge_status, flip_chunk, record_in_process
 from hil_tests.testing.drives import LEFT_TURN, TOY, make_policy, read
 
 SHIPPED = Path(__file__).parents[2] / "results" / "policies"

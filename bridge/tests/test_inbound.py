@@ -168,13 +168,6 @@ def test_feedback_that_cannot_be_believed_is_counted_by_reason(changes, reason):
     assert dict(check.rejected) == {reason: 1}
 
 
-@given(st.binary(max_size=300))
-def test_no_bytes_raise_or_are_believed_by_chance(payload):
-    check = checking_feedback()
-    assert check.read(payload, now_s=0.0) is None
-    assert sum(check.rejected.values()) == 1
-
-
 def test_a_vehicle_that_answers_the_last_simulator_is_there_but_not_believed():
     check = checking_feedback()
     before = make_feedback(900, session="the one before")

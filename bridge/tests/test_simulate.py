@@ -13,14 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from bridge.environments import (
-    Adapter,
-    describe,
-    known_stops,
-    make_environment,
-    say_once,
-    scene_of,
-)
+from bridge.environments import Adapter, describe, known_stops, make_environment, say_once, scene_of
 from bridge.inbound import NO_COMMAND, Decision
 from bridge.messages import Origin
 from bridge.simulate import EpisodeRunner
@@ -31,14 +24,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
-from hil_tests.testing.drives import (
-    SLOW_TOY,
-    TOY,
-    make_policy,
-    read,
-    start_edge,
-    start_simulate,
-)
+from hil_tests.testing.drives import SLOW_TOY, TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import STEERING, write_policy, write_rover
 
@@ -394,13 +380,6 @@ def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     result = runner.run(1, seed=3)
     assert result.actions[:1] == [[0.0]]
     assert clock.states[12].speed_mps > 3.5
-
-
-@pytest.mark.parametrize(("options", "speed_mps"), [({}, 5.0), ({"standing": True}, 0.0)])
-def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, options, speed_mps):
-    clock = ScriptedClock()
-    run(environment, clock, **options)
-    assert clock.states[0].speed_mps == pytest.approx(speed_mps, abs=1.0)
 
 
 def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path):
