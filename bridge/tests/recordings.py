@@ -135,7 +135,7 @@ def record_in_process(
         clock="lockstep", loop="policy", latency=latency,
     )  # fmt: skip
     environment = make_environment(env, condition)
-    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
+    nothing = RecordedEpisode(path, "v", 0, origin, describe(environment), began_ns=0)
     with whole_recording(path) as out:
         loaded = load_policy(policy, allow_unsigned=True)
         return ForkedDrive(nothing, environment, 0, loaded, out=out).run()

@@ -57,8 +57,8 @@ def test_a_drive_is_rebuilt_behind_a_network(fork_of, tmp_path):
     assert (found["fork"]["steps"], found["latency_spec"]) == (1, network)
     record_in_process(tmp_path / "b.mcap", TOY, policy, seed=4, latency="200ms")
     found = fork_of(tmp_path / "b.mcap", "--at", 2, "--policy", policy, "--env", TOY)["fork"]
-    # Until the first command arrives the car goes on as it was told last, and no longer than 2 T.
-    assert [action[0] for action in found["actions"][:6]] == [0.5, 0.5, -1.0, -1.0, 0.5, 0.5]
+    # Until the first command arrives the car rolls, and no longer than 2 T.
+    assert [action[0] for action in found["actions"][:6]] == [0.0, 0.0, -1.0, -1.0, 0.5, 0.5]
 
 
 def test_another_policy_or_network_drives_on_in_another_way(fork_of, tmp_path):
