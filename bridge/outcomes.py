@@ -72,22 +72,17 @@ class Estimate(NamedTuple):
         return f"{value} [{low}, {high}]" if np.isfinite(self.low) else value
 
 
-NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
-
-
 def mean_estimate(values: Iterable[float]) -> Estimate:
     """Return the mean of the values that are not NaN, with Student's interval."""
     numbers = np.fromiter(values, float)
     numbers = numbers[~np.isnan(numbers)]
-    if len(numbers) == 0:
-        return NOTHING
-    mean = float(numbers.mean())
-    if len(numbers) == 1:
-        return NOTHING._replace(value=mean, size=1)
+    count, mean = len(numbers), float(numbers.mean()) if len(numbers) else np.nan
+    if count < 2:
+        return Estimate(mean, -np.inf, np.inf, count)
     from scipy import stats  # Slow to load
 
-    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1) * stats.sem(numbers))
-    return Estimate(mean, mean - reach, mean + reach, len(numbers))
+    reach = float(stats.t.ppf(1.0 - TAIL, count - 1) * stats.sem(numbers))
+    return Estimate(mean, mean - reach, mean + reach, count)
 
 
 def success_estimate(successes: int, count: int) -> Estimate:

@@ -180,17 +180,14 @@ class WireListener:
             return self.queue.get(timeout=timeout_s)
         return None
 
-    def until_gone(
-        self, duration_s: float | None, linger_s: float = LINGER_S
-    ) -> Iterator[Heard | None]:
-        """Yield messages, and None where none comes, until the duration is over or the queue is
-        empty and no simulator has been there for ``linger_s``.
+    def until_gone(self, linger_s: float = LINGER_S) -> Iterator[Heard | None]:
+        """Yield messages, and None where none comes, until the queue is empty and no simulator has
+        been there for ``linger_s``.
 
         An edge runtime behind a router goes on sending without a simulator.
         """
-        now_s = seen_s = time.monotonic()
-        end_s = math.inf if duration_s is None else now_s + duration_s
-        while now_s < end_s and time.time() < self.end_s and not self._is_stopped:
+        seen_s = time.monotonic()
+        while time.time() < self.end_s and not self._is_stopped:
             yield self.next(POLL_S)
             now_s = time.monotonic()
             if self._simulators:
@@ -272,7 +269,6 @@ ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": cli.seconds}
 _ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
 _TLS = "folder of this party's certificate, from `deploy certs`; turns TLS on (tls/HOST:PORT)"
-_UNTIL = "stop after this many seconds (default: when the last simulator has left)"
 _NETWORK = "simulated network, for example " + SHORT_GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "endpoint on which edge runtimes and viewers connect"},
@@ -284,7 +280,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
     "--vehicle-id": {**_ID, "help": "id of the vehicle"},
     "--wait-s": {**_SECONDS, "default": 10.0, "help": "seconds to wait for a simulator"},
-    "--duration-s": {**_SECONDS, "help": _UNTIL},
     "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "seconds to wait for an edge runtime"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
     "--seed": {"metavar": "N", "type": cli.not_negative, "default": 0, "help": "random seed"},
@@ -345,13 +340,13 @@ def _add_record_arguments(parser: Any) -> None:
     linger = "seconds to wait for a simulator that has left to come back"
     out = "recording to write; the file must not exist yet"
     add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--connect", "--tls", "--wait-s")
     add_options(parser, "--vehicle-id", default=None, help=one)
     add("--linger-s", metavar="SECONDS", type=cli.seconds, default=LINGER_S, help=linger)
 
 
 def _run_record(arguments: Any) -> int:
-    """Record until the simulators go, the time is over, or somebody interrupts."""
+    """Record until the simulators go, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
@@ -363,7 +358,7 @@ def _run_record(arguments: Any) -> int:
         try:
             # A signal is the ordinary way to end a recording: it must not cut a message in two.
             with cli.quit_on_signals(listener.stop):
-                _listen(listener, writer, arguments)
+                _listen(listener, writer, arguments.linger_s)
                 writer.finish()
         except OSError as error:
             stopped = f"error: recording {path} stopped: {error.strerror}"
@@ -376,9 +371,9 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
+def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:
     flush_s = time.monotonic() + FLUSH_S
-    for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
+    for heard in listener.until_gone(linger_s):
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
             writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)

@@ -122,7 +122,6 @@ def _drive(
         "latency_spec": network,
         "policy_ids": clock.check.policy_ids,
         "deadline_misses": runner.deadline_misses,
-        "ridden_steps": runner.ridden_steps,
         "missed_ticks": clock.missed_ticks,
         "wall_clock_stalls": clock.wall_clock_stalls,
         "rejected": dict(by_edge + by_simulator),
@@ -187,8 +186,6 @@ class EpisodeRunner:
         self.safe_stops = report.SafeStopLog()
         self._adapter = Adapter(self.environment, self.task)
         self.deadline_misses = 0
-        self.ridden_steps = 0
-        """Ticks in which an action of an earlier command's plan was done."""
 
     def show_task(self, seed: int) -> None:
         """Send one state, which is final, so that the edge runtime compares the task as well.
@@ -235,7 +232,6 @@ class EpisodeRunner:
             result.reward += environments.finite("reward", reward)
             felt.append(report.accelerations(info))
             self.deadline_misses += not decision.fresh
-            self.ridden_steps += decision.ridden > 0
             self.safe_stops.observe(episode, state.step, decision)
             braked = bool(decision.brake_reason)
             applied = {"applied": result.actions[-1], "braked": braked, "ridden": decision.ridden}

@@ -96,7 +96,7 @@ def view(parser: argparse.ArgumentParser) -> None:
     add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
     text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--connect", "--tls", "--wait-s")
     text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
     add_options(parser, "--vehicle-id", default=None, help=text)
 

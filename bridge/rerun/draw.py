@@ -346,7 +346,7 @@ class WireLog:
 
 
 def run(arguments: Any) -> int:
-    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    """Run the command until the simulator goes, or somebody interrupts."""
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
     sink, opened = "", _foxglove
@@ -375,7 +375,7 @@ def _live(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
     with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         with contextlib.suppress(KeyboardInterrupt):
-            yield filter(None, listener.until_gone(arguments.duration_s))
+            yield filter(None, listener.until_gone())
         if listener.dropped:
             lost = f"{listener.dropped} messages came faster than they could be drawn"
             print(lost, file=sys.stderr)

@@ -10,7 +10,6 @@ import signal
 import time
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -213,10 +212,6 @@ def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def listen(listener, writer, linger_s):
-    ports._listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=linger_s))
-
-
 def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     """Not even while the writer is in the middle of one."""
     listener, path = WireListener(), tmp_path / "a.mcap"
@@ -230,7 +225,7 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
             copy(one)
 
         monkeypatch.setattr(writer._copies, "write", signalled)
-        listen(listener, writer, 9.0)
+        ports._listen(listener, writer, 9.0)
     assert [topic for topic, _, _ in told_in(path)] == ["phil/v/state", "view/v/state"]
 
 
@@ -256,7 +251,7 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
 
     monkeypatch.setattr(listener, "next", hear)
     with whole_recording(tmp_path / "drive.mcap") as writer:
-        listen(listener, writer, 0.05)
+        ports._listen(listener, writer, 0.05)
     assert writer.messages > 0
 
 

@@ -187,8 +187,7 @@ class ScriptedClock:
         reason = NO_COMMAND if braking else ""
         steering = 0.04 if state.step < self.drive else -0.02
         command = make_command(state.step, action=[steering])
-        ridden = int(state.step == 3)
-        return Decision(command, fresh=True, brake_reason=reason, ridden=ridden)
+        return Decision(command, fresh=True, brake_reason=reason)
 
     def newest_answer(self):
         return None
@@ -374,7 +373,6 @@ def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     assert event.reason == NO_COMMAND
     assert result.actions[clock.brake_until] == pytest.approx([-0.02])
     assert clock.states[clock.brake_until + 10].speed_mps > 1.0
-    assert runner.ridden_steps == 1
     # The next episode begins with the brake released, and holds no action of the last one.
     clock.drive, clock.brake_until = 0, 5
     result = runner.run(1, seed=3)
