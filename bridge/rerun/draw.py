@@ -355,44 +355,49 @@ def run(arguments: Any) -> int:
     source = _recorded if arguments.recording else _live
     with (
         sigterm_as_interrupt(),
+        source(arguments) as all_heard,
         opened(arguments, sink) as show,
-        source(arguments, sink) as all_heard,
     ):
-        for heard in all_heard:
-            show(heard)
+        try:
+            for heard in all_heard:
+                show(heard)
+            if arguments.recording and sink == shown.SERVE:
+                from bridge.ports import wait_to_be_told  # It loads zenoh: a training goes without.
+
+                print("all of it is there; ^C ends", flush=True)
+                wait_to_be_told()
+        except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
+            if arguments.recording and sink != shown.SERVE:
+                raise
     if sink.endswith(shown.SUFFIX):
         print(f"wrote {sink}")
     return 0
 
 
 @contextlib.contextmanager
-def _live(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
-    from bridge.ports import open_listener  # It loads zenoh, which a training goes without.
+def _live(arguments: Any) -> Iterator[Iterator[Heard]]:
+    from bridge.ports import open_listener
     from edge_runtime.transport import tls_for
 
     where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
     tls = tls_for(arguments.tls, where)
     with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
-        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
-        with contextlib.suppress(KeyboardInterrupt):
-            yield filter(None, listener.until_gone())
+        yield filter(None, listener.until_gone())
         if listener.dropped:
             lost = f"{listener.dropped} messages came faster than they could be drawn"
             print(lost, file=sys.stderr)
 
 
 @contextlib.contextmanager
-def _recorded(arguments: Any, sink: str) -> Iterator[Iterator[Heard]]:
-    """Yield all of it; a page is served until somebody interrupts."""
-    from bridge.ports import wait_to_be_told
-
+def _recorded(arguments: Any) -> Iterator[Iterator[Heard]]:
     file = Recording(Path(arguments.recording))
-    yield heard_of(file, choose_vehicle(file, arguments.vehicle_id))
-    file.say_trouble()
-    if sink == shown.SERVE:
-        print("all of it is there; ^C ends", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            wait_to_be_told()
+    vehicle_id = choose_vehicle(file, arguments.vehicle_id)
+
+    def all_heard() -> Iterator[Heard]:
+        yield from heard_of(file, vehicle_id)
+        file.say_trouble()
+
+    yield all_heard()
 
 
 @contextlib.contextmanager
