@@ -13,7 +13,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import msgspec
 import zstandard
@@ -120,11 +120,10 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
     """Return the vehicle of that id, or the only vehicle; UserError where that fails."""
     there = {_wire_topic(channel)[0] for channel, _ in recording.messages()} - {""}
     names = ", ".join(sorted(there)) or "none"
-    if vehicle_id is not None and vehicle_id not in there:
-        raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
-    if vehicle_id is None and len(there) != 1:
+    found = there & {vehicle_id} if vehicle_id else there
+    if len(found) != 1:
         raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
-    return vehicle_id or there.pop()
+    return found.pop()
 
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
@@ -190,7 +189,8 @@ class RecordingWriter:
             self._file.close()
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
-        schema_id = self._schema(schema.name, SCHEMA_ENCODING, schema.data)
+        name, text = schema
+        schema_id = self._schema(name, SCHEMA_ENCODING, text)
         self._add(topic, ENCODING, now_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
@@ -265,11 +265,7 @@ class Log(msgspec.Struct):
     line: int = 0
 
 
-class Schema(NamedTuple):
-    """A message type: its full name, and its JSON Schema."""
-
-    name: str
-    data: bytes
+Schema = tuple[str, bytes]  # The full name of a message type, and its JSON Schema
 
 
 NOT_COPIED = {"observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal"}
@@ -285,7 +281,7 @@ def describe(kind: type[msgspec.Struct]) -> Schema:
     copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
     schema = {"type": "object", "properties": copied, "$defs": parts}  # As Foxglove wants it
     package = "foxglove" if kind in (RawImage, Log) else "phil"
-    return Schema(f"{package}.{kind.__name__}", msgspec.json.encode(schema))
+    return f"{package}.{kind.__name__}", msgspec.json.encode(schema)
 
 
 class ViewerCopies:

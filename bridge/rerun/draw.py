@@ -424,7 +424,7 @@ def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
 
     @functools.cache
     def channel(topic: str, schema: Schema) -> Any:
-        told = foxglove.Schema(name=schema.name, encoding=SCHEMA_ENCODING, data=schema.data)
+        told = foxglove.Schema(name=schema[0], encoding=SCHEMA_ENCODING, data=schema[1])
         kind: Any = {"message_encoding": ENCODING, "schema": told, "context": context}
         return foxglove.Channel(topic, **kind)
 

@@ -31,7 +31,7 @@ ROWS = [
     ("view --connect FREE", "no display"),
     ("view --save /dev/null/a.rrd", "Not a directory"),
     ("view none.mcap --save a.rrd", "cannot be read"),
-    ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds no vehicle other"),
+    ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds vehicles hunter01; name one"),
 ]
 
 
