@@ -101,8 +101,7 @@ def _drive(
     if is_same := edge.manifest.text == task.text:
         task = msgspec.structs.replace(task, action=edge.manifest.action)  # with the policy's stops
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
-    apply = vehicle_action if vehicle else policy_action
-    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin, apply)
+    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
     if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
@@ -178,8 +177,6 @@ class EpisodeRunner:
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""
-    apply: Callable[[Adapter, Decision], np.ndarray] = policy_action
-    """Returns the action of one tick, and presses or releases the brake."""
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
@@ -218,6 +215,7 @@ class EpisodeRunner:
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
         applied: dict[str, Any] = {}  # What the scene says of the step before
         felt, ended = [], False
+        apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action
         while not ended:
             state = self._state(episode, result.steps, observation, info)
             self._show(state, applied)
@@ -225,7 +223,7 @@ class EpisodeRunner:
             decision = self.clock.exchange(state)
             if decision.brake_reason == Event.OTHER_TASK.value:
                 raise other_task(self.task)
-            action = self.apply(self._adapter, decision)
+            action = apply(self._adapter, decision)
             observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
             result.actions.append([float(value) for value in action.ravel()])
