@@ -23,22 +23,8 @@ from functools import partial
 
 import msgspec
 
-from bridge.inbound import (
-    BRAKE_PERIODS,
-    CommandCheck,
-    CommandHold,
-    Decision,
-    FeedbackCheck,
-)
-from bridge.network import (
-    COMMAND_WINDOW,
-    Arrival,
-    LatencyModel,
-    LatencySpec,
-    VirtualLink,
-    make_network,
-)
-from bridge.report import STANDSTILL_MPS, VehicleLog
+from bridge import inbound, network
+from bridge.inbound import Decision
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
@@ -48,6 +34,7 @@ Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must 
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Stop reasons of wall time. In lock-step they mean that the machine stalled."""
 POLL_S = 0.02
+STANDSTILL_MPS = 0.05
 STANDSTILL_WAIT_S = 5.0
 """Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
 
@@ -60,8 +47,8 @@ class _Clock:
     """
 
     publish: Publish
-    check: CommandCheck
-    spec: LatencySpec
+    check: inbound.CommandCheck
+    spec: network.LatencySpec
     task: Task
     latencies_ms: list[float] = field(default_factory=list)
     """From state sent to command received, injected delays included; one per answered state."""
@@ -73,8 +60,8 @@ class _Clock:
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
-        self._silence_s = BRAKE_PERIODS * self._period_s
-        self._hold = CommandHold(0.0, self._period_s)
+        self._silence_s = inbound.BRAKE_PERIODS * self._period_s
+        self._hold = inbound.CommandHold(0.0, self._period_s)
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
 
@@ -112,14 +99,9 @@ class LockStepClock(_Clock):
 
     def begin(self, episode: int, seed: int) -> None:
         self.check.begin(episode)
-        self._link: VirtualLink[State] = VirtualLink(
-            self.spec,
-            seed,
-            self._period_s,
-            Layout(self.task).size,
-            on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
-            on_stale=lambda: self.check.reject(Reason.STALE.value),
-        )
+        size = Layout(self.task).size
+        self._link = network.VirtualLink[State](self.spec, seed, self._period_s, size)
+        self._link.latencies_ms = self.latencies_ms  # Of the whole run
         self._hold = self._link.hold
         self._heard_s = 0.0  # Monotonic time of the last answer, or of the first state
         self._edge_silent = False
@@ -133,9 +115,12 @@ class LockStepClock(_Clock):
         self._link.send_state(state.step, state)
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
+        for _ in range(self._link.stale):
+            self.check.reject(Reason.STALE.value)
+        self._link.stale = 0
         return self._link.decide(self._edge_silent)
 
-    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
+    def _arrive_at_edge(self, arrival: network.Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = self._stamped(arrival.message)
         # What came between two ticks is read all the same, so that faults are counted.
@@ -184,7 +169,7 @@ class RealTimeClock(_Clock):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._window_s = COMMAND_WINDOW * self._period_s
+        self._window_s = network.COMMAND_WINDOW * self._period_s
         self._line = DelayLine()
         self.begin(episode=0, seed=0)
 
@@ -192,8 +177,8 @@ class RealTimeClock(_Clock):
         with self._arrived:
             self.check.begin(episode)
             self._start_s = self._begun_s = time.monotonic()
-            self._network = make_network(self.spec, seed)
-            self._hold = CommandHold(self._start_s, self._period_s)
+            self._network = network.make_network(self.spec, seed)
+            self._hold = inbound.CommandHold(self._start_s, self._period_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
@@ -226,7 +211,7 @@ class RealTimeClock(_Clock):
         self._send(self._network.up, payload, self.publish)
         return tick_s
 
-    def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
+    def _send(self, direction: network.LatencyModel, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
         sent_s = time.monotonic() - self._begun_s
         for arrival_s in direction.arrivals(sent_s, len(payload)):
@@ -261,18 +246,19 @@ class RealTimeClock(_Clock):
 
 
 class VehicleClock(RealTimeClock):
-    """The clock of ``--loop vehicle``; ``log`` keeps what the vehicle said of itself."""
+    """The clock of ``--loop vehicle``; it keeps the vehicle's name and faults for the report."""
 
     def __post_init__(self) -> None:
-        self.log = VehicleLog()
-        self.feedback_check = FeedbackCheck(self.check)
+        self.vehicle = ""
+        self.faults: Counter[str] = Counter()  # By the feedback messages that held them
+        self.feedback_check = inbound.FeedbackCheck(self.check)
         super().__post_init__()
 
     def begin(self, episode: int, seed: int) -> None:
         super().begin(episode, seed)
         with self._arrived:
             # Its own stream, so that commands meet the same luck as without it.
-            self._feedback_way = make_network(self.spec, seed + 1).down
+            self._feedback_way = network.make_network(self.spec, seed + 1).down
 
     def receive_feedback(self, payload: bytes) -> None:
         self._send(self._feedback_way, payload, self._feedback_arrives)
@@ -303,7 +289,8 @@ class VehicleClock(RealTimeClock):
         with self._arrived:
             feedback = self.feedback_check.read(payload, time.monotonic())
             if feedback is not None:
-                self.log.observe(feedback)
+                self.vehicle = feedback.vehicle
+                self.faults.update(feedback.faults)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Return whether a feedback, of any session, satisfies ``holds`` before ``limit_s``."""

@@ -13,18 +13,17 @@ import math
 import os
 import sys
 from argparse import Namespace
-from contextlib import ExitStack, closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import msgspec
-import numpy as np
 
 from bridge.clocks import LockStepClock
 from bridge.environments import Adapter, Environment, describe, make_environment
-from bridge.inbound import CommandCheck, Decision
+from bridge.inbound import CommandCheck
 from bridge.messages import Heard, Origin, Scene
 from bridge.network import LatencySpec, parse_spec
 from bridge.ports import add_options, scene_payload
@@ -37,7 +36,7 @@ from bridge.recording import (
 )
 from bridge.replay import controller_of
 from bridge.report import EpisodeResult
-from bridge.simulate import EpisodeRunner, policy_action
+from bridge.simulate import EpisodeRunner
 from edge_runtime import cli
 from edge_runtime.config import add_trust
 from edge_runtime.controller import Received, shared_limits
@@ -56,7 +55,6 @@ class RecordedEpisode:
     vehicle_id: str
     number: int
     origin: Origin
-    episode: int
     task: Task
     began_ns: int
     states: dict[int, State] = field(default_factory=dict)
@@ -97,18 +95,16 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
     drives: dict[tuple[str, int], RecordedEpisode] = {}
     for heard, message in valid_messages(recording, vehicle_id):
         if isinstance(message, Scene) and message.origin is not None and message.task is not None:
-            origin, episode = message.origin, message.episode
-            about = origin, episode, message.task, heard.arrived_ns
+            about = message.origin, message.task, heard.arrived_ns
             begun = RecordedEpisode(path, vehicle_id, len(drives), *about)
-            begun = drives.setdefault((origin.session, episode), begun)
+            begun = drives.setdefault((message.origin.session, message.episode), begun)
             if len(message.applied or ()) == len(begun.task.action):
                 begun.applied[message.step - 1] = list(message.applied or ()), message.braked
         elif isinstance(message, State | Command):
             drive = drives.get((message.session, message.episode))
             if drive is not None and number in (None, drive.number):
-                kept: dict[int, Any] = drive.states
-                if isinstance(message, Command):
-                    kept = drive.commands
+                is_state = isinstance(message, State)
+                kept: dict[int, Any] = drive.states if is_state else drive.commands
                 kept.setdefault(message.step, message)
     recording.say_trouble()
     number = 0 if number is None and len(drives) == 1 else number
@@ -150,8 +146,7 @@ class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):
 class ForkedDrive(LockStepClock):
     """A drive in lock-step from step ``fork`` of a recorded one, with a policy in this process.
 
-    ``network`` None: as recorded. ``out`` records the drive. Until its first command arrives the
-    vehicle goes on with the last recorded action.
+    ``network`` None: as recorded. ``out`` records the drive.
     """
 
     def __init__(
@@ -179,14 +174,8 @@ class ForkedDrive(LockStepClock):
         """Drive to the end; UserError where the drive cannot be rebuilt until the fork."""
         changed = {"session": "fork", "latency": str(self.spec)}
         origin = msgspec.structs.replace(self._drive.origin, **changed)
-        about = self.task, origin, self._apply
-        runner = EpisodeRunner(self._environment, self, self._show, *about)
+        runner = EpisodeRunner(self._environment, self, self._show, self.task, origin)
         return runner.run(0, origin.seed)
-
-    def _apply(self, adapter: Adapter, decision: Decision) -> np.ndarray:
-        if decision.command is None and not decision.brake_reason and self._fork:
-            return adapter.within(self._drive.applied[self._fork - 1][0])
-        return policy_action(adapter, decision)
 
     def _answer(self, payload: bytes) -> None:
         """Answer a state as an edge runtime would to which no state comes late."""
@@ -216,7 +205,6 @@ class ForkedDrive(LockStepClock):
 
 
 def add_place(parser: Any) -> None:
-    """Declare the options that say where a drive is forked."""
     at, which = "time of the fork in the drive, as 12.3s", "number of the drive, from 0"
     at_s = {"type": lambda text: cli.seconds(text.removesuffix("s")), "default": 0.0}
     parser.add_argument("--at", metavar="T", **at_s, help=at)
@@ -247,20 +235,18 @@ def _add_fork_arguments(parser: Any) -> None:
 
 
 def _run_fork(asked: Namespace) -> int:
-    """Fork the drive, and print and write what came of it."""
     if asked.human is not None:
         _hand_over(asked)
     drive, fork = find_fork(asked.recording, asked)
     at_s, found, policy = fork * drive.task.control_period_s, None, None
     if asked.policy is not None:
         policy = load_policy(asked.policy, asked.public_key, asked.allow_unsigned)
-    with ExitStack() as stack:
-        environment = stack.enter_context(closing(drive.environment(asked.env)))
+    with closing(drive.environment(asked.env)) as environment:
         if policy is None:
             ForkedEnvironment(environment, drive, drive.steps).reset()
         else:
-            out = stack.enter_context(whole_recording(asked.record)) if asked.record else None
-            found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
+            with whole_recording(asked.record) if asked.record else nullcontext() as out:
+                found = ForkedDrive(drive, environment, fork, policy, asked.latency, out).run()
     report = {
         "recording": asked.recording,
         "episode": drive.number,

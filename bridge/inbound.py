@@ -1,35 +1,22 @@
 """The vehicle's side of the safety rules: what the simulator believes, holds and brakes for. Pure.
 
-`CommandCheck`, `FeedbackCheck` and `EdgeCounts` read what comes back over the wire, and count by
-reason what is not believed. `CommandHold` is the contract's rule on every clock: the newest command
+`CommandCheck` and `FeedbackCheck` read what comes back over the wire, and count by reason what is
+not believed. `CommandHold` is the contract's rule on every clock: the newest command
 is held from tick to tick; when none has arrived for 2 T, or when the command itself says
 ``safe_stop``, the vehicle brakes.
 """
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
 
+from edge_runtime import wire
 from edge_runtime.manifest import Action, Task
-from edge_runtime.wire import (
-    DRIVE,
-    MAX_RIDE_S,
-    SAFE_STOP,
-    Command,
-    Feedback,
-    Health,
-    Reason,
-    Rejection,
-    decode_command,
-    decode_feedback,
-    decode_health,
-)
+from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Feedback, Reason, Rejection
 
 BRAKE_PERIODS = 2  # So many T without a command, and the vehicle brakes by itself
 ROUNDING_S = 1e-9
@@ -57,8 +44,6 @@ class Decision:
     """Which action of its plan ``command`` has in the place of its own; 0: its own."""
     feedback: Feedback | None = None
     """The vehicle in the loop about the tick; None without a vehicle, or where it is silent."""
-    waits: bool = False
-    """The episode's first command may still be under way."""
 
 
 class CommandHold:
@@ -105,8 +90,7 @@ class CommandHold:
             if ridden:
                 command = msgspec.structs.replace(command, action=plan[ridden - 1])
         fresh, self._fresh = self._fresh, False
-        waits = command is None and not edge_silent
-        return Decision(command, fresh, brake_reason, ridden, waits=waits)
+        return Decision(command, fresh, brake_reason, ridden)
 
 
 class CommandCheck:
@@ -136,7 +120,6 @@ class CommandCheck:
         self.newest = (self.newest[0], step)
 
     def end(self, final_step: int) -> None:
-        """End the episode."""
         self.sent(final_step)
         self._is_over = True
 
@@ -145,7 +128,7 @@ class CommandCheck:
 
         An answer after its episode's end is no fault. ``now_ns`` is the wall clock.
         """
-        command = decode_command(payload)
+        command = wire.decode_command(payload)
         if isinstance(command, Rejection):
             self.reject(command.reason.value)
             return None
@@ -176,7 +159,7 @@ class CommandCheck:
         for action in (command.action, *plan) if command.mode == DRIVE else ():
             if fault := _action_fault(action, self.actions):
                 return fault
-        if len(plan) * self.period_s > MAX_RIDE_S + ROUNDING_S:
+        if len(plan) * self.period_s > wire.MAX_RIDE_S + ROUNDING_S:
             return "plan_too_long"  # It would keep the vehicle going for longer than any may
         if (command.episode, command.step) > self.newest:
             return UNKNOWN_STEP
@@ -215,7 +198,7 @@ class FeedbackCheck:
 
     def read(self, payload: bytes, now_s: float) -> Feedback | None:
         """Return the feedback if it is this vehicle's newest, else None; ``now_s`` is monotonic."""
-        feedback = decode_feedback(payload)
+        feedback = wire.decode_feedback(payload)
         if isinstance(feedback, Rejection):
             self.rejected[feedback.reason.value] += 1
             return None
@@ -260,43 +243,3 @@ class FeedbackCheck:
             return Reason.DUPLICATE.value
         in_order = now_s - self._newest_s <= self._silence_s
         return Reason.STALE.value if in_order and feedback.sent_ns < newest_ns else ""
-
-
-class EdgeCounts:
-    """Adds up how the edge's counts of rejected states grow from the first health on.
-
-    Two threads report here: health messages on Zenoh's, answers to the status query on the
-    caller's. The public values are only ever replaced, so readers need no lock.
-    """
-
-    def __init__(self) -> None:
-        self.rejected: Counter[str] = Counter()  # States that the edge rejected, by reason
-        self.unreadable: Counter[str] = Counter()  # Health messages, as ``health_REASON``
-        self.newest: Health | None = None
-        self._lock = threading.Lock()
-
-    def observe_message(self, payload: bytes) -> None:
-        """Take a health message; count one that cannot be read."""
-        health = decode_health(payload)
-        if isinstance(health, Health):
-            self.observe(health)
-        else:
-            self.unreadable = self.unreadable + Counter([f"health_{health.reason.value}"])
-
-    def observe_status(self, payload: bytes) -> None:
-        """Take the JSON answer to the status query, which holds the fields of a health message."""
-        with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            self.observe(msgspec.json.decode(payload, type=Health))
-
-    def observe(self, health: Health) -> None:
-        """Add the growth since the last health; another edge runtime counts from zero."""
-        with self._lock:
-            last, before = self.newest, health.rejected
-            if last is not None:
-                is_younger = health.uptime_s < last.uptime_s
-                if is_younger and health.sent_ns < last.sent_ns:
-                    return  # A message and an answer have overtaken one another.
-                is_another = is_younger or health.policy_id != last.policy_id
-                before = {} if is_another else last.rejected
-            self.rejected = self.rejected + (Counter(health.rejected) - Counter(before))
-            self.newest = health

@@ -211,7 +211,6 @@ class Pace:
         self._free_s = -math.inf  # When the next one is due
 
     def due(self, now_s: float) -> bool:
-        """Return whether a message may pass now."""
         # One interval early will do, so that the jitter of a stream at the pace costs no message.
         if self._interval_s and now_s < self._free_s - self._interval_s:
             return False

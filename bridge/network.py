@@ -12,7 +12,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -20,16 +20,8 @@ import msgspec
 import numpy as np
 
 from bridge.inbound import ROUNDING_S, CommandHold, Decision
+from edge_runtime import safety
 from edge_runtime.latest import Freshness
-from edge_runtime.safety import (
-    Event,
-    Mode,
-    Safety,
-    advance,
-    classify_arrival,
-    classify_fresh,
-    note_arrival,
-)
 from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, Command
 
@@ -37,6 +29,7 @@ DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
 COMMAND_WINDOW = 0.25  # Of T: a command that arrives so soon after the tick still acts in it
 STATE_BYTES, COMMAND_BYTES = 122, 217  # A state without its observation
 FREE, KEPT = ORDERS = ("free", "kept")
+NORMAL, PARETO = TAILS = ("normal", "pareto")
 PARETO_ALPHA = 3.0  # As netem's pareto table: variance is finite above 2
 
 
@@ -63,7 +56,7 @@ class DirectionSpec:
     delay_ms: float = 0.0  # Mean time under way
     jitter_ms: float = 0.0
     """Standard deviation of the time under way; what falls below zero becomes zero."""
-    tail: str = "normal"
+    tail: str = NORMAL
     """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
     loss_percent: float = 0.0  # Share of messages that never arrive, over good and bad stretches
     burst_messages: float = 0.0
@@ -97,57 +90,30 @@ class DirectionSpec:
         """Share of messages in bad stretches that makes the overall loss the asked one."""
         return (self.loss_percent - self.clear_loss_percent) / (100.0 - self.clear_loss_percent)
 
-    def written(self, prefix: str = "") -> list[str]:
-        """Return the settings that are not at their default, as a specification has them."""
-        return [
-            f"{prefix}{name}={row.write(value)}"
-            for name, row in SETTINGS.items()
-            if (value := getattr(self, row.field)) != getattr(DirectionSpec, row.field)
-        ]
-
 
 class Setting(NamedTuple):
-    """A setting of a specification: how its value is read (ValueError if wrong) and written."""
+    """A setting of a specification, and how its value is read (ValueError if wrong)."""
 
     field: str
     example: str
     read: Callable[[str], Any]
-    write: Callable[[Any], str] = str
 
 
 _S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _MS = {"ms": 1.0, "us": 1e-3, "s": 1e3}
+_PERCENT = {"%": 1.0}
+_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
 
 
-def _quantity(text: str, units: Mapping[str, float], most: float, least: float = 0.0) -> float:
+def _quantity(
+    text: str, units: Mapping[str, float], most: float = 60_000.0, least: float = 0.0
+) -> float:
+    """Read a number with its unit; ``units`` has the factor of each."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
-    if match is None or match[2] not in units:
-        raise ValueError(text)
-    value = float(match[1]) * units[match[2]]
+    value = float(match[1]) * units.get(match[2], math.nan) if match else math.nan
     if not least <= value <= most:
         raise ValueError(text)
     return value
-
-
-def _written(value: float, unit: str) -> str:
-    return repr(float(value)).removesuffix(".0") + unit  # Reads back as the same
-
-
-def _number(
-    field: str, example: str, units: Mapping[str, float], most: float, least: float = 0.0
-) -> Setting:
-    """Make a setting with a unit; values are kept in the first, whose factor is 1."""
-    read, unit = partial(_quantity, units=units, most=most, least=least), next(iter(units))
-    return Setting(field, example, read, lambda value: _written(value, unit))
-
-
-def _choice(field: str, words: tuple[str, ...]) -> Setting:
-    def read(text: str) -> str:
-        if text not in words:
-            raise ValueError(text)
-        return text
-
-    return Setting(field, words[-1], read)
 
 
 def _read_outages(text: str) -> tuple[Outage, ...]:
@@ -156,41 +122,31 @@ def _read_outages(text: str) -> tuple[Outage, ...]:
     # A plus also stands inside an exponent, where it is followed by a bare number.
     for part in re.split(r"(?<!e)\+", text):
         match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", part)
-        times_s = (
-            [_quantity(word, _S, most=1e6) for word in match.groups() if word] if match else []
-        )
-        if match is None or len(times_s) < 2 or (match[2] and times_s[0] >= times_s[1]):
+        words = match.groups() if match else ()
+        times_s = [_quantity(word, _S, most=1e6) for word in words if word]
+        if len(times_s) < 2 or (words[1] and times_s[0] >= times_s[1]):
             raise ValueError(text)
-        windows.append(Outage(times_s[0], times_s[-1], times_s[1] if match[2] else None))
+        windows.append(Outage(times_s[0], times_s[-1], times_s[1] if words[1] else None))
     return tuple(windows)
 
 
-def _write_outages(outages: tuple[Outage, ...]) -> str:
-    """Write the windows; a start that is the period is left out."""
-    return "+".join(
-        _written(outage.length_s, "s")
-        + ("" if outage.period_s is None else f"/{_written(outage.period_s, 's')}")
-        + ("" if outage.start_s == outage.period_s else f"@{_written(outage.start_s, 's')}")
-        for outage in outages
-    )
-
-
-_PERCENT = {"%": 1.0}
-_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
+_ms, _percent = partial(_quantity, units=_MS), partial(_quantity, units=_PERCENT, most=100.0)
+_messages = partial(_quantity, units={"": 1.0}, most=1e6, least=1.0)
+_kbps = partial(_quantity, units=_RATES, most=1e9, least=math.ulp(0.0))
 SETTINGS = {
-    "delay": _number("delay_ms", "50ms", _MS, 60_000.0),
-    "jitter": _number("jitter_ms", "10ms", _MS, 60_000.0),
-    "loss": _number("loss_percent", "1%", _PERCENT, 100.0),
-    "tail": _choice("tail", ("normal", "pareto")),
-    "burst": _number("burst_messages", "5", {"": 1.0}, 1e6, least=1.0),
-    "clear_loss": _number("clear_loss_percent", "0.1%", _PERCENT, 100.0),
-    "reorder": _number("reorder_percent", "1%", _PERCENT, 100.0),
-    "reorder_by": _number("reorder_by_ms", "300ms", _MS, 60_000.0),
-    "order": _choice("order", ORDERS),
-    "duplicate": _number("duplicate_percent", "1%", _PERCENT, 100.0),
-    "rate": _number("rate_kbps", "1Mbit/s", _RATES, 1e9, least=math.ulp(0.0)),
-    "queue": _number("queue_ms", "100ms", _MS, 60_000.0),
-    "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages, _write_outages),
+    "delay": Setting("delay_ms", "50ms", _ms),
+    "jitter": Setting("jitter_ms", "10ms", _ms),
+    "loss": Setting("loss_percent", "1%", _percent),
+    "tail": Setting("tail", "pareto", lambda word: TAILS[TAILS.index(word)]),
+    "burst": Setting("burst_messages", "5", _messages),
+    "clear_loss": Setting("clear_loss_percent", "0.1%", _percent),
+    "reorder": Setting("reorder_percent", "1%", _percent),
+    "reorder_by": Setting("reorder_by_ms", "300ms", _ms),
+    "order": Setting("order", KEPT, lambda word: ORDERS[ORDERS.index(word)]),
+    "duplicate": Setting("duplicate_percent", "1%", _percent),
+    "rate": Setting("rate_kbps", "1Mbit/s", _kbps),
+    "queue": Setting("queue_ms", "100ms", _ms),
+    "outage": Setting("outages", "0.5s@2s+0.2s/10s", _read_outages),
 }
 """Name in a specification -> setting."""
 SHORT_GRAMMAR = "50ms+-10ms or delay=50ms,loss=1% (all settings: bridge/README.md)"
@@ -203,16 +159,14 @@ GRAMMAR = (
 
 @dataclass(frozen=True)
 class LatencySpec:
-    """Both directions; ``parse_spec(str(spec)) == spec``."""
+    """Both directions, and the text that they were read from."""
 
     up: DirectionSpec = DirectionSpec()
     down: DirectionSpec = DirectionSpec()
+    text: str = field(default="none", compare=False)
 
     def __str__(self) -> str:
-        """Canonical form: defaults are left out, prefixes only where needed."""
-        if self.up == self.down:
-            return ",".join(self.up.written()) or "none"
-        return ",".join(self.up.written("up.") + self.down.written("down."))
+        return self.text
 
 
 def parse_spec(text: str) -> LatencySpec:
@@ -223,9 +177,10 @@ def parse_spec(text: str) -> LatencySpec:
     any order. GRAMMAR has them all.
     """
     given: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
-    parts = [] if text.strip() in ("", "none") else text.split(",")
+    parts = [part.strip() for part in text.split(",")] if text.strip() else ["none"]
+    text = ",".join(parts)
     try:
-        for part in map(str.strip, parts):
+        for part in parts if text != "none" else ():
             prefix, dot, rest = part.partition(".")
             if not dot or prefix not in DIRECTIONS:
                 prefix, rest = "", part
@@ -234,24 +189,19 @@ def parse_spec(text: str) -> LatencySpec:
             if short := re.fullmatch(r"(\d[^=]*?)(?:(?:\+-|±)(.*))?", rest):
                 pairs = [("delay", short[1])] + ([] if short[2] is None else [("jitter", short[2])])
             for name, word in pairs:
-                field, value = _read_setting(name, word, part)
-                if field in given[prefix]:
+                if name not in SETTINGS:
+                    raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
+                row = SETTINGS[name]
+                if row.field in given[prefix]:
                     raise UserError(f"{name} is set twice")
-                given[prefix][field] = value
-        return LatencySpec(*(DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS))
+                try:
+                    given[prefix][row.field] = row.read(word)
+                except ValueError:
+                    raise UserError(f"{part!r}: write it like {name}={row.example}") from None
+        up, down = (DirectionSpec(**given[""] | given[way]) for way in DIRECTIONS)
+        return LatencySpec(up, down, text)
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
-
-
-def _read_setting(name: str, word: str, part: str) -> tuple[str, Any]:
-    if name not in SETTINGS:
-        raise UserError(f"{part!r} is not understood; write {GRAMMAR}")
-    row = SETTINGS[name]
-    try:
-        return row.field, row.read(word)
-    except ValueError:
-        example = f"{name}={row.example}"
-        raise UserError(f"{part!r} is not understood; write it like {example}") from None
 
 
 def _pareto(draw: float) -> float:
@@ -260,7 +210,7 @@ def _pareto(draw: float) -> float:
     return (upper_tail ** (-1.0 / PARETO_ALPHA) - mean) / std
 
 
-SHAPES: dict[str, Callable[[float], float]] = {"normal": lambda draw: draw, "pareto": _pareto}
+SHAPES: dict[str, Callable[[float], float]] = {NORMAL: lambda draw: draw, PARETO: _pareto}
 """How long a message is under way: shapes with mean 0 and standard deviation 1.
 
 The delay is ``delay + jitter * shape``, as with netem's distribution tables. Both shapes are
@@ -339,8 +289,6 @@ class LatencyModel:
 
 
 class Network(NamedTuple):
-    """The two directions of one episode."""
-
     up: LatencyModel
     down: LatencyModel
 
@@ -372,29 +320,24 @@ class VirtualLink(Generic[Message]):
     time, so an edge runtime does not notice a gap in it: the link runs the safety machine itself,
     from standby at each episode's start, and turns into a safe stop what that would not drive.
 
-    ``on_heard`` is called with each newest answer's latency in s, state sent to command received,
-    ``on_stale`` for each answer that is not newer than the newest; ``period_s`` is T,
-    ``observation_bytes`` what a state carries.
+    ``latencies_ms`` has each newest answer's, from state sent to command received, ``stale`` counts
+    the answers that are not newer than the newest; ``period_s`` is T, ``observation_bytes`` what a
+    state carries.
     """
 
     def __init__(
-        self,
-        spec: LatencySpec,
-        seed: int,
-        period_s: float,
-        observation_bytes: int,
-        on_heard: Callable[[float], None] = lambda latency_s: None,
-        on_stale: Callable[[], None] = lambda: None,
+        self, spec: LatencySpec, seed: int, period_s: float, observation_bytes: int
     ) -> None:
         self._period_s, self._state_bytes = period_s, STATE_BYTES + observation_bytes
         self.hold = CommandHold(0.0, period_s)
         self._link = make_network(spec, seed)
-        self._on_heard, self._on_stale = on_heard, on_stale
+        self.latencies_ms: list[float] = []
+        self.stale = 0
         # A heap by arrival time; messages of the same time keep their order.
         self._under_way: list[tuple[float, int, Callable[[float], Arrival[Message] | None]]] = []
         self._numbers = itertools.count()
         self._newest_at_edge = -1
-        self._safety = Safety(period_s)
+        self._safety = safety.Safety(period_s)
         self._freshness = Freshness(self._safety.answer_s)
         self._unanswered = -1  # The step of a state that came too late to be driven on
         self._step, self._window_end_s = 0, COMMAND_WINDOW * period_s
@@ -422,7 +365,7 @@ class VirtualLink(Generic[Message]):
         """
         if arrival.step == self._unanswered:
             return
-        if self._safety.mode is Mode.SAFE_STOP:
+        if self._safety.mode is safety.Mode.SAFE_STOP:
             command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
         if command.plan:  # as long as the edge runtime's own silence
             ride_s = len(command.plan) * self._period_s
@@ -448,24 +391,25 @@ class VirtualLink(Generic[Message]):
 
     def _judge(self, step: int, now_s: float) -> None:
         """Let the edge runtime's safety machine judge the arrival of a newest state."""
-        gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
+        gap = safety.classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
-            self._safety = advance(self._safety, gap)
-        stands, sent_s = self._safety.mode is Mode.SAFE_STOP, step * self._period_s
+            self._safety = safety.advance(self._safety, gap)
+        stands, sent_s = self._safety.mode is safety.Mode.SAFE_STOP, step * self._period_s
         lag_s = self._freshness.lag_s("", sent_s, now_s, None, stands)
         if lag_s > self._safety.answer_s + ROUNDING_S:
-            self._safety = advance(self._safety, Event.LATE)
-            self._unanswered = step if self._safety.mode is Mode.DRIVE else -1
+            self._safety = safety.advance(self._safety, safety.Event.LATE)
+            self._unanswered = step if self._safety.mode is safety.Mode.DRIVE else -1
             return
-        self._safety = note_arrival(self._safety, "", now_s)
-        fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
-        self._safety = advance(self._safety, fresh)
+        self._safety = safety.note_arrival(self._safety, "", now_s)
+        fresh = safety.classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = safety.advance(self._safety, fresh)
 
     def _arrive_at_vehicle(self, command: Command, computing_s: float, now_s: float) -> None:
         answered_step = self.hold.newest_step
         if not self.hold.admit(command, now_s):
-            self._on_stale()
+            self.stale += 1
             return
         self._admitted_s = now_s
         if command.step > answered_step:
-            self._on_heard(now_s - command.step * self._period_s + computing_s)
+            latency_s = now_s - command.step * self._period_s + computing_s
+            self.latencies_ms.append(latency_s * 1e3)

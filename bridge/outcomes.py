@@ -1,9 +1,11 @@
-"""How an episode ended: the words for it, and what they mean."""
+"""How episodes ended: the words for it, and estimates with 95 % confidence intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 GOAL, FAILED, COLLISION = "goal", "failed", "collision"
 UNKNOWN = "ended"  # The environment reports neither ``outcome`` nor ``is_success``
@@ -38,3 +40,54 @@ def settled(outcomes: Iterable[str]) -> list[str]:
     outcomes = list(outcomes)
     is_told = not UNTOLD.issuperset(outcomes)
     return [TIMEOUT if is_told and each == TRUNCATED else each for each in outcomes]
+
+
+CONFIDENCE = 0.95
+TAIL = 0.5 * (1.0 - CONFIDENCE)  # Outside each end of an interval
+
+
+class Estimate(NamedTuple):
+    """A number with its interval; the interval is infinite where there are too few values."""
+
+    value: float
+    low: float
+    high: float
+    size: int  # Values behind it
+
+    def times(self, factor: float) -> Estimate:
+        """Multiply the number and its interval by a positive factor."""
+        return Estimate(factor * self.value, factor * self.low, factor * self.high, self.size)
+
+    def as_share(self) -> str:
+        """Return a share in percent, with the interval cut off at 0 and 100."""
+        low, high = max(self.low, 0.0), min(self.high, 1.0)
+        shown = self if self.size < 2 else self._replace(low=low, high=high)
+        return shown.times(100.0).text(1)
+
+    def text(self, digits: int = 2) -> str:
+        """Return "0.97 [0.93, 0.99]"; without an interval the value, a dash without values."""
+        if not self.size:
+            return "–"
+        value, low, high = (f"{number:.{digits}f}" for number in self[:3])
+        return f"{value} [{low}, {high}]" if np.isfinite(self.low) else value
+
+
+def mean_estimate(values: Iterable[float]) -> Estimate:
+    """Return the mean of the values that are not NaN, with Student's interval."""
+    numbers = np.fromiter(values, float)
+    numbers = numbers[~np.isnan(numbers)]
+    count, mean = len(numbers), float(numbers.mean()) if len(numbers) else np.nan
+    if count < 2:
+        return Estimate(mean, -np.inf, np.inf, count)
+    from scipy import stats  # Slow to load
+
+    reach = float(stats.t.ppf(1.0 - TAIL, count - 1) * stats.sem(numbers))
+    return Estimate(mean, mean - reach, mean + reach, count)
+
+
+def success_estimate(successes: int, count: int) -> Estimate:
+    """Return the share of successes with Wilson's interval."""
+    from scipy import stats
+
+    interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / count, float(interval.low), float(interval.high), count)

@@ -19,19 +19,10 @@ import msgspec
 import onnx
 
 from bridge.environments import Adapter, Environment, describe, known_stops, make_environment
+from edge_runtime import policy as edge
 from edge_runtime.cli import Subcommand, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Task, check_task
-from edge_runtime.policy import (
-    MAX_POLICY_MIB,
-    OUTPUT,
-    SIGNATURE_SUFFIX,
-    UNSIGNED,
-    Policy,
-    check_answer,
-    check_graph,
-    open_policy,
-)
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError, read_bytes
 
@@ -55,7 +46,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Make, check and sign a policy file."""
     out, key = arguments.out, arguments.key
     check_writable(out)
     if key:
@@ -67,11 +57,11 @@ def _run(arguments: argparse.Namespace) -> int:
             if not any(change.startswith(place) for change in arguments.changes):
                 ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
                 raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
-        model = read_bytes(arguments.model, "model", MAX_POLICY_MIB)
+        model = read_bytes(arguments.model, "model", edge.MAX_POLICY_MIB)
         training = {"source": Path(arguments.model).name, "environment": arguments.env}
         try:
             data = make_policy(model, task, arguments.algorithm, training)
-            policy = open_policy(data, UNSIGNED)
+            policy = edge.open_policy(data, edge.UNSIGNED)
             _try(policy, environment)
         except UserError as error:
             raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
@@ -111,7 +101,7 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
     A single input and a single output may have any name and get the manifest's. Raises UserError
     for anything but an ONNX model that the board can run.
     """
-    check_graph(model)
+    edge.check_graph(model)
     graph = onnx.load_from_string(model)
     names = [each.name for each in graph.graph.input]
     known = {each.name for each in graph.graph.initializer}  # of a model of IR version 3
@@ -119,7 +109,7 @@ def make_policy(model: bytes, task: Task, algorithm: str, training: dict[str, An
     if len(inputs) == len(task.observation) == 1:
         _rename(graph.graph, inputs[0], next(iter(task.observation)))
     if len(graph.graph.output) == 1:
-        _rename(graph.graph, graph.graph.output[0].name, OUTPUT)
+        _rename(graph.graph, graph.graph.output[0].name, edge.OUTPUT)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     about: dict[str, Any] = {"algorithm": algorithm, "training": training, "created": created}
     manifest = Manifest(**msgspec.structs.asdict(task), **about)
@@ -138,7 +128,7 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
             names[:] = [swap.get(name, name) for name in names]
 
 
-def _try(policy: Policy, environment: Environment) -> None:
+def _try(policy: edge.Policy, environment: Environment) -> None:
     """Ask the policy in REAL_OBSERVATIONS steps of random actions.
 
     Raises UserError for an action that the environment cannot take.
@@ -152,7 +142,7 @@ def _try(policy: Policy, environment: Environment) -> None:
             action = policy.act(policy.layout.arrays(adapter.pack(seen)))
         except Exception as error:  # onnxruntime's exceptions share no narrower base
             raise UserError(f"onnxruntime does not run it: {error}") from None
-        check_answer(action, policy.manifest, "a real observation")
+        edge.check_answer(action, policy.manifest, "a real observation")
         sampled = adapter.within(environment.action_space.sample())
         seen, _, terminated, truncated, _ = environment.step(sampled)
         over = terminated or truncated
@@ -164,7 +154,7 @@ def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
     The key is read first: a wrong one leaves no unsigned file behind.
     """
     key = read_signing_key(key_file) if key_file else None
-    signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
+    signature_path = Path(f"{path}{edge.SIGNATURE_SUFFIX}")
     check_writable(signature_path)
     write_atomic(path, data)
     if key is not None:

@@ -13,6 +13,7 @@ import secrets
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,25 +23,17 @@ import msgspec
 import zenoh
 
 from bridge.environments import picture_of, say_once, scene_of
-from bridge.inbound import EdgeCounts
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import RecordingWriter, new_recording
+from edge_runtime import cli
 from edge_runtime import tls as access
-from edge_runtime.cli import (
-    Subcommand,
-    examples,
-    not_negative,
-    quit_on_signals,
-    seconds,
-    sigterm_as_interrupt,
-)
 from edge_runtime.files import check_writable
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
 from edge_runtime.util import UserError, counted
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, check_vehicle_id, key
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
@@ -64,6 +57,17 @@ def scene_payload(environment: Any, stamps: Scene) -> bytes:
     return encode_scene({}, stamps)
 
 
+class EdgeStatus(Health, frozen=True, kw_only=True):
+    """The edge runtime's answer to the status query."""
+
+    manifest: Manifest
+
+    def rejected_since(self, before: EdgeStatus) -> Counter[str]:
+        """Return the states rejected in between, by reason; a restarted one counts from zero."""
+        is_same = self.policy_id == before.policy_id and self.uptime_s >= before.uptime_s
+        return Counter(self.rejected) - Counter(before.rejected if is_same else {})
+
+
 class SimulatorPort:
     """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
 
@@ -71,7 +75,7 @@ class SimulatorPort:
         self, zenoh_session: zenoh.Session, vehicle_id: str, tls: TlsFiles | None = None
     ) -> None:
         self._zenoh, self.vehicle_id, self._tls = zenoh_session, vehicle_id, tls
-        self.session, self.edge_counts = secrets.token_hex(8), EdgeCounts()
+        self.session = secrets.token_hex(8)
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
         self._states, self._scenes = (
@@ -80,7 +84,6 @@ class SimulatorPort:
         )
         token = zenoh_session.liveliness().declare_token(f"phil/{vehicle_id}/simulator")
         self._declared: list[Any] = [self._states, self._scenes, token]
-        self.hear("health", self.edge_counts.observe_message)
 
     def hear(self, topic: str, handler: Callable[[bytes], None]) -> None:
         """Call ``handler(payload)``, which must be quick, for every message of the topic."""
@@ -100,33 +103,25 @@ class SimulatorPort:
         if somebody.matching:
             self._scenes.put(scene_payload(environment, stamps))
 
-    def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
+    def wait_for_edge(self, limit_s: float, endpoint: str) -> EdgeStatus:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
-        while not any(True for _ in self._statuses()):
+        while (status := self.edge_status()) is None:
             if time.monotonic() >= give_up_s:
                 raise UserError(
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
                     f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
                 )
             time.sleep(RETRY_S)
+        return status
 
-    def note_edge_counts(self) -> None:
-        for status in self._statuses():
-            self.edge_counts.observe_status(status)
-
-    def edge_manifest(self) -> Manifest | None:
-        """Return the manifest of the edge runtime's policy; None without an answer."""
-        for status in self._statuses():
-            with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError, KeyError):
-                fields = msgspec.json.decode(status, type=dict[str, msgspec.Raw])
-                return msgspec.json.decode(fields["manifest"], type=Manifest)
-        return None
-
-    def _statuses(self) -> Iterator[bytes]:
+    def edge_status(self) -> EdgeStatus | None:
+        """Ask the edge runtime how it is; None without an answer that can be read."""
         for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
-            if reply.ok is not None:
-                yield reply.ok.payload.to_bytes()
+            with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
+                if reply.ok is not None:
+                    return msgspec.json.decode(reply.ok.payload.to_bytes(), type=EdgeStatus)
+        return None
 
     def close(self) -> None:
         """Undeclare everything: a callback left open hangs the process at its end."""
@@ -185,17 +180,14 @@ class WireListener:
             return self.queue.get(timeout=timeout_s)
         return None
 
-    def until_gone(
-        self, duration_s: float | None, linger_s: float = LINGER_S
-    ) -> Iterator[Heard | None]:
-        """Yield messages, and None where none comes, until the duration is over or the queue is
-        empty and no simulator has been there for ``linger_s``.
+    def until_gone(self, linger_s: float = LINGER_S) -> Iterator[Heard | None]:
+        """Yield messages, and None where none comes, until the queue is empty and no simulator has
+        been there for ``linger_s``.
 
         An edge runtime behind a router goes on sending without a simulator.
         """
-        now_s = seen_s = time.monotonic()
-        end_s = math.inf if duration_s is None else now_s + duration_s
-        while now_s < end_s and time.time() < self.end_s and not self._is_stopped:
+        seen_s = time.monotonic()
+        while time.time() < self.end_s and not self._is_stopped:
             yield self.next(POLL_S)
             now_s = time.monotonic()
             if self._simulators:
@@ -274,10 +266,9 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
 
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
-_SECONDS = {"metavar": "SECONDS", "type": seconds}
+_SECONDS = {"metavar": "SECONDS", "type": cli.seconds}
 _ID = {"metavar": "ID", "type": check_vehicle_id, "default": DEFAULT_VEHICLE_ID}
 _TLS = "folder of this party's certificate, from `deploy certs`; turns TLS on (tls/HOST:PORT)"
-_UNTIL = "stop after this many seconds (default: when the last simulator has left)"
 _NETWORK = "simulated network, for example " + SHORT_GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "endpoint on which edge runtimes and viewers connect"},
@@ -289,10 +280,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--tls": {"metavar": "DIR", "type": "path", "help": _TLS},
     "--vehicle-id": {**_ID, "help": "id of the vehicle"},
     "--wait-s": {**_SECONDS, "default": 10.0, "help": "seconds to wait for a simulator"},
-    "--duration-s": {**_SECONDS, "help": _UNTIL},
     "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": "seconds to wait for an edge runtime"},
     "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
-    "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "random seed"},
+    "--seed": {"metavar": "N", "type": cli.not_negative, "default": 0, "help": "random seed"},
     "--out": {"metavar": "R.json", "type": check_writable, "help": "write the report to this file"},
 }
 """Options of several commands; their types raise UserError for a bad value."""
@@ -322,31 +312,27 @@ def _add_router_arguments(parser: Any) -> None:
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
-    config = "a settings file of zenohd, instead of all other options"
-    parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
-    listens, config = arguments.listen or [DEFAULT_ENDPOINT], arguments.config
+    listens = arguments.listen or [DEFAULT_ENDPOINT]
     tls, rules = tls_for(arguments.tls, *listens), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
-    with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
-        try:  # As zenohd would
-            session = zenoh.open(zenoh.Config.from_file(config)) if config else None
-        except zenoh.ZError as error:
-            raise UserError(f"Zenoh opens no router with {config}: {error}") from None
-        session = session or open_session(listen=listens, mode="router", tls=tls, access=rules)
-        with closing(session):
-            print(f"ready {config or ','.join(listens)}", flush=True)
-            wait_to_be_told(tls)
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        cli.sigterm_as_interrupt(),
+        closing(open_session(listen=listens, mode="router", tls=tls, access=rules)),
+    ):
+        print(f"ready {','.join(listens)}", flush=True)
+        wait_to_be_told(tls)
     return 0
 
 
 ROUTER_EXAMPLE = "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router"
-ROUTER = Subcommand(examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
+ROUTER = cli.Subcommand(cli.examples(ROUTER_EXAMPLE), _add_router_arguments, _run_router)
 
 
 def _add_record_arguments(parser: Any) -> None:
@@ -354,25 +340,25 @@ def _add_record_arguments(parser: Any) -> None:
     linger = "seconds to wait for a simulator that has left to come back"
     out = "recording to write; the file must not exist yet"
     add("--out", metavar="F.mcap", type=new_recording, required=True, help=out)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--connect", "--tls", "--wait-s")
     add_options(parser, "--vehicle-id", default=None, help=one)
-    add("--linger-s", metavar="SECONDS", type=seconds, default=LINGER_S, help=linger)
+    add("--linger-s", metavar="SECONDS", type=cli.seconds, default=LINGER_S, help=linger)
 
 
 def _run_record(arguments: Any) -> int:
-    """Record until the simulators go, the time is over, or somebody interrupts."""
+    """Record until the simulators go, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
     path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
-        sigterm_as_interrupt(),
+        cli.sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
         closing(RecordingWriter(path)) as writer,
     ):
         print(f"recording {path}", flush=True)
         try:
             # A signal is the ordinary way to end a recording: it must not cut a message in two.
-            with quit_on_signals(listener.stop):
-                _listen(listener, writer, arguments)
+            with cli.quit_on_signals(listener.stop):
+                _listen(listener, writer, arguments.linger_s)
                 writer.finish()
         except OSError as error:
             stopped = f"error: recording {path} stopped: {error.strerror}"
@@ -385,9 +371,9 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
+def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:
     flush_s = time.monotonic() + FLUSH_S
-    for heard in listener.until_gone(arguments.duration_s, arguments.linger_s):
+    for heard in listener.until_gone(linger_s):
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
             writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
@@ -397,4 +383,4 @@ def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> 
 
 
 RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
-RECORD = Subcommand(examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)
+RECORD = cli.Subcommand(cli.examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)

@@ -13,7 +13,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import msgspec
 import zstandard
@@ -50,22 +50,17 @@ class Recording:
         """The file has no end of its own: a kill, or damage beyond which nothing can be read."""
         self.damaged_places = 0  # Chunks that do not match their checksums
 
-    @property
-    def is_damaged(self) -> bool:
-        """Whether more is amiss than a kill leaves behind."""
-        return self.damaged_places > 0
-
     def trouble(self) -> str:
         """Return what is wrong with the file, as a verb with its object; empty: nothing."""
-        if self.is_damaged:
+        if self.damaged_places:
             return f"has {counted(self.damaged_places, 'damaged place')}"
         return "was cut off" if self.cut_off else ""
 
-    def say_trouble(self, taken: str = "") -> None:
-        """Print the trouble, if any, in one line on stderr, with how much is taken."""
+    def say_trouble(self) -> None:
+        """Print the trouble, if any, in one line on stderr."""
         if trouble := self.trouble():
             line = f"the recording {self.path} {trouble}; what is whole of it is taken"
-            print(line + taken, file=sys.stderr, flush=True)
+            print(line, file=sys.stderr, flush=True)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Yield the messages, with their channels, in the order of the file, that of arrival.
@@ -125,11 +120,10 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
     """Return the vehicle of that id, or the only vehicle; UserError where that fails."""
     there = {_wire_topic(channel)[0] for channel, _ in recording.messages()} - {""}
     names = ", ".join(sorted(there)) or "none"
-    if vehicle_id is not None and vehicle_id not in there:
-        raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
-    if vehicle_id is None and len(there) != 1:
+    found = there & {vehicle_id} if vehicle_id else there
+    if len(found) != 1:
         raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
-    return vehicle_id or there.pop()
+    return found.pop()
 
 
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
@@ -190,11 +184,13 @@ class RecordingWriter:
         self._file.close()
 
     def close(self) -> None:
-        """Close the file, finished or not."""
-        close_torn(self._file)
+        """Close the file, finished or not; the disk may not take its last bytes."""
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def _add_copy(self, topic: str, schema: Schema, now_ns: int, data: bytes) -> None:
-        schema_id = self._schema(schema.name, SCHEMA_ENCODING, schema.data)
+        name, text = schema
+        schema_id = self._schema(name, SCHEMA_ENCODING, text)
         self._add(topic, ENCODING, now_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
@@ -211,32 +207,27 @@ def new_recording_at(path: Path) -> tuple[BinaryIO, Writer]:
         writer.start(profile="", library=f"phil-hil {__version__}")
         writer.flush()  # Before anybody is told of the file, it is an MCAP file.
     except OSError as error:
-        close_torn(stream)
+        with contextlib.suppress(OSError):
+            stream.close()
         path.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None
     return stream, writer
 
 
-def close_torn(stream: BinaryIO) -> None:
-    """Close a file whose last bytes the disk may not take."""
-    with contextlib.suppress(OSError):
-        stream.close()
-
-
 @contextlib.contextmanager
-def whole_recording(path: str) -> Iterator[RecordingWriter]:
+def whole_recording(path: str | Path) -> Iterator[RecordingWriter]:
     """Write a recording in one go; where that fails, no file is left."""
-    new_recording(path)
-    with contextlib.closing(RecordingWriter(Path(path))) as writer:
+    writer = RecordingWriter(path := Path(new_recording(path)))
+    with contextlib.closing(writer):
         try:
             yield writer
             writer.finish()
         except BaseException:
-            Path(path).unlink()
+            path.unlink()
             raise
 
 
-def new_recording(path: str) -> str:
+def new_recording(path: str | Path) -> str:
     """Return the absolute path; UserError where no recording could be begun there."""
     check_writable(path)
     if Path(path).exists():
@@ -274,11 +265,7 @@ class Log(msgspec.Struct):
     line: int = 0
 
 
-class Schema(NamedTuple):
-    """A message type: its full name, and its JSON Schema."""
-
-    name: str
-    data: bytes
+Schema = tuple[str, bytes]  # The full name of a message type, and its JSON Schema
 
 
 NOT_COPIED = {"observation", "picture", "task", "plan", "roads", "lane_lines", "path", "goal"}
@@ -294,7 +281,7 @@ def describe(kind: type[msgspec.Struct]) -> Schema:
     copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
     schema = {"type": "object", "properties": copied, "$defs": parts}  # As Foxglove wants it
     package = "foxglove" if kind in (RawImage, Log) else "phil"
-    return Schema(f"{package}.{kind.__name__}", msgspec.json.encode(schema))
+    return f"{package}.{kind.__name__}", msgspec.json.encode(schema)
 
 
 class ViewerCopies:

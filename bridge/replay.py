@@ -169,20 +169,19 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
     action of the policy or cannot follow its scenario.
     """
     limits = shared_limits(policy.manifest.action, _vehicle_limits(drive, policy, config))
+    commands = [each.command for each in drive.answers.values()]
     controller, starts_s = None, drive.starts_s[1:]
     for state in drive.states():
         exchange = drive.answers.get(key_of(state))
         if exchange is None:
             yield state, None, None
             continue
+        while starts_s and starts_s[0] <= exchange.arrived_s:
+            controller, starts_s = None, starts_s[1:]
         recorded = exchange.command
-        started = [start_s for start_s in starts_s if start_s <= exchange.arrived_s]
-        if controller is None or started:
-            starts_s = starts_s[len(started) :]
+        if controller is None:
             armed = recorded.reason != Event.NOT_ARMED.value
-            needs_rearm = drive.vehicle != NONE
-            commands = [each.command for each in drive.answers.values()]
-            controller = controller_of(policy, limits, commands, needs_rearm, armed)
+            controller = controller_of(policy, limits, commands, drive.vehicle != NONE, armed)
         order = _answer(controller, policy, state, exchange)
         yield state, recorded if recorded.inference_ns or order else None, order
 
@@ -252,16 +251,14 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
     States without a recorded answer are counted, not compared. Two answers are equal where mode
     and reason are, and no action, planned ones included, is further apart than ``tolerance``.
     """
-    kinds, unanswered, largest = Counter[str](), 0, 0.0
+    kinds, unanswered, distances = Counter[str](), 0, [0.0]
     differences: list[dict[str, Any]] = []
     for state, recorded, order in rows:
         if recorded is None:
             unanswered += 1
             continue
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
-        distance = _distance(recorded, order)
-        if distance < math.inf:
-            largest = max(largest, distance)
+        distances.append(distance := _distance(recorded, order))
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)
@@ -270,7 +267,7 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
         "compared": kinds.total(),
         "unanswered": unanswered,
         "different": len(differences),
-        "largest_difference": largest,
+        "largest_difference": max(filter(math.isfinite, distances)),
         "tolerance": tolerance,
         "by_recorded": dict(kinds),
         "first_differences": differences[:SHOWN_DIFFERENCES],

@@ -21,7 +21,6 @@ from bridge.environments import finite
 from bridge.inbound import BRAKE_PERIODS, NO_COMMAND, Decision
 from bridge.outcomes import COLLISION, GOAL, UNTOLD, settled
 from edge_runtime.util import counted, printable
-from edge_runtime.wire import Feedback
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
 QUANTITIES = {
@@ -120,27 +119,22 @@ class SafeStopLog:
     def __init__(self) -> None:
         self.events: list[SafeStopEvent] = []
         self._open: SafeStopEvent | None = None
-        self._waits = False  # In all of the open event the first command may have been under way
+        self._episode, self._is_answered = -1, False
 
     def observe(self, episode: int, step: int, decision: Decision) -> None:
-        """Note what was decided at ``step``."""
-        event, command = self._open, decision.command
-        if event is not None and event.episode != episode:
-            event = None
-        if command is None:
-            self._waits &= decision.waits
-        elif self._waits and event is not None:
-            self._waits = False
-            if command.step <= BRAKE_PERIODS:
-                self.events.remove(event)
-                event = None
+        if episode != self._episode:
+            self._episode, self._open, self._is_answered = episode, None, False
+        if decision.command is not None and not self._is_answered:
+            self._is_answered = True
+            waited = self._open is not None and self._open.reason == NO_COMMAND
+            if waited and decision.command.step <= BRAKE_PERIODS:
+                self.events.pop()
+                self._open = None
         if not decision.brake_reason:
-            event = None
-        elif event is None:
-            event = SafeStopEvent(episode, step, decision.brake_reason)
-            self.events.append(event)
-            self._waits = decision.waits and event.reason == NO_COMMAND
-        self._open = event
+            self._open = None
+        elif self._open is None:
+            self._open = SafeStopEvent(episode, step, decision.brake_reason)
+            self.events.append(self._open)
 
 
 def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
@@ -183,7 +177,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterat
 
 
 def summary_line(report: Mapping[str, Any]) -> str:
-    """Return the report in one line for a terminal."""
     latency, times = report["latency_ms"], "no command came"
     if latency["p50"] is not None:
         times = "latency p50 {p50:.1f} ms, p99 {p99:.1f} ms".format(**latency)
@@ -199,46 +192,6 @@ def _reasons(noun: str, counts: Mapping[str, int]) -> str:
     """Return text like "3 safe stops (2 no_command, 1 vehicle_fault)"."""
     each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
     return counted(sum(counts.values()), noun) + (f" ({each})" if each else "")
-
-
-STANDSTILL_MPS = 0.05
-MAX_LAG_S, LAG_STEP_S = 2.0, 0.005
-
-
-class VehicleLog:
-    """What the vehicle in the loop says of itself: its name, its faults, and its speeds."""
-
-    def __init__(self) -> None:
-        self.name = ""
-        self.faults: Counter[str] = Counter()  # Words, by the feedback messages that held them
-        self._rows: list[tuple[int, float, float]] = []  # Stamp (ns), speeds asked and reached
-
-    def observe(self, feedback: Feedback) -> None:
-        """Take a feedback, in order."""
-        self.name = feedback.vehicle
-        self.faults.update(feedback.faults)
-        if feedback.commanded_speed_mps is not None and not feedback.self_braking:
-            row = feedback.sent_ns, feedback.commanded_speed_mps, feedback.speed_mps
-            self._rows.append(row)
-
-    def report(self) -> dict[str, Any]:
-        """Return name, faults and the lag of the speed."""
-        lag_ms = {"speed": self._lag_ms()}
-        return {"name": self.name, "lag_ms": lag_ms, "faults": dict(self.faults)}
-
-    def _lag_ms(self) -> float | None:
-        """Return the delay with the least mean square of reached(t) - asked(t - delay), in ms.
-
-        None without a set-point, and where the best delay is MAX_LAG_S.
-        """
-        if not self._rows:
-            return None
-        rows = np.array(sorted(self._rows))
-        times_s, asked, reached = (rows[:, 0] - rows[0, 0]) / 1e9, rows[:, 1], rows[:, 2]
-        delays_s = np.arange(0.0, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-        errors = [np.sum((reached - np.interp(times_s - d, times_s, asked)) ** 2) for d in delays_s]
-        best = int(np.argmin(errors))
-        return None if best == len(delays_s) - 1 else round(float(delays_s[best]) * 1e3, 3)
 
 
 LINE_INTERVAL_S = 15.0  # Between two lines of progress where stderr is no terminal

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -15,39 +16,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from bridge import environments, report
 from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
-from bridge.environments import (
-    CONDITIONS,
-    NOMINAL,
-    Adapter,
-    Environment,
-    describe,
-    finite,
-    make_environment,
-    offered,
-    scenarios,
-)
+from bridge.environments import CONDITIONS, Adapter, Environment, make_environment
 from bridge.inbound import CommandCheck, Decision
 from bridge.messages import Origin, Scene
 from bridge.outcomes import outcome_of
-from bridge.ports import SimulatorPort, add_options, open_port
-from bridge.report import (
-    EpisodeResult,
-    ProgressBar,
-    SafeStopLog,
-    accelerations,
-    make_report,
-    number_of,
-    of_known,
-    summary_line,
-)
-from edge_runtime.cli import (
-    ArgumentParser,
-    examples,
-    positive,
-    positive_number,
-    sigterm_as_interrupt,
-)
+from bridge.ports import EdgeStatus, SimulatorPort, add_options, open_port
+from bridge.report import EpisodeResult, of_known
+from edge_runtime import cli
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.safety import Event
@@ -57,25 +34,25 @@ from edge_runtime.wire import State
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 PEDAL = "pedal"
-EXAMPLE = examples(
+EXAMPLE = cli.examples(
     "python -m bridge simulate --env Pendulum-v1 --episodes 5 \\\n"
     "      --clock realtime --latency 50ms+-10ms",
     "python -m bridge simulate --env SCENARIO --clock realtime --loop vehicle --vehicle-id car-a",
 )
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: cli.ArgumentParser) -> None:
     add = parser.add_argument
-    env = f"scenario ({', '.join(scenarios())}), gymnasium id or module:id"
+    env = f"scenario ({', '.join(environments.scenarios())}), gymnasium id or module:id"
     scene = "scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items())
     clock = "lockstep waits for each command, realtime never waits"
     loop = "the car follows the policy's commands, or (realtime only) the reports of the vehicle"
     loop += " behind the edge runtime"
     period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--env", metavar="ENV", required=True, help=env)
-    add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
-    add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
-    add("--period", metavar="SECONDS", type=positive_number, help=period)
+    add("--condition", choices=CONDITIONS, default=environments.NOMINAL, help=scene)
+    add("--episodes", metavar="N", type=cli.positive, default=1, help="episodes to drive")
+    add("--period", metavar="SECONDS", type=cli.positive_number, help=period)
     add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
     add("--loop", choices=LOOPS, default=POLICY, help=loop)
     where = parser.add_mutually_exclusive_group()
@@ -96,66 +73,62 @@ def run(asked: Namespace) -> int:
     tls = tls_for(asked.tls, endpoint)
     with ExitStack() as stack:
         environment = stack.enter_context(closing(make_environment(asked.env, asked.condition)))
-        stack.enter_context(sigterm_as_interrupt())
-        task = describe(environment, asked.period)
+        stack.enter_context(cli.sigterm_as_interrupt())
+        task = environments.describe(environment, asked.period)
         opened = open_port(asked.listen, asked.vehicle_id, tls, asked.connect, wait_s)
         port = stack.enter_context(opened)
         kind = VehicleClock if asked.loop == VEHICLE else CLOCKS[asked.clock]
         check = CommandCheck(port.session, task)
         clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
         port.hear("command", clock.receive)
-        port.wait_for_edge(wait_s, endpoint)
+        edge = port.wait_for_edge(wait_s, endpoint)
         if isinstance(clock, VehicleClock):
             port.hear("feedback", clock.receive_feedback)
             clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-        report = _drive(asked, environment, port, clock)
-    write_json_out(asked.out, report)
-    print(summary_line(report))
+        found = _drive(asked, environment, port, clock, edge)
+    write_json_out(asked.out, found)
+    print(report.summary_line(found))
     return 0
 
 
 def _drive(
-    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock
+    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock, edge: EdgeStatus
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop")}
     how["standing"] = vehicle is not None
-    network, task, manifest = str(asked.latency), clock.task, port.edge_manifest()
-    if manifest is not None and manifest.text == task.text:
-        task = msgspec.structs.replace(task, action=manifest.action)  # with the policy's stops
+    network, task = str(asked.latency), clock.task
+    if is_same := edge.manifest.text == task.text:
+        task = msgspec.structs.replace(task, action=edge.manifest.action)  # with the policy's stops
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
-    apply = vehicle_action if vehicle else policy_action
-    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin, apply)
-    # Without a manifest, the edge runtime itself compares what the states say.
-    if manifest is not None and manifest.text != task.text:
+    runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
+    if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
         raise other_task(task)
     results = []
-    port.note_edge_counts()
-    with ProgressBar("episodes", asked.episodes) as bar:
+    with report.ProgressBar("episodes", asked.episodes) as bar:
         for episode in range(asked.episodes):
             if vehicle is not None:
                 vehicle.wait_for_standstill()
             results.append(runner.run(episode, asked.seed + episode))
             bar.advance({"last": results[-1].outcome})
-    port.note_edge_counts()
-    edge, by_simulator = port.edge_counts, clock.rejected() + port.edge_counts.unreadable
+    after, by_simulator = port.edge_status(), clock.rejected()
+    by_edge = after.rejected_since(edge) if after else Counter[str]()
     facts = {
         "scenario": task.task,
         **how,
         "latency_spec": network,
         "policy_ids": clock.check.policy_ids,
         "deadline_misses": runner.deadline_misses,
-        "ridden_steps": runner.ridden_steps,
         "missed_ticks": clock.missed_ticks,
         "wall_clock_stalls": clock.wall_clock_stalls,
-        "rejected": dict(edge.rejected + by_simulator),
-        "rejected_by_edge": dict(edge.rejected),
+        "rejected": dict(by_edge + by_simulator),
+        "rejected_by_edge": dict(by_edge),
         "rejected_by_simulator": dict(by_simulator),
-        "vehicle": vehicle.log.report() if vehicle else None,
+        "vehicle": vehicle and {"name": vehicle.vehicle, "faults": dict(vehicle.faults)},
     }
-    return make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
+    return report.make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
 
 
 def other_task(task: Task) -> UserError:
@@ -185,7 +158,7 @@ def vehicle_action(adapter: Adapter, decision: Decision) -> np.ndarray:
     adapter.press_brake(bool(decision.brake_reason))
     if decision.feedback is None:
         return adapter.stop()
-    pedal_for_speed = offered(adapter.env, "pedal_for_speed")
+    pedal_for_speed = environments.offered(adapter.env, "pedal_for_speed")
     speed_mps, action = decision.feedback.scenario_speed_mps, list(decision.feedback.action)
     for place, row in enumerate(adapter.task.action):
         if row.name == PEDAL and speed_mps is not None and pedal_for_speed is not None:
@@ -204,16 +177,12 @@ class EpisodeRunner:
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""
-    apply: Callable[[Adapter, Decision], np.ndarray] = policy_action
-    """Returns the action of one tick, and presses or releases the brake."""
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
-        self.safe_stops = SafeStopLog()
+        self.safe_stops = report.SafeStopLog()
         self._adapter = Adapter(self.environment, self.task)
         self.deadline_misses = 0
-        self.ridden_steps = 0
-        """Ticks in which an action of an earlier command's plan was done."""
 
     def show_task(self, seed: int) -> None:
         """Send one state, which is final, so that the edge runtime compares the task as well.
@@ -246,6 +215,7 @@ class EpisodeRunner:
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
         applied: dict[str, Any] = {}  # What the scene says of the step before
         felt, ended = [], False
+        apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action
         while not ended:
             state = self._state(episode, result.steps, observation, info)
             self._show(state, applied)
@@ -253,14 +223,13 @@ class EpisodeRunner:
             decision = self.clock.exchange(state)
             if decision.brake_reason == Event.OTHER_TASK.value:
                 raise other_task(self.task)
-            action = self.apply(self._adapter, decision)
+            action = apply(self._adapter, decision)
             observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
             result.actions.append([float(value) for value in action.ravel()])
-            result.reward += finite("reward", reward)
-            felt.append(accelerations(info))
+            result.reward += environments.finite("reward", reward)
+            felt.append(report.accelerations(info))
             self.deadline_misses += not decision.fresh
-            self.ridden_steps += decision.ridden > 0
             self.safe_stops.observe(episode, state.step, decision)
             braked = bool(decision.brake_reason)
             applied = {"applied": result.actions[-1], "braked": braked, "ridden": decision.ridden}
@@ -270,7 +239,7 @@ class EpisodeRunner:
         self.clock.finish(final)
         self._under_way = None
         result.outcome = outcome_of(info, only_truncated=not terminated)
-        result.distance_m = number_of(info, "distance_m") or 0.0
+        result.distance_m = report.number_of(info, "distance_m") or 0.0
         result.time_s = round(result.steps * self._period_s, 6)
         result.lateral_acceleration_mps2, result.longitudinal_acceleration_mps2 = map(
             of_known, zip(*felt, strict=True)
@@ -287,7 +256,7 @@ class EpisodeRunner:
             sim_time_s=round(step * self._period_s, 6),
             sent_ns=0,  # The clock stamps it when it sends it.
             observation={} if observation is None else self._adapter.pack(observation),
-            speed_mps=number_of(info, "speed_mps"),
+            speed_mps=report.number_of(info, "speed_mps"),
             final=final,
             task=self.task.text,
         )

@@ -22,9 +22,8 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from bridge.network import parse_spec
-from bridge.outcomes import GOAL
+from bridge.outcomes import GOAL, success_estimate
 from bridge.report import EpisodeResult, ProgressBar, markdown_table
-from bridge.statistics import success_estimate
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError

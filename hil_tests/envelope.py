@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from bridge.network import DirectionSpec, LatencySpec, Outage
+from bridge.network import LatencySpec, parse_spec
 from bridge.outcomes import GOAL
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
@@ -55,17 +55,15 @@ def network(at: Point) -> LatencySpec:
     """Return the network of a point, the same each way."""
     delay_ms, jitter_ms, tail_ms, loss, burst, outage_s = (at.get(name, 0.0) for name in AXES)
     spread_ms, has_bursts = jitter_ms or tail_ms, burst >= 1.0
-    outages = (Outage(round(outage_s, 6), OUTAGE_START_S, OUTAGE_EVERY_S),) if outage_s else ()
-    one_way = DirectionSpec(
-        delay_ms=round(max(delay_ms, JITTER_FLOOR * spread_ms), 6),
-        jitter_ms=round(spread_ms, 6),
-        tail="pareto" if tail_ms else "normal",
-        loss_percent=round(loss + has_bursts * BURST_PERCENT * (1.0 - loss / 100.0), 6),
-        clear_loss_percent=round(loss * has_bursts, 6),
-        burst_messages=round(burst * has_bursts, 6),
-        outages=outages,
-    )
-    return LatencySpec(one_way, one_way)
+    every = f"s/{OUTAGE_EVERY_S:g}s@{OUTAGE_START_S:g}s"
+    lost = loss + has_bursts * BURST_PERCENT * (1.0 - loss / 100.0)
+    settings = {
+        "delay": (max(delay_ms, JITTER_FLOOR * spread_ms), "ms"), "jitter": (spread_ms, "ms"),
+        "loss": (lost, "%"), "clear_loss": (loss * has_bursts, "%"),
+        "burst": (burst * has_bursts, ""), "outage": (outage_s, every),
+    }  # fmt: skip
+    words = [f"{name}={value:.9g}{unit}" for name, (value, unit) in settings.items() if value]
+    return parse_spec(",".join(words + ["tail=pareto"] * (tail_ms > 0)))
 
 
 class SequentialTest:

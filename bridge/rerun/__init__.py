@@ -86,24 +86,22 @@ def view(parser: argparse.ArgumentParser) -> None:
 
     text = "show this recording of bridge record, instead of listening"
     parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
-    where = parser.add_mutually_exclusive_group()
-    page, window = "serve a web page on this machine's loopback only", "open a rerun window"
-    for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
-        where.add_argument(f"--{kind}", dest="sink", action="store_const", const=kind, help=text)
-    text = "write a recording instead of showing it"
-    where.add_argument("--save", dest="sink", metavar=f"F{SUFFIX}", help=text)
+    add = parser.add_mutually_exclusive_group().add_argument
+    kind: Any = {"dest": "sink", "action": "store_const"}
+    add("--spawn", **kind, const=SPAWN, help="open a rerun window (the default)")
+    add("--serve", **kind, const=SERVE, help="serve a web page on this machine's loopback only")
+    add("--save", dest="sink", metavar="F.rrd", help="write a recording instead of showing it")
     text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
     number: Any = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
-    where.add_argument("--foxglove", nargs="?", metavar="PORT", help=text, **number)
+    add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
     text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--connect", "--tls", "--wait-s")
     text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
     add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def has_display() -> bool:
-    """Return whether a window can be opened here."""
     return any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
@@ -113,11 +111,11 @@ def check_sink(sink: str | None, port: int | None = None) -> str:
     Raise UserError for any other, and where nothing can be shown there. ``port``: of the page.
     """
     sink = sink or SPAWN
-    if port is not None and sink != SERVE:
-        raise UserError(f"--port is that of a page: --{SERVE}")
-    for each in () if port is None else (port, port + 1):
-        if _answers(each):
-            raise UserError(f"port {each} is in use; name another --port")
+    if port is not None:
+        if sink != SERVE:
+            raise UserError(f"--port is that of a page: --{SERVE}")
+        if any(map(_answers, (port, port + 1))):
+            raise UserError(f"port {port} or {port + 1} is in use; name another --port")
     if sink.endswith(SUFFIX):
         return str(check_writable(sink))
     if sink not in (SPAWN, SERVE):
@@ -177,9 +175,9 @@ def _shown(
 ) -> Iterator[None]:
     """Draw for a window or a page; ViewerGone where it does not last."""
     page, data = (port, port + 1) if port else (free_port(), free_port())
-    serving = ["--serve-web", "--web-viewer-port", str(page)]
-    options = serving if kind == SERVE else ["--expect-data-soon"]
-    ports = [page, data] if kind == SERVE else [data]
+    options, ports = ["--expect-data-soon"], [data]
+    if kind == SERVE:
+        options, ports = ["--serve-web", "--web-viewer-port", str(page)], [page, data]
     viewer = Viewer([*options, "--port", str(data)], ports)
     try:
         url = f"rerun+http://{LOOPBACK}:{data}/proxy"
@@ -238,7 +236,6 @@ class Viewer:
 
 
 def free_port() -> int:
-    """Return a port that is not in use."""
     return int(free_endpoint().rpartition(":")[2])
 
 

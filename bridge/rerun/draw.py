@@ -7,9 +7,9 @@ are lines: rerun cannot turn its flat boxes.
 
 from __future__ import annotations
 
+import cmath
 import contextlib
 import functools
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,37 +19,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bridge import messages
+from bridge import rerun as shown
 from bridge.inbound import BRAKE_PERIODS
-from bridge.messages import (
-    DECODERS,
-    Heard,
-    Pace,
-    Point,
-    Scene,
-    SeenCar,
-    SeenScene,
-    decode,
-    images_of,
-    is_picture,
-)
+from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene
 from bridge.recording import Recording, choose_vehicle, heard_of
-from bridge.rerun import (
-    APPLIED,
-    GLASS,
-    GOAL,
-    GROUND,
-    LOOPBACK,
-    MARKING,
-    PATH,
-    POLICY,
-    ROAD,
-    SERVE,
-    SUFFIX,
-    Colour,
-    check_sink,
-    open_sink,
-    shades,
-)
+from bridge.rerun import Colour
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link import link_words
@@ -57,8 +32,7 @@ from edge_runtime.manifest import Layout, Task
 from edge_runtime.util import UserError, counted
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
 
-BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
-PURPLE, GREY = (150, 80, 200), (120, 124, 130)
+RED, GREY = (220, 50, 50), (120, 124, 130)
 MARGIN_M = 8.0  # Ground shown beyond the path
 CAMERA = "camera"  # From here the road is seen
 MOST_LINES = 16  # Numbers of an observation that a plot can show
@@ -85,8 +59,8 @@ class Canvas:
         self._states, self._ground = dict.fromkeys(states, ""), object()
         for path, of in states.items():
             names, colours = list(of), list(of.values())
-            shown = rr.StateConfiguration(values=names, labels=names, colors=colours)
-            self.log(path, shown, static=True)
+            look = rr.StateConfiguration(values=names, labels=names, colors=colours)
+            self.log(path, look, static=True)
 
     def stand_at(self, step: int, **seconds: float) -> None:
         """Set the time of all that is drawn next: the step, and seconds by timeline."""
@@ -100,7 +74,7 @@ class Canvas:
 
     def style(self, path: str, colour: Colour, names: Sequence[str]) -> None:
         """Name the lines at one path, and give them shades of a colour."""
-        colours, widths = shades(colour, len(names)), [2.0] * len(names)
+        colours, widths = shown.shades(colour, len(names)), [2.0] * len(names)
         self.log(path, rr.SeriesLines(colors=colours, names=names, widths=widths), static=True)
 
     def state(self, path: str, value: str) -> None:
@@ -117,7 +91,7 @@ class Canvas:
     def observation(self, entries: Mapping[str, np.ndarray]) -> None:
         """Draw what the policy sees: its pictures, the newest last, and the first numbers."""
         for name, array in entries.items():
-            if (images := images_of(array)) is None:
+            if (images := messages.images_of(array)) is None:
                 self.scalar(f"observation/{name}", *array.ravel()[:MOST_LINES])
                 continue
             for place, image in zip(("now", "before"), images[::-1], strict=False):
@@ -137,38 +111,35 @@ class Canvas:
             self.log("road/picture", picture)
             return
         self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene), 0.0]))
-        for name, colour in (("traffic", APPLIED), ("ego", ego_colour)):
+        for name, colour in (("traffic", shown.APPLIED), ("ego", ego_colour)):
             cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
-            half_m = [car.width_m / 2 for car in cars]
-            bodies, screens = ([line(car) for car in cars] for line in (body, windscreen))
+            half_m, bodies = [car.width_m / 2 for car in cars], list(map(body, cars))
             self._strips(f"road/{name}/body", bodies, colour, half_m, order=3.0)
-            self._strips(f"road/{name}/glass", screens, GLASS, 0.3, order=4.0)
+            self._strips(f"road/{name}/glass", map(windscreen, cars), shown.GLASS, 0.3, order=4.0)
 
     def _draw_ground(self, scene: SeenScene) -> None:
-        self._strips("road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
-        self._strips("road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
-        self._strips("road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
+        self._strips("road/roads", scene.roads, shown.ROAD, scene.road_width_m / 2, order=0.0)
+        self._strips("road/lanes", scene.lane_lines, shown.MARKING, 0.06, order=0.5)
+        self._strips("road/path", [scene.path] if scene.path else [], shown.PATH, 0.15, order=1.0)
         if scene.goal is not None:
-            look: Any = {"colors": [GOAL], "radii": [0.9], "labels": ["goal"], "draw_order": 2.0}
-            self.log("road/goal", rr.Points2D([scene.goal], **look))
+            goal: Any = {"colors": [shown.GOAL], "radii": [0.9], "labels": ["goal"]}
+            self.log("road/goal", rr.Points2D([scene.goal], **goal, draw_order=2.0))
 
     def _strips(self, path: str, strips: Any, colour: Colour, radii_m: Any, order: float) -> None:
-        drawn = rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order)
-        self.log(path, drawn)
+        look: Any = {"colors": [colour], "radii": radii_m, "draw_order": order}
+        self.log(path, rr.LineStrips2D(list(strips), **look))
 
 
-def bounds_of(scene: SeenScene) -> list[tuple[float, float]]:
-    """Return the x and y ranges (m) that show the path, or the cars where there is none."""
-    places = scene.path or [(car.x, car.y) for car in scene.vehicles] or [(0.0, 0.0)]
-    return [(min(at) - MARGIN_M, max(at) + MARGIN_M) for at in zip(*places, strict=True)]
+def bounds_of(path: Sequence[Point]) -> list[tuple[float, float]]:
+    """Return the x and y ranges (m) that show the path."""
+    return [(min(at) - MARGIN_M, max(at) + MARGIN_M) for at in zip(*path, strict=True)]
 
 
 def away_m(scene: SeenScene) -> list[float]:
     """Return how far (x, y) the ego car is from the view's middle; [0, 0] where it is inside."""
-    bounds = bounds_of(scene)
-    for ego in (car for car in scene.vehicles if car.ego):
-        place = list(zip((ego.x, ego.y), bounds, strict=True))
-        if scene.path and not all(low <= at <= high for at, (low, high) in place):
+    for ego in (car for car in scene.vehicles if car.ego and scene.path):
+        place = list(zip((ego.x, ego.y), bounds_of(scene.path), strict=True))
+        if not all(low <= at <= high for at, (low, high) in place):
             return [at - (low + high) / 2 for at, (low, high) in place]
     return [0.0, 0.0]
 
@@ -176,38 +147,36 @@ def away_m(scene: SeenScene) -> list[float]:
 def body(car: SeenCar) -> list[Point]:
     """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
     reach = max(0.0, (car.length_m - car.width_m) / 2)
-    return [_placed(car, -reach, 0.0), _placed(car, reach, 0.0)]
+    return _line(car, -reach, reach)
 
 
 def windscreen(car: SeenCar) -> list[Point]:
     """Return the line that tells front from back."""
-    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
-    return [_placed(car, ahead, -aside), _placed(car, ahead, aside)]
+    return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
 
 
-def _placed(car: SeenCar, ahead: float, aside: float) -> Point:
-    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
-    return car.x + ahead * cos - aside * sin, car.y + ahead * sin + aside * cos
+def _line(car: SeenCar, *points: complex) -> list[Point]:
+    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
+    placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
+    return [(each.real, each.imag) for each in placed]
 
 
 def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
-    """Make the view of a plot."""
     legend, axis = rrb.Corner2D.LeftTop, rrb.TimeAxis(view_range=WHOLE)
     return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend, axis_x=axis)
 
 
 def lanes_view(origin: str, title: str) -> rrb.StateTimelineView:
-    """Make the view of states over time."""
     axis = rrb.TimeAxis(view_range=WHOLE)
     return rrb.StateTimelineView(origin=origin, name=title, time_view=axis)
 
 
 def road_view(scene: SeenScene | None) -> rrb.Spatial2DView:
     """Make the view from above: of the scene's path, moving on with a car that leaves it."""
-    look: dict[str, Any] = {"name": "From above", "background": list(GROUND)}
+    look: dict[str, Any] = {"name": "From above", "background": list(shown.GROUND)}
     if scene is None or not scene.path:
         return rrb.Spatial2DView(origin="road", **look)
-    x_range, y_range = bounds_of(scene)
+    x_range, y_range = bounds_of(scene.path)
     bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     return rrb.Spatial2DView(origin=CAMERA, contents="/road/**", visual_bounds=bounds, **look)
 
@@ -238,33 +207,22 @@ def two_columns(
 PLOTS = (
     ("action", "Command: asked and achieved"),
     ("speed", "Speed, m/s: of the simulated car and of the vehicle"),
-    ("latency", "Latency, ms: round trip, and its parts"),
+    ("latency", "Latency, ms: round trip, and inference"),
     ("link", "Link each way: mean delay and jitter, ms; loss, %"),
     ("rejected", "Messages rejected so far, by either side"),
 )
 """From top to bottom."""
-ACTIONS = {"action/asked": POLICY, "action/achieved": APPLIED}
+ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
 NO_COMMAND, NO_REASON = "no command", "-"
-MODES = {DRIVE: POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
+MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
 STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
-Place = tuple[str, int, int]  # Session, episode and step of a state
-REMEMBERED_STATES = 64  # Whose times are kept, for the latency of their commands
-INFO, WARN = rr.TextLogLevel.INFO, rr.TextLogLevel.WARN
 
 
 def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
     """Lay out the views; ``pictures``: whether the policy sees any."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
-    events = rrb.TextLogView(
-        origin="events",
-        name="Events",
-        columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
-    )
-    right = rrb.Vertical(
-        lanes_view("mode", "Mode, and why it does not drive"),
-        *(plot_view(*plot) for plot in PLOTS),
-        events,
-    )
+    mode = lanes_view("mode", "Mode, and why it does not drive")
+    right = rrb.Vertical(mode, *(plot_view(*plot) for plot in PLOTS))
     return two_columns(left, right, [3, 2], "sim_time")
 
 
@@ -288,18 +246,13 @@ class WireLog:
         self._end_step = 0
         self._mode = self._reason = ""
         self._heard_command_ns = self._plan_periods = 0
-        self._sent_ns: dict[Place, int] = {}
-        self._answered_ms: dict[Place, float] = {}
-        """From the sending of a state to that of its first command, by the stamps of both."""
-        self._split: Place | None = None
-        """The state whose round trip was drawn in its parts last."""
         self._health: Health | None = None
 
     def write(self, heard: Heard) -> None:
         """Draw one message as it came; a token shows as silence."""
         if heard.topic not in DECODERS:
             return
-        message = decode(heard)
+        message = messages.decode(heard)
         if isinstance(message, wire.Rejection):
             self.left_out += 1
         else:
@@ -310,7 +263,6 @@ class WireLog:
             self._period_s = state.sim_time_s / state.step
         self._session, episode = state.session, (state.session, state.episode)
         self._stand_at(*episode, state.step)
-        _keep(self._sent_ns, (*episode, state.step), state.sent_ns)
         layout, due = self._layout, self._frames_pace.due(arrived_ns * 1e-9)
         if layout and due and not layout.refusal(state.observation):
             self._canvas.observation(layout.arrays(state.observation))
@@ -323,19 +275,14 @@ class WireLog:
         silent = arrived_ns - self._heard_command_ns > periods * self._period_s * 1e9
         # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
-            self._tell(NO_COMMAND, "the simulator brakes by itself", WARN)
+            self._tell(NO_COMMAND, "the simulator brakes by itself")
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
         self._stand_at(command.session, command.episode, command.step)
         self._heard_command_ns, self._plan_periods = arrived_ns, len(command.plan or ())
         self._canvas.scalar("action/asked", *command.action)
-        place = command.session, command.episode, command.step
-        if (sent_ns := self._sent_ns.get(place)) is not None:
-            self._canvas.scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
-            if place not in self._answered_ms:  # A safe stop is repeated for as long as it lasts.
-                _keep(self._answered_ms, place, (command.sent_ns - sent_ns) * 1e-6)
         self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
-        self._tell(command.mode, command.reason, INFO if command.mode == DRIVE else WARN)
+        self._tell(command.mode, command.reason)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         self._canvas.scalar("action/achieved", *feedback.action)
@@ -359,14 +306,9 @@ class WireLog:
         self._stand_at(session, scene.episode, scene.step)
         if scene.round_trip_ms is not None:
             self._canvas.scalar("latency/round_trip", scene.round_trip_ms)
-            answered = (session, scene.episode, scene.answered_step or 0)
-            # Every scene tells it until the next one is known.
-            if answered in self._answered_ms and answered != self._split:
-                self._split, answered_ms = answered, self._answered_ms[answered]
-                self._canvas.scalar("latency/downlink", scene.round_trip_ms - answered_ms)
         self._canvas.scalar("rejected/simulator", sum(scene.rejected.values()))
         if scene.ridden and self._mode == DRIVE:
-            self._tell(DRIVE, "rides on the plan", WARN)
+            self._tell(DRIVE, "rides on the plan")
         if self._cars_pace.due(arrived_ns * 1e-9):
             picture = rr.EncodedImage(contents=scene.picture, media_type="image/jpeg")
             road = None if scene.picture else scene
@@ -374,22 +316,20 @@ class WireLog:
 
     def _lay_out(self, scene: SeenScene | None) -> rrb.Blueprint:
         entries = self._task.observation.values() if self._task else ()
-        return lay_out(scene, not entries or any(map(is_picture, entries)))
+        return lay_out(scene, not entries or any(map(messages.is_picture, entries)))
 
     def _stand_at(self, session: str, episode: int, step: int) -> None:
         step += self._starts.setdefault((session, episode), self._end_step)
         self._end_step = max(self._end_step, step + 1)
         self._canvas.stand_at(step, sim_time=step * self._period_s)
 
-    def _tell(self, mode: str, reason: str, level: Any) -> None:
+    def _tell(self, mode: str, reason: str) -> None:
         """Draw the mode where it changes."""
         if (mode, reason) == (self._mode, self._reason):
             return
         self._mode, self._reason = mode, reason
         self._canvas.state("mode/mode", mode)
         self._canvas.state("mode/reason", reason or NO_REASON)
-        text = f"{mode}: {reason}" if reason else mode
-        self._canvas.log("events", rr.TextLog(text, level=level))
         self._draw_status()
 
     def _draw_status(self) -> None:
@@ -405,54 +345,66 @@ class WireLog:
         self._canvas.status(*lines)
 
 
-def _keep(memory: dict[Place, Any], place: Place, value: Any) -> None:
-    """Remember a value of a state, and forget the oldest."""
-    memory[place] = value
-    if len(memory) > REMEMBERED_STATES:
-        del memory[next(iter(memory))]
-
-
 def run(arguments: Any) -> int:
-    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    """Run the command until the simulator goes, or somebody interrupts."""
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
-    if arguments.foxglove:
+    sink, opened = "", _foxglove
+    if not arguments.foxglove:
+        sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
+    source = _recorded if arguments.recording else _live
+    with (
+        sigterm_as_interrupt(),
+        source(arguments) as all_heard,
+        opened(arguments, sink) as show,
+    ):
         try:
-            import foxglove
-        except ImportError:
-            raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
-        return _watch(arguments, _served(foxglove, arguments.foxglove))
-    sink = check_sink(arguments.sink, arguments.port)
-    interval_s = 0.0 if sink.endswith(SUFFIX) else PICTURE_INTERVAL_S
-    if arguments.recording is None:
-        _watch(arguments, _drawn(sink, arguments.port, interval_s))
-    else:
-        _show_recording(arguments, sink)
-    if sink.endswith(SUFFIX):
+            for heard in all_heard:
+                show(heard)
+            if arguments.recording and sink == shown.SERVE:
+                from bridge.ports import wait_to_be_told  # It loads zenoh: a training goes without.
+
+                print("all of it is there; ^C ends", flush=True)
+                wait_to_be_told()
+        except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
+            if arguments.recording and sink != shown.SERVE:
+                raise
+    if sink.endswith(shown.SUFFIX):
         print(f"wrote {sink}")
     return 0
 
 
-def _show_recording(arguments: Any, sink: str) -> None:
-    """Draw all of it; a page is served until somebody interrupts."""
-    from bridge.ports import wait_to_be_told  # It loads zenoh, which a training goes without.
+@contextlib.contextmanager
+def _live(arguments: Any) -> Iterator[Iterator[Heard]]:
+    from bridge.ports import open_listener
+    from edge_runtime.transport import tls_for
 
-    file = Recording(Path(arguments.recording))
-    heard = heard_of(file, choose_vehicle(file, arguments.vehicle_id))
-    with _drawn(sink, arguments.port, 0.0) as show:
-        for each in heard:
-            show(each)
-        file.say_trouble()
-        if sink == SERVE:
-            print("all of it is there; ^C ends", flush=True)
-            with contextlib.suppress(KeyboardInterrupt):
-                wait_to_be_told()
+    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, where)
+    with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
+        yield filter(None, listener.until_gone())
+        if listener.dropped:
+            lost = f"{listener.dropped} messages came faster than they could be drawn"
+            print(lost, file=sys.stderr)
 
 
 @contextlib.contextmanager
-def _drawn(sink: str, port: int | None, interval_s: float) -> Iterator[Callable[[Heard], None]]:
-    with open_sink(sink, "phil_hil", lay_out(None), port) as recording:
-        log = WireLog(recording, interval_s)
+def _recorded(arguments: Any) -> Iterator[Iterator[Heard]]:
+    file = Recording(Path(arguments.recording))
+    vehicle_id = choose_vehicle(file, arguments.vehicle_id)
+
+    def all_heard() -> Iterator[Heard]:
+        yield from heard_of(file, vehicle_id)
+        file.say_trouble()
+
+    yield all_heard()
+
+
+@contextlib.contextmanager
+def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
+    all_of_it = arguments.recording or sink.endswith(shown.SUFFIX)
+    with shown.open_sink(sink, "phil_hil", lay_out(None), arguments.port) as recording:
+        log = WireLog(recording, 0.0 if all_of_it else PICTURE_INTERVAL_S)
         yield log.write
     if log.left_out:
         said = counted(log.left_out, "message")
@@ -460,15 +412,19 @@ def _drawn(sink: str, port: int | None, interval_s: float) -> Iterator[Callable[
 
 
 @contextlib.contextmanager
-def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
+def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
     """Yield what shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
-    context = foxglove.Context()
+    try:
+        import foxglove
+    except ImportError:
+        raise UserError("--foxglove needs its SDK: pip install 'phil-hil[foxglove]'") from None
+    port, context = arguments.foxglove, foxglove.Context()
 
     @functools.cache
     def channel(topic: str, schema: Schema) -> Any:
-        told = foxglove.Schema(name=schema.name, encoding=SCHEMA_ENCODING, data=schema.data)
+        told = foxglove.Schema(name=schema[0], encoding=SCHEMA_ENCODING, data=schema[1])
         kind: Any = {"message_encoding": ENCODING, "schema": told, "context": context}
         return foxglove.Channel(topic, **kind)
 
@@ -476,34 +432,11 @@ def _served(foxglove: Any, port: int) -> Iterator[Callable[[Heard], None]]:
         channel(topic, schema).log(data, log_time=now_ns)
 
     try:
-        server = foxglove.start_server(name="phil", host=LOOPBACK, port=port, context=context)
+        server = foxglove.start_server(name="phil", host=shown.LOOPBACK, port=port, context=context)
     except RuntimeError as error:
         raise UserError(f"cannot serve Foxglove at port {port}: {error}") from None
     try:
-        print(f"open ws://{LOOPBACK}:{port} in Foxglove", flush=True)
+        print(f"open ws://{shown.LOOPBACK}:{port} in Foxglove", flush=True)
         yield ViewerCopies(add).write
     finally:
         server.stop()
-
-
-def _watch(
-    arguments: Any, opened: contextlib.AbstractContextManager[Callable[[Heard], None]]
-) -> int:
-    """Show until there is a reason to stop."""
-    from bridge.ports import open_listener
-    from edge_runtime.transport import tls_for
-
-    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    tls = tls_for(arguments.tls, where)
-    with (
-        sigterm_as_interrupt(),
-        open_listener(where, vehicle_id, arguments.wait_s, tls) as listener,
-        opened as show,
-        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
-        contextlib.suppress(KeyboardInterrupt),
-    ):
-        for heard in filter(None, listener.until_gone(arguments.duration_s)):
-            show(heard)
-    if listener.dropped:
-        print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
-    return 0

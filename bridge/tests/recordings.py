@@ -6,7 +6,6 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from bridge.__main__ import main
 from bridge.environments import describe, make_environment
 from bridge.fork import ForkedDrive, RecordedEpisode
 from bridge.messages import Heard, Origin
-from bridge.recording import RecordingWriter
+from bridge.recording import RecordingWriter, whole_recording
 from bridge.report import EpisodeResult
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
@@ -64,18 +63,29 @@ def start_record(endpoint: str, path: Path, *options: str) -> Process:
 
 
 def record_drive(
-    folder: Path, env: str, policy: Path, *options: str, edge: Sequence[str] = (), **more: Any
+    folder: Path, env: str, policy: Path, *options: str, view: Path | None = None, **more: Any
 ) -> Path:
-    """Record a drive of the three processes; its report is ``report.json`` beside it."""
+    """Record a drive of the three processes, with its report in ``report.json`` beside it.
+
+    ``view``: the file of a view that watches it as well.
+    """
     endpoint, path = free_endpoint(), folder / "drive.mcap"
-    simulating = ("--wait-edge-s", "100", *options)
-    with (
-        start_simulate(endpoint, folder / "report.json", env, *simulating, **more) as simulator,
-        start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5") as recorder,
-        start_edge(endpoint, policy, *edge),
-    ):
+    there = ("--connect", endpoint, "--wait-s", "100")
+    with contextlib.ExitStack() as stack:
+        words = ("--wait-edge-s", "100", *options)
+        run = start_simulate(endpoint, folder / "report.json", env, *words, **more)
+        simulator = stack.enter_context(run)
+        watching = []
+        if view is not None:
+            viewer = Process("bridge", "view", "--save", str(view), *there)
+            watching.append(stack.enter_context(viewer))
+            wait_until(lambda: list(view.parent.glob(f".{view.name}*")), "the view to begin")
+        recorder = start_record(endpoint, path, "--wait-s", "100", "--linger-s", "0.5")
+        watching.append(stack.enter_context(recorder))
+        stack.enter_context(start_edge(endpoint, policy))
         simulator.succeed(200.0)
-        recorder.succeed()
+        for process in watching:
+            process.succeed()
     return path
 
 
@@ -116,13 +126,6 @@ def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
     return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
 
 
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[RecordingWriter]:
-    with contextlib.closing(RecordingWriter(path)) as writer:
-        yield writer
-        writer.finish()
-
-
 def record_in_process(
     path: Path, env: str, policy: Path, seed: int, latency: str, condition: str = "nominal"
 ) -> EpisodeResult:
@@ -132,8 +135,8 @@ def record_in_process(
         clock="lockstep", loop="policy", latency=latency,
     )  # fmt: skip
     environment = make_environment(env, condition)
-    nothing = RecordedEpisode(path, "v", 0, origin, 0, describe(environment), began_ns=0)
-    with writing(path) as out:
+    nothing = RecordedEpisode(path, "v", 0, origin, describe(environment), began_ns=0)
+    with whole_recording(path) as out:
         loaded = load_policy(policy, allow_unsigned=True)
         return ForkedDrive(nothing, environment, 0, loaded, out=out).run()
 

@@ -22,7 +22,6 @@ ROWS = [
     ("simulate --env TOY --listen BUSY --out r.json", "in use"),
     ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),
     ("simulate --env TOY --loop vehicle", "--loop vehicle needs --clock realtime"),
-    ("router --config there.mcap", "Zenoh opens no router"),
     ("record --out there.mcap", "exists"),
     ("record --out a.mcap --connect FREE --wait-s 0", "no link"),
     ("replay LEFT_TURN --policy none.onnx", "does not exist"),
@@ -32,7 +31,7 @@ ROWS = [
     ("view --connect FREE", "no display"),
     ("view --save /dev/null/a.rrd", "Not a directory"),
     ("view none.mcap --save a.rrd", "cannot be read"),
-    ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds no vehicle other"),
+    ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds vehicles hunter01; name one"),
 ]
 
 

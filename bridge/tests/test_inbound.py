@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from bridge import inbound
 from bridge.environments import Adapter, describe
 from bridge.inbound import NO_COMMAND, CommandHold
+from bridge.ports import EdgeStatus
 from bridge.report import SafeStopLog
 from bridge.simulate import vehicle_action
 from bridge.tests.recordings import health
@@ -167,13 +168,6 @@ def test_feedback_that_cannot_be_believed_is_counted_by_reason(changes, reason):
     assert dict(check.rejected) == {reason: 1}
 
 
-@given(st.binary(max_size=300))
-def test_no_bytes_raise_or_are_believed_by_chance(payload):
-    check = checking_feedback()
-    assert check.read(payload, now_s=0.0) is None
-    assert sum(check.rejected.values()) == 1
-
-
 def test_a_vehicle_that_answers_the_last_simulator_is_there_but_not_believed():
     check = checking_feedback()
     before = make_feedback(900, session="the one before")
@@ -192,6 +186,7 @@ def test_after_silence_another_board_with_a_slow_clock_is_believed():
     assert dict(check.rejected) == {"stale": 1}
 
 
+MANIFEST: Any = None  # Nobody looks at it.
 HEARD = CommandHold(0.0, T).decide(0.0)
 STOPPED = CommandHold(0.0, T).decide(0.0, edge_silent=True)
 
@@ -261,33 +256,17 @@ def test_a_steered_car_brakes_when_its_vehicle_does():
 
 
 @pytest.mark.parametrize(
-    ("messages", "expected"),
+    ("before", "after", "grown"),
     [
-        ([], {}),
-        ([health(1, 1.0, stale=7)], {}),
-        ([health(1, 1.0, stale=7), health(2, 2.0, stale=9, schema=1)], {"stale": 2, "schema": 1}),
+        (health(1, 1.0, stale=7), health(2, 2.0, stale=9, schema=1), {"stale": 2, "schema": 1}),
         # Restarted: it counts from zero, even where it has passed the old count.
-        ([health(1, 9.0, stale=1), health(2, 0.5, stale=3)], {"stale": 3}),
+        (health(1, 9.0, stale=1), health(2, 0.5, stale=3), {"stale": 3}),
         # The board's wall clock was set back in between.
-        ([health(9, 1.0), health(2, 2.0, stale=1), health(3, 3.0, stale=2)], {"stale": 2}),
-        # A message that an answer has overtaken is no restart.
-        ([health(1, 1.0), health(3, 3.0, stale=2), health(2, 2.0, stale=1)], {"stale": 2}),
+        (health(9, 1.0, stale=1), health(2, 2.0, stale=3), {"stale": 2}),
     ],
 )
-def test_growth_is_added_up(messages, expected):
-    counts = inbound.EdgeCounts()
-    for message in messages:
-        counts.observe_message(encode(message))
-    assert counts.rejected == expected
-
-
-def test_the_status_answer_counts_as_a_message_and_junk_does_not():
-    counts = inbound.EdgeCounts()
-    counts.observe_message(encode(health(1, 1.0)))
-    status = {**msgspec.to_builtins(health(2, 2.0, stale=1)), "version": "1", "manifest": {}}
-    for answer in (msgspec.json.encode(status), b"junk"):
-        counts.observe_status(answer)
-    for payload in (b"junk", bytes(70_000)):
-        counts.observe_message(payload)
-    assert counts.rejected == {"stale": 1}
-    assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
+def test_what_an_edge_runtime_rejected_in_a_drive_is_the_growth_of_its_counts(before, after, grown):
+    first, last = (
+        EdgeStatus(**msgspec.structs.asdict(one), manifest=MANIFEST) for one in (before, after)
+    )
+    assert last.rejected_since(first) == grown

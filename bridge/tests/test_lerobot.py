@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 from bridge.messages import Scene, encode_scene
-from bridge.recording import RawImage
+from bridge.recording import RawImage, whole_recording
 from bridge.rerun import free_port
 from bridge.tests import recordings
 from bridge.tests.recordings import heard
@@ -41,7 +41,7 @@ FILE = "chunk-000/file-000"
 
 
 def recorded(path, task):
-    with recordings.writing(path) as writer:
+    with whole_recording(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for (episode, step), mode in STEPS.items():
@@ -97,7 +97,7 @@ def test_a_data_set_holds_what_was_seen_and_commanded(tmp_path, capsys):
 def drive_of(path, entry, values, action=0.5):
     """A recording of answered states, each of one array as bytes."""
     task = msgspec.structs.replace(ROVER, observation={"a": entry}, action=ACTIONS[:1])
-    with recordings.writing(path) as writer:
+    with whole_recording(path) as writer:
         scene = Scene(episode=0, step=0, sim_time_s=0.0, task=task)
         writer.write(heard("scene", encode_scene({}, scene)))
         for step, value in enumerate(values):

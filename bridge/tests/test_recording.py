@@ -10,7 +10,6 @@ import signal
 import time
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -27,9 +26,9 @@ from mcap.writer import MCAP0_MAGIC
 from bridge import ports
 from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
-from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe
+from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe, whole_recording
 from bridge.replay import RecordedDrive, replay
-from bridge.tests.recordings import chunks, flip, health, heard, record_drive, start_record, writing
+from bridge.tests.recordings import chunks, flip, health, heard, start_record
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.config import Config
 from edge_runtime.manifest import Entry, Task
@@ -75,7 +74,7 @@ def test_the_picture_is_what_the_policy_saw_and_may_have_the_name_of_a_message(t
     frames = bytes(range(256)) * (SIZE // 256) + bytes(SIZE % 256)
     place: dict[str, Any] = {"episode": 0, "step": 3, "sim_time_s": 0.3}
     task = msgspec.structs.replace(TASK, observation={"state": TASK.observation["frames"]})
-    with writing(tmp_path / "runs" / "a.mcap") as writer:
+    with whole_recording(tmp_path / "runs" / "a.mcap") as writer:
         # It says how to read the states.
         writer.write(heard("scene", encode_scene({}, Scene(**place, task=task))))
         state = encode(make_state(3, observation={"state": frames}))
@@ -93,7 +92,7 @@ def test_the_picture_is_what_the_policy_saw_and_may_have_the_name_of_a_message(t
 
 
 def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
-    with writing(tmp_path / "a.mcap") as writer:
+    with whole_recording(tmp_path / "a.mcap") as writer:
         writer.write(heard("state", b"junk"))
         writer.write(Heard("phil/v/state", "state", b"", 2, MAX_STATE_BYTES + 1))
         writer.write(heard("alive", b"\x01"))
@@ -113,7 +112,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
         encode_scene({"vehicles": []}, Scene(episode=1, step=1, sim_time_s=0.1)),
         encode_scene({}, Scene(episode=1, step=1, sim_time_s=0.1, task=ODD)),
     ]  # fmt: skip
-    with writing(tmp_path / "a.mcap") as writer:
+    with whole_recording(tmp_path / "a.mcap") as writer:
         for number in range(3000):
             payload = bytearray(good[number % len(good)])
             for _ in range(number // 1000):
@@ -128,15 +127,8 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     assert list(replay(drive, policy, Config()))
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("drive")
-    recording = record_drive(folder, SLOW_TOY, make_policy(folder))
-    return recording, read(folder / "report.json")
-
-
 def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
-    recording, report = drive
+    recording, _, report = drive
     steps = report["per_episode"][0]["steps"]
     with recording.open("rb") as stream:
         found = make_reader(stream, validate_crcs=True).iter_messages()
@@ -151,7 +143,8 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
 
 @pytest.mark.parametrize("kind", [State, Command, Health, Scene, RawImage, Log])
 def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
-    schema = msgspec.json.decode(describe(kind).data)
+    name_of_kind, text = describe(kind)
+    schema = msgspec.json.decode(text)
     assert schema["type"] == "object"  # Foxglove takes no other.
     kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int,
              "number": int | float, None: dict}  # fmt: skip
@@ -159,7 +152,7 @@ def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
         copies = [
             json.loads(message.data)
             for told, _, message in make_reader(stream).iter_messages()
-            if told is not None and told.name == describe(kind).name
+            if told is not None and told.name == name_of_kind
         ]
     assert copies
     for copy in copies:
@@ -167,53 +160,46 @@ def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
             assert isinstance(value, kinds[schema["properties"][name].get("type")]), name
 
 
-def test_a_kill_loses_little(tmp_path):
-    """Half a second at most on an idle machine."""
-    endpoint, recording = free_endpoint(), tmp_path / "cut.mcap"
-    with (
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime"),
-        start_record(endpoint, recording) as run,
-        start_edge(endpoint, make_policy(tmp_path)),
-    ):
-        wait_until(lambda: len(states_in(recording)) > 10, "a second")
-        time.sleep(0.7)  # Just after a flush there would be nothing to lose.
-        run.send(signal.SIGKILL)
-        killed_ns = time.time_ns()
-        run.wait()
-    states = states_in(recording)
-    assert (killed_ns - states[-1][0]) * 1e-9 < 2.0
-    assert [state.step for _, state in states] == list(range(len(states)))
-
-
 @pytest.mark.parametrize("keep", [0.2, 0.9, 0.999])
 def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
-    recording, _ = drive
+    recording, *_ = drive
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
     whole, part = states_in(recording), states_in(torn)
     assert part == whole[: len(part)]
     read_again = Recording(torn)
     collections.deque(read_again.messages(), maxlen=0)
-    assert (read_again.cut_off, read_again.is_damaged) == (True, False)
+    assert read_again.trouble() == "was cut off"
 
 
-def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
-    """A limit on the file's size stands in for the disk: the same error path of write(2)."""
-    endpoint, recording = free_endpoint(), tmp_path / "full.mcap"
+def test_a_kill_loses_little_and_a_full_disk_nothing_that_was_written(tmp_path):
+    """Half a second at most on an idle machine.
+
+    A limit on the file's size stands in for the disk: the same error path of write(2).
+    """
+    endpoint, cut, full = free_endpoint(), tmp_path / "cut.mcap", tmp_path / "full.mcap"
     out = tmp_path / "r.json"
     with (
-        start_simulate(endpoint, out, SLOW_TOY) as run,
-        start_record(endpoint, recording) as recorder,
+        start_simulate(endpoint, out, SLOW_TOY, "--episodes", "2") as run,
+        start_record(endpoint, cut) as killed,
+        start_record(endpoint, full) as recorder,
         start_edge(endpoint, make_policy(tmp_path)),
     ):
-        wait_until(lambda: states_in(recording), "the first states")
-        written, full = states_in(recording), recording.stat().st_size + 100
-        resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (full, full))
+        wait_until(lambda: len(states_in(cut)) > 10 and states_in(full), "a second")
+        written, size = states_in(full), full.stat().st_size + 100
+        resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size, size))
+        time.sleep(0.7)  # Just after a flush there would be nothing to lose.
+        killed.send(signal.SIGKILL)
+        killed_ns = time.time_ns()
         assert recorder.wait() == 1, recorder.errors
         assert run.wait() == 0, run.errors
+    states = states_in(cut)
+    assert (killed_ns - states[-1][0]) * 1e-9 < 2.0
+    places = [(state.episode, state.step) for _, state in states]
+    assert places == [divmod(number, 61) for number in range(len(places))]
     (line,) = recorder.errors.splitlines()
     assert "File too large" in line
-    assert states_in(recording)[: len(written)] == written
+    assert states_in(full)[: len(written)] == written
     assert read(out)["per_episode"][0]["steps"] == 60  # The loop went on to its end.
 
 
@@ -228,16 +214,12 @@ def test_a_disk_that_is_full_at_the_start_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def listen(listener, writer, linger_s):
-    ports._listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=linger_s))
-
-
 def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
     """Not even while the writer is in the middle of one."""
     listener, path = WireListener(), tmp_path / "a.mcap"
     monkeypatch.setattr(listener, "next", lambda _: heard("state", encode(make_state(0))))
 
-    with writing(path) as writer, quit_on_signals(listener.stop):
+    with whole_recording(path) as writer, quit_on_signals(listener.stop):
         copy = writer._copies.write
 
         def signalled(one):
@@ -245,7 +227,7 @@ def test_a_signal_cuts_no_message_in_two(tmp_path, monkeypatch):
             copy(one)
 
         monkeypatch.setattr(writer._copies, "write", signalled)
-        listen(listener, writer, 9.0)
+        ports._listen(listener, writer, 9.0)
     assert [topic for topic, _, _ in told_in(path)] == ["phil/v/state", "view/v/state"]
 
 
@@ -270,8 +252,8 @@ def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
         return next(said)  # They come to an end where it listens on.
 
     monkeypatch.setattr(listener, "next", hear)
-    with writing(tmp_path / "drive.mcap") as writer:
-        listen(listener, writer, 0.05)
+    with whole_recording(tmp_path / "drive.mcap") as writer:
+        ports._listen(listener, writer, 0.05)
     assert writer.messages > 0
 
 
@@ -294,7 +276,6 @@ def test_only_the_damaged_chunk_is_lost(tmp_path, number):
     assert told_in(copy) == whole[:first] + whole[first + sizes[number] :]
     recording = Recording(copy)
     assert list(recording.messages())
-    assert (recording.damaged_places, recording.cut_off) == (1, False)
     assert recording.trouble() == "has 1 damaged place"
 
 
@@ -310,7 +291,7 @@ def test_no_change_of_bytes_makes_a_message_or_loses_one_unsaid(tmp_path):
     """In two chunks and an index: each kind of record that `record` writes."""
     small, path = tmp_path / "small.mcap", tmp_path / "changed.mcap"
     payloads = {"state": encode(make_state(1)), "command": encode(make_command(1))}
-    with writing(small) as writer:
+    with whole_recording(small) as writer:
         for number, (topic, payload) in enumerate(payloads.items()):
             writer.write(heard(topic, payload, number))
             writer.flush()

@@ -1,14 +1,11 @@
-"""What is said of a drive: a line an episode, the last line, and a vehicle's lag."""
+"""What is said of a drive: a line an episode, and the last line."""
 
-import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from bridge import report as reports
-from bridge.report import ProgressBar, VehicleLog
-from hil_tests.testing.messages import make_feedback
+from bridge.report import ProgressBar
 
 RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, None, 123)
 FACTS = {"scenario": "toy", "condition": "nominal", "policy_ids": ["p"], "seed": 0}
@@ -55,18 +52,3 @@ def test_without_a_terminal_progress_is_a_line(capsys):
         bar.advance({"return": "2.0"}, 4)
         bar.advance({"return": "3.0"}, 10)  # An episode is driven to its end.
     assert capsys.readouterr().err == "training: 14/10  return 3.0\n"
-
-
-@pytest.mark.parametrize("lag_s", [0.0, 0.2])
-def test_the_lag_of_a_speed_is_found(lag_s):
-    log = VehicleLog()
-    for time_s in np.arange(0, 10, 0.05):
-        asked, reached = (1 + math.sin(2 * (time_s - late_s)) for late_s in (0.0, lag_s))
-        speeds = {"speed_mps": reached, "commanded_speed_mps": asked}
-        log.observe(make_feedback(0, sent_ns=round((5 + time_s) * 1e9), **speeds))
-    # What a vehicle does that brakes by itself is not what it was asked for.
-    log.observe(make_feedback(0, commanded_speed_mps=9.0, self_braking=True, faults=["unheard"]))
-    report = log.report()
-    assert report["lag_ms"] == {"speed": pytest.approx(1e3 * lag_s, abs=1e3 * reports.LAG_STEP_S)}
-    assert (report["name"], report["faults"]) == ("robot", {"unheard": 1})
-    assert VehicleLog().report()["lag_ms"] == {"speed": None}

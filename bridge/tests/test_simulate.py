@@ -13,32 +13,18 @@ import gymnasium
 import numpy as np
 import pytest
 
-from bridge.environments import (
-    Adapter,
-    describe,
-    known_stops,
-    make_environment,
-    say_once,
-    scene_of,
-)
+from bridge.environments import Adapter, describe, known_stops, make_environment, say_once, scene_of
 from bridge.inbound import NO_COMMAND, Decision
 from bridge.messages import Origin
 from bridge.simulate import EpisodeRunner
 from bridge.tests.odd import odd
-from bridge.tests.recordings import bridge_status, record_drive, rerun, wait_until_driving_steadily
+from bridge.tests.recordings import bridge_status, record_drive, rerun
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
-from hil_tests.testing.drives import (
-    SLOW_TOY,
-    TOY,
-    make_policy,
-    read,
-    start_edge,
-    start_simulate,
-)
+from hil_tests.testing.drives import SLOW_TOY, TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import STEERING, write_policy, write_rover
 
@@ -60,28 +46,6 @@ def drove_as_in_process(report, policy):
         outcome, actions = drive_in_process(policy, row["seed"])
         assert row["outcome"] == outcome
         np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
-
-
-def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path):
-    policy, endpoint = make_policy(tmp_path, "constant", 0.1), free_endpoint()
-    out = tmp_path / "killed.json"
-    with start_simulate(endpoint, out, SLOW_TOY, "--clock", "realtime") as run:
-        with start_edge(endpoint, policy) as edge:
-            # One that had stopped by itself would not be missed.
-            wait_until_driving_steadily(edge)
-            edge.kill()
-        # The brake is due within 3 T; a new edge runtime may be there before.
-        time.sleep(0.5)
-        # Another board with another policy takes over in the same episode.
-        with start_edge(endpoint, make_policy(tmp_path, "constant", 0.2)):
-            assert run.wait() == 0, run.errors
-    report = read(out)
-    assert len(report["policy_ids"]) == 2
-    # On a busy machine the edge runtime may have stopped for a reason of its own, too.
-    event = next(row for row in report["safe_stop_events"] if row["reason"] == "no_command")
-    (row,) = report["per_episode"]
-    assert row["actions"][event["step"]] == [-1.0]
-    assert row["actions"][-1] == pytest.approx([0.2])
 
 
 def test_an_interrupted_run_writes_no_report(tmp_path):
@@ -223,8 +187,7 @@ class ScriptedClock:
         reason = NO_COMMAND if braking else ""
         steering = 0.04 if state.step < self.drive else -0.02
         command = make_command(state.step, action=[steering])
-        ridden = int(state.step == 3)
-        return Decision(command, fresh=True, brake_reason=reason, ridden=ridden)
+        return Decision(command, fresh=True, brake_reason=reason)
 
     def newest_answer(self):
         return None
@@ -410,19 +373,11 @@ def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     assert event.reason == NO_COMMAND
     assert result.actions[clock.brake_until] == pytest.approx([-0.02])
     assert clock.states[clock.brake_until + 10].speed_mps > 1.0
-    assert runner.ridden_steps == 1
     # The next episode begins with the brake released, and holds no action of the last one.
     clock.drive, clock.brake_until = 0, 5
     result = runner.run(1, seed=3)
     assert result.actions[:1] == [[0.0]]
     assert clock.states[12].speed_mps > 3.5
-
-
-@pytest.mark.parametrize(("options", "speed_mps"), [({}, 5.0), ({"standing": True}, 0.0)])
-def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, options, speed_mps):
-    clock = ScriptedClock()
-    run(environment, clock, **options)
-    assert clock.states[0].speed_mps == pytest.approx(speed_mps, abs=1.0)
 
 
 def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path):

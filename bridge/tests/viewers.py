@@ -29,7 +29,8 @@ def in_place(kind, folder, monkeypatch):
     fake.chmod(0o755)
     monkeypatch.setenv("RERUN_CLI_PATH", str(fake))
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr("bridge.rerun.FLUSH_S", 1.0)
+    monkeypatch.setattr("bridge.rerun.FLUSH_S", 0.5)
+    monkeypatch.setattr("bridge.rerun.END_S", 0.3)
     if kind == "never listens":
         monkeypatch.setattr("bridge.rerun.START_S", 1.0)
     yield

@@ -148,16 +148,17 @@ def garbage_feedback(rig: Rig, number: int) -> Try:
     return Try()
 
 
-@drives_on(_COUNTED, counted="simulator", flows=False)
+@drives_on()
 def garbage_health(rig: Rig, number: int) -> Try:
     """10,000 random and mutated health messages."""
     wait_until(lambda: rig.timeline.health, "a health message")
-    return _put_garbage(rig, "health", rig.timeline.health[-1], number)
+    _put_garbage(rig, "health", rig.timeline.health[-1], number)
+    return Try()
 
 
 def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
-    decode, prefix = DECODERS[topic], "health_" if topic == "health" else ""
+    decode = DECODERS[topic]
     legal = "foreign_session" if topic in ("state", "command") else ""
     if topic == "state":
         decode = Layout(rig.task).decode
@@ -166,7 +167,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
     for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):
         rig.probe.put(topic, payload)
         found = decode(payload)
-        sent[f"{prefix}{found.reason.value}" if isinstance(found, Rejection) else legal] += 1
+        sent[found.reason.value if isinstance(found, Rejection) else legal] += 1
         if number % 25 == 0:
             time.sleep(max(0.0, begin_s + number / PER_S - time.monotonic()))
     del sent[""]

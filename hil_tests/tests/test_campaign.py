@@ -103,5 +103,4 @@ def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it(tmp_path):
             break
     vehicle = report["vehicle"]
     assert (report["loop"], vehicle["name"]) == ("vehicle", "hunter")
-    assert 0.0 < vehicle["lag_ms"]["speed"] < 1000.0
     assert report["rejected_by_simulator"] == {}

@@ -18,8 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from bridge.outcomes import Estimate, mean_estimate
 from bridge.report import markdown_table
-from bridge.statistics import Estimate, mean_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer import experiments as plan
