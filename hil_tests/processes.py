@@ -188,14 +188,15 @@ def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
         watching.join()
 
 
-def run_command(*arguments: str) -> None:
+def run_command(*arguments: object) -> None:
     """Print ``python -m ...`` and run it to its end; UserError where it failed and has said why."""
-    print(f"\n$ python -m {shlex.join(arguments)}", flush=True)
+    words = ["python", "-m", *map(str, arguments)]
+    print(f"\n$ {shlex.join(words)}", flush=True)
     # Not `subprocess.call`: after ^C that kills a command which may still save something.
-    with subprocess.Popen([sys.executable, "-m", *arguments]) as process:
+    with subprocess.Popen([sys.executable, *words[1:]]) as process:
         status = process.wait()
     if status:
-        raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
+        raise UserError(f"{' '.join(words[:4])} ended with status {status}")
 
 
 def drive_shown(
