@@ -28,7 +28,7 @@ from bridge.statistics import success_estimate
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.drivers import Drivers
+from hil_tests.envelope import Drivers
 from hil_tests.faults.rows import ROWS, Row
 from hil_tests.faults.run import run_faults
 from trainer.training.metrics import write_figure
@@ -132,11 +132,11 @@ def render_faults(report: Found) -> list[str]:
         tries = f"{row['tries']} (+{row['disturbed']} again)" if row["disturbed"] else row["tries"]
         times = []
         for kind in ("reaction", "recovery"):
-            spread, limit = row[f"{kind}_ms"] or {}, row[f"{kind}_limit_ms"]
-            times.append(" / ".join(f"{value:.0f}" for value in spread.values()) or "-")
+            spread, limit = row[f"{kind}_ms"].values(), row[f"{kind}_limit_ms"]
+            times.append(" / ".join(f"{value:.0f}" for value in spread) or "-")
             times.append("-" if limit is None else f"{limit:.0f}")
-        late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
-        missed = [f"{count} {name} late" for name, count in late.items() if count]
+        late = {kind: row[f"{kind}_late"] for kind in ("reaction", "recovery")}
+        missed = [f"{kind} late {count} times" for kind, count in late.items() if count]
         missed += [f"{len(row[it])} {it}" for it in ("unsafe", "crashes", "wrong") if row[it]]
         counted = sum(row["rejected"].values())
         met = f"met, {counted:,} rejected and counted" if counted else "met"

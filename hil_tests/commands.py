@@ -44,7 +44,6 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--env", default="left_turn", help="scenario, gymnasium id or MODULE:ID")
     _add_common(parser, "ENV")
     add("--promise", type=inner, default=0.95, help="success rate that the policy must keep")
-    add("--confidence", type=inner, default=0.95, help="statistical confidence of each limit")
 
 
 def _add_common(parser: argparse.ArgumentParser, env: str) -> None:

@@ -103,7 +103,7 @@ def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault]
     The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
     rejected.
     """
-    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True}
+    through = {"goes_on": True, "recovery_limit_s": None, "flows": True}
     return fault(expected, **{**through, **options})
 
 

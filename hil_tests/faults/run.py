@@ -26,7 +26,7 @@ from hil_tests.testing.policies import TASK, write_policy
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-POLICIES = {"steady": ("constant", 0.6), "full": ("constant", 1.0), "mean": ("mean", 0.0)}
+POLICIES = {"steady": ("constant", 0.6), "mean": ("mean", 0.0)}
 """Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
 frames, the brake on all others."""
 
@@ -151,35 +151,28 @@ def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, An
     For another T than 0.1 s a reaction may take ``later_s`` longer, which is the difference of 2 T,
     and a recovery that of the five states that it takes.
     """
-    times = {
-        **_times("reaction", "reactions", outcome, row.reaction_limit_s, later_s),
-        **_times("recovery", "recoveries", outcome, row.recovery_limit_s, 2.5 * later_s),
-    }
-    late = times["reactions_late"] + times["recoveries_late"]
+    report: dict[str, Any] = {"name": row.name, "done": row.done, "expected": row.expected}
+    report |= {"tries": len(outcome.tries), "disturbed": outcome.disturbed}
+    late = 0
+    for kind, limit_s, more_s in (
+        ("reaction", row.reaction_limit_s, later_s),
+        ("recovery", row.recovery_limit_s, 2.5 * later_s),
+    ):
+        most_ms = math.inf if limit_s is None else round((limit_s + more_s) * 1e3, 1)
+        times_s = [getattr(each, f"{kind}_s") for each in outcome.tries]
+        times_ms = [round(time_s * 1e3, 1) for time_s in times_s if time_s is not None]
+        figures: dict[str, Any] = {"min": min, "median": statistics.median, "max": max}
+        report[f"{kind}_ms"] = {name: of(times_ms) for name, of in figures.items() if times_ms}
+        report[f"{kind}_limit_ms"] = None if limit_s is None else most_ms
+        report[f"{kind}_late"] = sum(time_ms > most_ms for time_ms in times_ms)
+        late += report[f"{kind}_late"]
     wrong = [text for each in outcome.tries for text in each.wrong]
     return {
-        **{name: getattr(row, name) for name in ("name", "done", "expected")},
-        "tries": len(outcome.tries),
-        "disturbed": outcome.disturbed,
-        **times,
+        **report,
         "reasons": dict(Counter(each.reason for each in outcome.tries if each.reason)),
         "rejected": dict(sum((Counter(each.rejected) for each in outcome.tries), Counter())),
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,
         "passed": not (late or wrong or outcome.unsafe or outcome.crashes),
-    }
-
-
-def _times(
-    kind: str, plural: str, outcome: Outcome, limit_s: float | None, later_s: float
-) -> dict[str, Any]:
-    most_ms = math.inf if limit_s is None else round((limit_s + later_s) * 1e3, 1)
-    found = [getattr(each, f"{kind}_s") for each in outcome.tries]
-    found_ms = [round(value_s * 1e3, 1) for value_s in found if value_s is not None]
-    figures: dict[str, Any] = {"min": min, "median": statistics.median, "max": max}
-    return {
-        f"{kind}_ms": {name: of(found_ms) for name, of in figures.items()} if found_ms else None,
-        f"{kind}_limit_ms": None if limit_s is None else most_ms,
-        f"{plural}_late": sum(value_ms > most_ms for value_ms in found_ms),
     }

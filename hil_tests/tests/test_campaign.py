@@ -12,7 +12,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests import campaign
 from hil_tests.__main__ import main
-from hil_tests.drivers import Drivers
+from hil_tests.envelope import Drivers
 from hil_tests.faults.rig import free_bus
 from hil_tests.processes import POLICY, Process, operator, trusting
 from hil_tests.testing.drives import SHORT_TOY, read, start_simulate
@@ -61,7 +61,6 @@ def test_a_campaign_of_networks_is_the_drive_in_process(tmp_path, monkeypatch, c
 
 def test_a_step_limit_is_a_failure_where_another_drive_tells_and_silence_is_an_error():
     drivers: Any = Drivers.__new__(Drivers)
-    drivers.driven = 0
 
     def drive(ends):
         drivers.map = lambda *_, **__: [
@@ -83,7 +82,7 @@ def drive_hunter(folder):
     endpoint, bus, config = free_endpoint(), free_bus(), folder / "edge.toml"
     config.write_text(f'[vehicle.hunter]\nbus = "{bus}"\n')
     common = ("--vehicle-id", "hunter")
-    chassis = ("hil_tests", "mock_hunter", "--bus", bus, "--set=dead_time_s=0.1")
+    chassis = ("hil_tests", "mock_hunter", "--bus", bus)
     edge = ("edge_runtime", "run", *trusting(POLICY, None), "--connect", endpoint, *common)
     drive = ("--clock", "realtime", "--loop", "vehicle", *common)
     with (
