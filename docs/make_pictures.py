@@ -1,6 +1,5 @@
 """Make the pictures of this folder anew: ``python docs/make_pictures.py [NAME.png ...]``."""
 
-import asyncio
 import sys
 import tempfile
 import time
@@ -16,23 +15,15 @@ from bridge.rerun import LOOPBACK, Viewer, free_port
 from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError, read_json
 from hil_tests.campaign import draw_axes
-from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
+from hil_tests.processes import POLICY, PUBLIC_KEY, drive_shown, run_command
 from trainer.environments import make_environment
 from trainer.evaluation import load_driver
-from trainer.person.tests.browser import (
-    PERSON_DRIVES,
-    POLICY_DRIVES,
-    open_browser,
-    quit_sitting,
-    until,
-)
 from trainer.training.metrics import read_metrics, write_figure
 from trainer.util import kept
 
 MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
-TAKE_OVERS = 12  # Before the picture of the cockpit: the coach needs something to say
 
 
 def moment(scenario: str) -> tuple[Any, Any]:
@@ -47,11 +38,11 @@ def moment(scenario: str) -> tuple[Any, Any]:
     return env, frames
 
 
-def from_above(out: Path, _work: Path) -> None:
+def from_above(out: Path, _: Path) -> None:
     Image.fromarray(moment(out.stem)[0].render()).save(out)
 
 
-def policy_sees(out: Path, _work: Path) -> None:
+def policy_sees(out: Path, _: Path) -> None:
     """Draw both frames of both scenarios, enlarged pixel by pixel."""
     figure = Figure(figsize=(8.6, 5.6), layout="constrained")
     for panels, scenario in zip(figure.subplots(len(MOMENTS), 2), MOMENTS, strict=True):
@@ -63,7 +54,7 @@ def policy_sees(out: Path, _work: Path) -> None:
     write_figure(figure, out)
 
 
-def success_against_latency(out: Path, _work: Path) -> None:
+def success_against_latency(out: Path, _: Path) -> None:
     shipped = Path(kept("results/latency/left_turn/shipped.json"))
     write_figure(draw_axes(read_json(shipped, "latency report")["latency"]), out)
 
@@ -111,35 +102,10 @@ def screenshot(out: Path, rrd: Path, timeline: str, **moment: Any) -> None:
         viewer.end()
 
 
-def cockpit(out: Path, work: Path) -> None:
-    """Show a training in the browser, in the middle of a take-over; it needs Chromium."""
-    words = "--human web --seed 1 --set evaluate_every_steps=60 --set evaluation_runs=10"
-    with Process("trainer", "train", *words.split(), "--out", str(work / "cockpit")) as training:
-        training.wait_for_line("cockpit: open ")
-        url = next(line for line in training.output.splitlines() if line.startswith("cockpit: "))
-        asyncio.run(_take_over(url.split()[-1], out))
-        training.succeed()
-
-
-async def _take_over(url: str, out: Path) -> None:
-    async with open_browser() as page:
-        await page.goto(url)
-        for key, seconds in [("ArrowUp", 1.5)] * TAKE_OVERS + [("ArrowDown", 0.5)]:
-            await until(page, POLICY_DRIVES)
-            await asyncio.sleep(2.5)
-            await page.keyboard.down(key)
-            await until(page, PERSON_DRIVES)
-            await asyncio.sleep(seconds)
-            await page.screenshot(path=out, full_page=True)  # The last one stays.
-            await page.keyboard.up(key)
-        await quit_sitting(page)
-
-
 PICTURES: dict[str, Callable[[Path, Path], None]] = {
     "left_turn.png": from_above,
     "congestion.png": from_above,
     "policy_sees.png": policy_sees,
-    "cockpit.png": cockpit,
     "success_against_latency.png": success_against_latency,
     "rerun.png": rerun_loop,
     "rerun_training.png": rerun_training,
@@ -149,8 +115,8 @@ PICTURES: dict[str, Callable[[Path, Path], None]] = {
 
 def main(names: list[str], out: Path = Path(__file__).parent) -> int:
     """Make the named pictures, or all."""
-    if unknown := set(names) - set(PICTURES):
-        raise UserError(f"no picture {unknown.pop()!r}: choose from {', '.join(PICTURES)}")
+    if not set(names) <= set(PICTURES):
+        raise UserError(f"choose from {', '.join(PICTURES)}")
     with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
         for name in names or PICTURES:
             PICTURES[name](out / name, Path(folder))
