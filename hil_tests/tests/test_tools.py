@@ -75,7 +75,7 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
         return subprocess.run(line, capture_output=True, text=True, check=True, env=path).stdout
 
     run("install", bundle, "--trust", keys / "policy.pub", "--service", "none")
-    status = json.loads(run("status", "--json"))
+    status = json.loads(run("status"))
     words = [opt / "current/bin/phil-edge", "run", "--config", "config.toml"]
     with subprocess.Popen(words, cwd=opt / "current", stderr=subprocess.DEVNULL) as runtime:
         try:
@@ -87,7 +87,7 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
         finally:
             runtime.terminate()
     run("uninstall")
-    assert (status["whole"], status["service"]) == ("yes", "not run by the installer")
+    assert (status["is_whole"], status["service"]) == (True, "not run by the installer")
     assert episode["policy_id"] == status["policy_id"]
     assert episode["answered_states"] > 0
     # A busy machine's; and states that came before the runtime had seen the listener's certificate.
