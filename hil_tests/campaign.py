@@ -29,8 +29,8 @@ from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
 from hil_tests.envelope import Drivers
-from hil_tests.faults.rows import ROWS, Row
-from hil_tests.faults.run import run_faults
+from hil_tests.faults.rows import Row
+from hil_tests.faults.run import ROWS, run_faults
 from trainer.training.metrics import write_figure
 from trainer.util import cores, kept
 

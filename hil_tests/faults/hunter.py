@@ -23,7 +23,7 @@ from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.inside import BRIGHT
 from hil_tests.faults.observe import REACTION_LIMIT_S, SET_POINT, SPEED, STATUS, CanMonitor
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import Try, at_any_phase, fault
+from hil_tests.faults.rows import Row, Try, at_any_phase
 from hil_tests.mock_hunter import BITS, FAULTS, MODELS
 
 QUIET_S = 0.5
@@ -58,12 +58,12 @@ def speed_mps(data: bytes) -> float:
     return int.from_bytes(data[:2], "big", signed=True) * 1e-3
 
 
-def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
+def at_fault(expect: Expect, rig: Rig) -> Try:
     """Judge that it stops for the fault, stands when it is over, and drives once re-armed."""
     chassis, monitor = rig.chassis, rig.monitor
     rig.switch(BRIGHT, "")
     rig.wait_until_driving(lambda: any(speed_mps(d) > _FAST_MPS for _, d in monitor.of(SPEED)[-3:]))
-    at_any_phase(number)
+    at_any_phase(rig)
     on_s = chassis.switch(expect.name, True)
     if expect.name == "stuck":  # Nobody can know before it is asked for another speed.
         rig.switch(BRIGHT, None)
@@ -132,9 +132,10 @@ _EXPECTS = (
     Expect("estop", "emergency stop", STATUS, lambda data: data[0] == 1),
     *(Expect(name, bit.words, STATUS, lambda data: any(data[4:6])) for name, bit in BITS.items()),
 )  # fmt: skip
-for _expect in _EXPECTS:
-    fault(
-        "set-point 0 on the bus, vehicle_fault; stands until re-armed", f"hunter_{_expect.name}",
-        f"Hunter: {FAULTS[_expect.name]}", rig={"vehicle": "hunter"}, flows=True,
-        reaction_limit_s=REACTION_LIMIT_S + _LATER_S.get(_expect.name, 0.0), policy="mean",
-    )(partial(at_fault, _expect))  # fmt: skip
+ROWS = [
+    Row(f"hunter_{expect.name}", f"Hunter: {FAULTS[expect.name]}",
+        "set-point 0 on the bus, vehicle_fault; stands until re-armed", partial(at_fault, expect),
+        REACTION_LIMIT_S + _LATER_S.get(expect.name, 0.0), rig={"vehicle": "hunter"},
+        policy="mean", flows=True)
+    for expect in _EXPECTS
+]  # fmt: skip

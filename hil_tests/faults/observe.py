@@ -36,9 +36,6 @@ RECOVERY_LIMIT_S = 1.0
 SET_POINT, STATUS, SPEED = HEARD = (0x111, 0x211, 0x221)
 _LOOPBACK = "127.0.0.1"
 _CHUNK_BYTES = 4096  # Small, so that a throttled relay hands over bit by bit
-_STATE_BYTES = 20
-"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
-(then 47 bytes for each are on the link)."""
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
 
@@ -172,7 +169,6 @@ class Relay:
     """Passes TCP on from ``endpoint`` to ``target``, an endpoint of this machine."""
 
     def __init__(self, target: str) -> None:
-        self.last_state_s = -math.inf  # When the last bytes of a state went to whoever connected
         self._target = (_LOOPBACK, int(target.rpartition(":")[2]))
         self._flowing = threading.Event()
         self._flowing.set()
@@ -236,8 +232,6 @@ class Relay:
                 if to_caller:
                     time.sleep(len(data) / self._bytes_per_s)
                 sink.sendall(data)
-                if to_caller and len(data) > _STATE_BYTES:
-                    self.last_state_s = time.monotonic()
         _shut(source)
         _shut(sink)
 

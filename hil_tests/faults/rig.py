@@ -71,6 +71,7 @@ class Rig:
         sender: bool = False,
         ride_s: float = 0.0,
     ) -> None:
+        self.number = 0  # Of the try
         self.timeline = DriveTimeline()
         self.crashes: list[str] = []
         self.task, self.period_s = task, task.control_period_s
@@ -143,11 +144,7 @@ class Rig:
     def switch(self, name: str, word: str | None) -> None:
         """Write a word into one of the files that the faulty ends look at; None removes it."""
         path = self._directory / name
-        if word is None:
-            path.unlink(missing_ok=True)
-            return
-        path.with_suffix(".new").write_text(word)
-        path.with_suffix(".new").replace(path)
+        path.unlink(missing_ok=True) if word is None else path.write_text(word)
 
     def try_rearm(self) -> bool:
         """Ask once for a re-arm; return whether the runtime accepted it."""

@@ -16,7 +16,7 @@ from typing import Any
 
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
+from hil_tests.faults import hunter, messages, rows
 from hil_tests.faults.observe import later_s, longest_gap_s
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase
@@ -26,6 +26,7 @@ from hil_tests.testing.policies import TASK, write_policy
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
+ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS]
 POLICIES = {"steady": ("constant", 0.6), "mean": ("mean", 0.0)}
 """Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
 frames, the brake on all others."""
@@ -77,10 +78,10 @@ def run_faults(
 
         found: dict[str, dict[str, Any]] = {}
         for alone in (False, True):
-            rows = [row for row in chosen if row.alone == alone]
+            some = [row for row in chosen if row.alone == alone]
             with ThreadPoolExecutor(1 if alone else jobs) as pool:
                 try:
-                    found.update(zip((row.name for row in rows), pool.map(do, rows), strict=True))
+                    found.update(zip((row.name for row in some), pool.map(do, some), strict=True))
                 except BaseException:  # ^C, too
                     ended.set()
                     raise
@@ -106,14 +107,14 @@ def use_rig(
     with rig:
         usable = True
         while usable and len(outcome.tries) < tries and not ended.is_set():
-            number, begin_s = len(outcome.tries), time.monotonic()
+            rig.number, begin_s = len(outcome.tries), time.monotonic()
             try:
                 rig.wait_until_driving()
-                at_any_phase(number)
+                at_any_phase(rig)
                 begin_s = time.monotonic()
-                done, usable = do_fault(row, rig, number), row.counted != "simulator"
+                done, usable = do_fault(row, rig), row.counted != "simulator"
             except (OSError, UserError) as error:  # a time-out, or a process that is gone
-                done, usable = Try(wrong=[f"try {number}: {error}"]), False
+                done, usable = Try(wrong=[f"try {rig.number}: {error}"]), False
             gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
             stalled = row.flows and gap_s > STALLED_PERIODS * rig.period_s
             if stalled and usable and outcome.disturbed < MOST_DISTURBED:
@@ -125,11 +126,11 @@ def use_rig(
     outcome.crashes += rig.crashes
 
 
-def do_fault(row: Row, rig: Rig, number: int) -> Try:
+def do_fault(row: Row, rig: Rig) -> Try:
     """Do the fault of a row once, and judge it where the drive was to go on."""
     before = rig.edge_counts() if row.counted == "edge" else Counter()
     begin_s = time.monotonic()
-    done = row.run(rig, number)
+    done = row.run(rig)
     if not row.goes_on:
         return done
     end_s = time.monotonic()

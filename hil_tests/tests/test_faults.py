@@ -12,13 +12,13 @@ from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.observe import REACTION_LIMIT_S, DriveTimeline
 from hil_tests.faults.rig import ChassisProcess
-from hil_tests.faults.rows import ROWS, Row, Try
-from hil_tests.faults.run import Outcome, report_row, run_faults, use_rig
+from hil_tests.faults.rows import Row, Try
+from hil_tests.faults.run import ROWS, Outcome, report_row, run_faults, use_rig
 from hil_tests.mock_hunter import FAULTS
 from hil_tests.testing.policies import TASK
 
 PLACE = ("session", 0, 7)
-ROW = Row("name", "done", "expected", lambda rig, number: Try())
+ROW = Row("name", "done", "expected", lambda rig: Try())
 
 
 def command(**changes):
