@@ -150,9 +150,9 @@ def _link_fails(
     stop_s, reason = rig.logged_stop(begin_s)
     rig.own_brake_s(begin_s)
     sleep_until(begin_s + max(lasts_s, 2.5 * rig.period_s))  # longer than silence
+    cut_until_s = time.monotonic()
     restore()
-    ended_s = time.monotonic()
-    recovered_s, wrong = rig.recovered_after_s(ended_s), _stopped_first(rig, ended_s)
+    recovered_s, wrong = rig.recovered_after_s(time.monotonic()), _stopped_first(rig, cut_until_s)
     return Try(stop_s - rig.last_state_s(before_s=begin_s), recovered_s, reason, wrong)
 
 
