@@ -96,12 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
                 rows, arguments.tries, policy, lambda row: bar.advance({"row": row}),
                 arguments.jobs or cores(), arguments.public_key,
             )  # fmt: skip
-        text += ["## Faults", "", *render_faults(faults)]
+        text += ["## Faults", "", *(lines := render_faults(faults))]
         passed = faults["passed"]
-        for row in faults["rows"]:
-            for what in (*row["wrong"], *row["unsafe"], *row["crashes"]):
-                print(f"{row['name']}: {what}")
-        print("Every fault was met." if passed else "Not every fault was met.")
+        print("\n".join(line for line in lines if "MISSED" in line or not line.startswith("|")))
     write_json_out(out, result)
     write_atomic(markdown, ("\n".join(text).rstrip() + "\n").encode())
     print(f"{out} and {markdown}")
@@ -135,12 +132,11 @@ def render_faults(report: Found) -> list[str]:
             spread, limit = row[f"{kind}_ms"].values(), row[f"{kind}_limit_ms"]
             times.append(" / ".join(f"{value:.0f}" for value in spread) or "-")
             times.append("-" if limit is None else f"{limit:.0f}")
-        late = {kind: row[f"{kind}_late"] for kind in ("reaction", "recovery")}
-        missed = [f"{kind} late {count} times" for kind, count in late.items() if count]
-        missed += [f"{len(row[it])} {it}" for it in ("unsafe", "crashes", "wrong") if row[it]]
+        missed = ["late"] * (row["reaction_late"] + row["recovery_late"])
+        missed += [*row["wrong"], *row["unsafe"], *row["crashes"]]
         counted = sum(row["rejected"].values())
         met = f"met, {counted:,} rejected and counted" if counted else "met"
-        verdict = f"MISSED: {', '.join(missed)}" if missed else met
+        verdict = f"MISSED {row['name']}: {'; '.join(missed)}" if missed else met
         rows.append((row["done"], row["expected"], tries, *times, verdict))
     crashes, unsafe = report["crashes"], report["unsafe_commands"]
     return [*markdown_table(head, rows), f"{crashes} crashes and {unsafe} unsafe commands."]
@@ -159,12 +155,11 @@ def run_latency(
         for spec in specs:
             rows[spec] = make_row(spec, drivers.drive(parse_spec(spec), seeds))
             bar.advance({"network": spec})
-    told = ("name", "title", "unit", "values", "specs")
     return {
         "policy": str(policy),
         "policy_id": drivers.policy_id,
         **asked,
-        "axes": [{name: getattr(axis, name) for name in told} for axis in axes],
+        "axes": [{**axis._asdict(), "specs": axis.specs} for axis in axes],
         "rows": rows,
         "budget": budget(axes, rows, arguments.target, policy.stem),
     }

@@ -63,13 +63,13 @@ def train(folder: Path) -> None:
     human_dir, run_dir = folder / "human", folder / "run"
     if not (human_dir / "human.json").exists():  # It is written last.
         print("\n1  A person drives and takes over; the human model learns to imitate that")
-        told = ("--seed", 1, "--frames", 2, "--label-every-step", *HUMAN)
-        run_command("trainer", "human", "--out", human_dir, *told)
+        words = ("--seed", 1, "--frames", 2, "--label-every-step", *HUMAN)
+        run_command("trainer", "human", "--out", human_dir, *words)
     print("\n2  PHIL-TD3 learns to drive; the human model takes over when it must")
-    told = ("--human", human_dir, "--seed", 1, *TRAINING)
-    told += tuple(word for setting in SETTINGS for word in ("--set", setting))
-    resume = ["--resume"] * (run_dir / "config.json").exists()
-    run_command("trainer", "train", "--out", run_dir, *told, *resume)
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    settings += ["--resume"] * (run_dir / "config.json").exists()
+    told = ("--human", human_dir, "--seed", 1, *TRAINING, *settings)
+    run_command("trainer", "train", "--out", run_dir, *told)
 
 
 def drive(folder: Path, trust: tuple[str, ...]) -> dict[str, dict[str, Any]]:

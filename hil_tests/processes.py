@@ -231,9 +231,3 @@ def wait_until(
             return value
         time.sleep(poll_s)
     raise CommandTimeoutError(f"not within {timeout_s:g} s: {what}")
-
-
-def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:
-    """Return an edge runtime's options for a policy that may be unsigned."""
-    named = () if public_key is None else ("--public-key", public_key)
-    return ("--policy", str(policy), "--allow-unsigned", *named)

@@ -20,7 +20,7 @@ from hil_tests.faults import hunter, messages, rows
 from hil_tests.faults.observe import later_s, longest_gap_s
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase
-from hil_tests.processes import POLICY, trusting
+from hil_tests.processes import POLICY
 from hil_tests.testing.policies import TASK, write_policy
 
 STALLED_PERIODS = 1.5
@@ -58,11 +58,12 @@ def run_faults(
     given = load_policy(policy, public_key, allow_unsigned=True).manifest
     ended = threading.Event()  # No more tries are begun
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
-        policies = {"given": trusting(policy, public_key)}
+        policies = {"given": ["--policy", str(policy), "--allow-unsigned"]}
+        policies["given"] += ["--public-key", public_key] if public_key else []
         for kind, made in POLICIES.items():
             path = Path(folder, f"{kind}.onnx")
             write_policy(path, *made)
-            policies[kind] = trusting(path, None)
+            policies[kind] = ["--policy", str(path), "--allow-unsigned"]
 
         def do(row: Row) -> dict[str, Any]:
             task, outcome = given if row.policy == "given" else TASK, Outcome()

@@ -15,6 +15,7 @@ from hil_tests.faults.rig import ChassisProcess
 from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, report_row, run_faults, use_rig
 from hil_tests.mock_hunter import FAULTS
+from hil_tests.processes import Process, wait_until
 from hil_tests.testing.policies import TASK
 
 PLACE = ("session", 0, 7)
@@ -149,3 +150,10 @@ def test_any_movement_in_between_is_found(truth, moved):
     lines = [(0.0, f"chassis t={at} mode=can motion={motion}") for at, motion in told]
     chassis.process = Mock(lines=lines)
     assert chassis.moved_between(1.0, 2.0) == moved
+
+
+def test_a_process_has_crashed_where_nobody_ended_it():
+    with Process("json.tool", "nowhere") as failed, Process("http.server", "0") as ended:
+        wait_until(lambda: failed.has_ended, "its end")
+        ended.end()
+        assert (failed.crashed(), ended.crashed()) == (True, False)
