@@ -36,6 +36,7 @@ from trainer.util import cores, kept
 
 Found = Mapping[str, Any]  # A part of a report's JSON
 PANELS = 3  # In a row
+TARGET = 0.98  # Share of successes that a network within the budget leaves
 
 
 class Axis(NamedTuple):
@@ -161,7 +162,7 @@ def run_latency(
         **asked,
         "axes": [{**axis._asdict(), "specs": axis.specs} for axis in axes],
         "rows": rows,
-        "budget": budget(axes, rows, arguments.target, policy.stem),
+        "budget": budget(axes, rows, policy.stem),
     }
 
 
@@ -172,7 +173,7 @@ def make_row(spec: str, results: Sequence[EpisodeResult]) -> dict[str, Any]:
     return {"spec": spec, "episodes": len(results), "success": success, "outcomes": dict(outcomes)}
 
 
-def budget(axes: Sequence[Axis], rows: Found, target: float, name: str) -> dict[str, Any]:
+def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:
     """Return each axis's limit, and a sentence of them.
 
     A limit is the largest value up to which every tested one is at the target; None: not even 0.
@@ -180,14 +181,14 @@ def budget(axes: Sequence[Axis], rows: Found, target: float, name: str) -> dict[
     limits, parts = {}, []
     for axis in axes:
         points = zip(axis.values, axis.specs, strict=True)
-        holds = takewhile(lambda point: rows[point[1]]["success"]["value"] >= target, points)
+        holds = takewhile(lambda point: rows[point[1]]["success"]["value"] >= TARGET, points)
         limit = max((value for value, _ in holds), default=None)
         limits[axis.name] = limit
         most = " (the most that was tested)" if limit == axis.values[-1] else ""
         found = f"{limit:g} {axis.unit}" if limit is not None else "not even 0"
         parts.append(f"{found}{most} of {axis.title}")
-    sentence = f"{name} holds at least {100 * target:g}% success up to {'; '.join(parts)}. "
-    return {"target_success": target, "limits": limits, "sentence": f"{sentence}One at a time."}
+    sentence = f"{name} holds at least {100 * TARGET:g}% success up to {'; '.join(parts)}. "
+    return {"target_success": TARGET, "limits": limits, "sentence": f"{sentence}One at a time."}
 
 
 def render_latency(latency: Found) -> list[str]:

@@ -21,12 +21,6 @@ def campaign(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     _add_common(parser, "SCENARIO")
     add("--runs", type=cli.whole_number(2), default=100, help="episodes per network")
-    add(
-        "--target",
-        type=cli.share,
-        default=0.98,
-        help="success rate that a network must keep, 0 to 1",
-    )
     add("--only", choices=("latency", "faults"), help="run one part (default: both)")
     rows = "run only these networks and faults, by name or pattern (delay, hunter_*); an unknown"
     add("--rows", metavar="NAME,...", help=f"{rows} name lists all")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from deploy.installer import release
 from deploy.installer.release import BEFORE, CURRENT, DEFAULT_ROOT, PREVIOUS, Releases
-from deploy.installer.systemd import SERVICES, Systemd, UnhealthyError, choose
+from deploy.installer.systemd import Systemd, UnhealthyError, choose
 from edge_runtime.cli import SIGNALS, ArgumentParser, run_cli
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
@@ -77,8 +77,8 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         add = commands.add_parser(name, help=text, description=text).add_argument
         add("--root", metavar="DIR", default=DEFAULT_ROOT, help="folder of the installation")
-        who = "who runs the release, none for somebody else (default: as before, or systemd)"
-        add("--service", choices=SERVICES, help=who)
+        none = "at the first install: somebody else runs the release (default: systemd does)"
+        add("--service", choices=["none"], help=none)
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
             trust = "first install: the public key to trust from now on"

@@ -133,7 +133,7 @@ def test_a_policy_that_may_not_drive_there_changes_nothing_and_damage_is_said(bo
 
 @pytest.mark.parametrize(
     ("option", "is_installed", "is_systemd"),
-    [(None, False, True), (None, True, False), ("none", False, False), ("systemd", True, True)],
+    [(None, False, True), (None, True, False), ("none", False, False)],
 )
 def test_who_runs_it_stays_as_it_was_installed(
     tmp_path, monkeypatch, option, is_installed, is_systemd

@@ -58,7 +58,7 @@ class Rig:
     sender: Sender
     relay: Relay
     router: Process
-    chassis: ChassisProcess
+    chassis: Chassis
     monitor: CanMonitor
 
     def __init__(
@@ -100,8 +100,8 @@ class Rig:
             if vehicle == "hunter":
                 bus = free_bus()
                 self._edge += ["--bus", bus]
-                self.chassis = ChassisProcess(bus)
-                self._keep(self.chassis.process)
+                self.chassis = Chassis(bus)
+                self._keep(self.chassis)
                 self.monitor = CanMonitor(bus)
                 self._closing.callback(self.monitor.close)
             self.edge = self.start_edge()
@@ -304,16 +304,17 @@ def noisy_state(step: int, task: Task = TASK, **changes: Any) -> State:
     return make_state(step, **{**fields, **changes})
 
 
-class ChassisProcess:
+class Chassis(Process):
     """``python -m hil_tests mock_hunter`` beside a rig: its faults, and what it really did."""
 
-    def __init__(self, bus: str, *arguments: str) -> None:
-        self.process = Process("hil_tests", "mock_hunter", "--bus", bus, *arguments, ready="ready")
+    def __init__(self, bus: str) -> None:
+        super().__init__("hil_tests", "mock_hunter", "--bus", bus, ready="ready")
 
     @property
     def truth(self) -> list[tuple[float, bool]]:
         """Since when (monotonic s) it moves or stands, whatever it reports."""
-        return [(float(t), does == "moves") for t, does in self._said(_TOLD)]
+        told = (_TOLD.match(line) for _, line in self.lines)
+        return [(float(each[1]), each[2] == "moves") for each in told if each]
 
     @property
     def moves(self) -> bool:
@@ -321,12 +322,11 @@ class ChassisProcess:
 
     def switch(self, name: str, on: bool) -> float:
         """Switch a fault; return when it took effect, monotonic s."""
-        word = "on" if on else "off"
-        done = re.compile(rf"(fault) t=([\d.]+) {name}={word}")
-        count = len(self._said(done))
-        self.process.tell(f"{name} {word}")
-        found = wait_until(lambda: self._said(done)[count:], f"fault {name} {word}")
-        return float(found[0][1])
+        done, count = f"{name}={'on' if on else 'off'}", len(self.lines)
+        self.tell(f"{name} {'on' if on else 'off'}")
+        wait_until(lambda: any(line.endswith(done) for _, line in self.lines[count:]), done)
+        (line,) = (line for _, line in self.lines[count:] if line.endswith(done))
+        return float(line.split()[1].removeprefix("t="))
 
     def stands_s(self, since_s: float, timeout_s: float) -> float:
         """Return when it stood, at or after a moment; TimeoutError where it goes on moving."""
@@ -337,10 +337,6 @@ class ChassisProcess:
         """Return whether it moved at any moment in between."""
         before = [moves for since_s, moves in self.truth if since_s <= begin_s][-1:]
         return any(before + [moves for since_s, moves in self.truth if begin_s < since_s < end_s])
-
-    def _said(self, pattern: re.Pattern[str]) -> list[tuple[str, str]]:
-        found = (pattern.match(line) for _, line in self.process.lines)
-        return [(each[1], each[2]) for each in found if each]
 
 
 def free_bus() -> str:

@@ -34,7 +34,7 @@ JITTER = campaign.Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms"
 def test_the_budget_is_the_largest_value_up_to_which_all_hold(delay, jitter, limits):
     shares = zip((*DELAY.specs, *JITTER.specs), (*delay, *jitter), strict=True)
     rows = {spec: {"success": {"value": share}} for spec, share in shares}
-    found = campaign.budget([DELAY, JITTER], rows, 0.98, "a policy")
+    found = campaign.budget([DELAY, JITTER], rows, "a policy")
     assert tuple(found["limits"].values()) == limits
     assert f"{limits[0]} ms of delay" in found["sentence"]
 

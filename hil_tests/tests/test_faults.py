@@ -2,7 +2,7 @@
 
 import threading
 from pathlib import Path
-from unittest.mock import MagicMock, Mock
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
@@ -11,7 +11,7 @@ from edge_runtime.util import UserError
 from hil_tests.campaign import choose, render_faults
 from hil_tests.faults import hunter, observe
 from hil_tests.faults.observe import REACTION_LIMIT_S, DriveTimeline
-from hil_tests.faults.rig import ChassisProcess
+from hil_tests.faults.rig import Chassis
 from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, report_row, run_faults, use_rig
 from hil_tests.mock_hunter import FAULTS
@@ -145,10 +145,10 @@ def test_frames_and_speeds_that_should_never_be_are_found():
     ],
 )
 def test_any_movement_in_between_is_found(truth, moved):
-    chassis = ChassisProcess.__new__(ChassisProcess)
+    chassis = Chassis.__new__(Chassis)
     told = (one.split() for one in truth.split(", "))
     lines = [(0.0, f"chassis t={at} mode=can motion={motion}") for at, motion in told]
-    chassis.process = Mock(lines=lines)
+    chassis.lines = lines
     assert chassis.moved_between(1.0, 2.0) == moved
 
 
