@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -166,26 +166,14 @@ class Process:
             self.lines.append((seen_s, line.rstrip()))
 
 
-@contextlib.contextmanager
-def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
+def _operate(endpoint: str, vehicle_id: str, end: threading.Event) -> None:
     """Re-arm a vehicle after each safe stop, in place of the person of an unattended drive."""
-    end = threading.Event()
-
-    def watch() -> None:
-        while not end.wait(OPERATOR_LOOKS_EVERY_S):
-            with contextlib.suppress(UserError):  # no runtime yet, or no more
-                status = ask(endpoint, vehicle_id, "status")
-                stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
-                if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
-                    print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
-
-    watching = threading.Thread(target=watch)
-    watching.start()
-    try:
-        yield
-    finally:
-        end.set()
-        watching.join()
+    while not end.wait(OPERATOR_LOOKS_EVERY_S):
+        with contextlib.suppress(UserError):  # no runtime yet, or no more
+            status = ask(endpoint, vehicle_id, "status")
+            stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
+            if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
+                print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
 
 
 def run_command(*arguments: object) -> None:
@@ -214,7 +202,11 @@ def drive_shown(
         stack.enter_context(Process(*edge, ready="ready", shown=True))
         beside = Process("bridge", *listener, *common, shown=True) if listener else None
         stack.enter_context(beside or contextlib.nullcontext())
-        stack.enter_context(operator(endpoint, vehicle_id))
+        end = threading.Event()
+        operator = threading.Thread(target=_operate, args=(endpoint, vehicle_id, end))
+        stack.callback(operator.join)
+        stack.callback(end.set)
+        operator.start()
         where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
         run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
         if beside is not None:
