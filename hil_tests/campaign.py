@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from bridge.network import parse_spec
 from bridge.outcomes import GOAL
-from bridge.report import EpisodeResult, ProgressBar, markdown_table
+from bridge.report import ProgressBar, markdown_table
 from bridge.statistics import success_estimate
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
@@ -151,10 +151,14 @@ def run_latency(
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     asked = {name: getattr(arguments, name) for name in ("scenario", "condition", "seed", "runs")}
     task = (str(policy), arguments.scenario, arguments.condition, arguments.public_key)
-    rows = {}
+    rows: dict[str, dict[str, Any]] = {}
     with Drivers(*task, arguments.jobs) as drivers, ProgressBar("networks", len(specs)) as bar:
         for spec in specs:
-            rows[spec] = make_row(spec, drivers.drive(parse_spec(spec), seeds))
+            results = drivers.drive(parse_spec(spec), seeds)
+            outcomes = Counter(result.outcome for result in results)
+            success = success_estimate(outcomes[GOAL], len(results))._asdict()  # Wilson, 95 %
+            rows[spec] = {"spec": spec, "episodes": len(results), "success": success}
+            rows[spec]["outcomes"] = dict(outcomes)
             bar.advance({"network": spec})
     return {
         "policy": str(policy),
@@ -164,13 +168,6 @@ def run_latency(
         "rows": rows,
         "budget": budget(axes, rows, policy.stem),
     }
-
-
-def make_row(spec: str, results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Sum up the drives of a network; the success has Wilson's interval of 95 %."""
-    outcomes = Counter(result.outcome for result in results)
-    success = success_estimate(outcomes[GOAL], len(results))._asdict()
-    return {"spec": spec, "episodes": len(results), "success": success, "outcomes": dict(outcomes)}
 
 
 def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:

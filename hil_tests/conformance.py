@@ -179,7 +179,6 @@ class Bench:
         return True
 
 
-NO_NUMBERS = (math.nan, math.inf, -math.inf)
 # In this order, because one begins where another ends.
 RULES: dict[str, Callable[[Bench], bool]] = {
     "each action has a range": lambda it: (
@@ -199,7 +198,7 @@ RULES: dict[str, Callable[[Bench], bool]] = {
         it.stands_for_now() and it.goes()
     ),
     "NaN and infinity are a ValueError": lambda it: it.refuses(
-        *({**it.go, name: value} for name in it.go for value in NO_NUMBERS)
+        *({**it.go, name: float(text)} for name in it.go for text in ("nan", "inf", "-inf"))
     ),
     "a command that lacks its actions is a ValueError": lambda it: it.refuses({}, {"": 0.5}),
     "far beyond its limits it stays within them": Bench.stays_within,

@@ -133,22 +133,14 @@ class Search:
             print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
         return str(self.tried[str(spec)]["verdict"])
 
-    def holds_up_to(self, ray: Ray, most: int) -> int:
-        """Return the largest step up to which every tried one holds, by bisection from 0.
-
-        Less may be worse: half of it is tried, too.
-        """
-        edge = self._bisect(ray, 0, most, (HOLDS,))[0]
-        if edge > 1 and self.verdict(ray(edge // 2)) != HOLDS:
-            edge = self._bisect(ray, 0, edge // 2, (HOLDS,))[0]
-        return edge
-
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
         """Return the largest step that holds, the smallest beyond it that breaks, both networks.
 
         None where none breaks.
         """
-        inside = self.holds_up_to(ray, most)
+        inside = self._bisect(ray, 0, most, (HOLDS,))[0]
+        if inside > 1 and self.verdict(ray(inside // 2)) != HOLDS:  # Less may be worse.
+            inside = self._bisect(ray, 0, inside // 2, (HOLDS,))[0]
         beyond = self._bisect(ray, inside, most, (HOLDS, BETWEEN))[1]
         outside = beyond if beyond <= most else None
         found = {"steps": (inside, outside), "inside": str(network(ray(inside)))}

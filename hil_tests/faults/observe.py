@@ -208,21 +208,15 @@ class Relay:
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # closed
             while True:
-                self._join(self._listener.accept()[0])
-
-    def _join(self, near: socket.socket) -> None:
-        with self._lock:
-            try:
-                if self._is_cut:
-                    raise ConnectionError
-                far = socket.create_connection(self._target, timeout=1.0)
-            except OSError:
-                near.close()
-                return
-            far.settimeout(None)
-            self._open += [near, far]
-        for pair in ((near, far, False), (far, near, True)):
-            threading.Thread(target=self._pump, args=pair, daemon=True).start()
+                near = self._listener.accept()[0]
+                with self._lock:
+                    if self._is_cut:
+                        near.close()
+                        continue
+                    far = socket.create_connection(self._target)
+                    self._open += [near, far]
+                for pair in ((near, far, False), (far, near, True)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
     def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
         with contextlib.suppress(OSError):

@@ -186,11 +186,9 @@ class Rig:
 
     def own_brake_s(self, since_s: float) -> float:
         """Wait for the simulated vehicle's own brake after ``since_s``; return when it went on."""
-
-        def pressed_s() -> float | None:
-            return next((at_s for at_s, on in self.brakes() if on and at_s > since_s), None)
-
-        return float(wait_until(pressed_s, "the simulator's own brake"))
+        what = "the simulator's own brake"
+        pressed = wait_until(lambda: [s for s, on in self.brakes() if on and s > since_s], what)
+        return float(pressed[0])
 
     def stop_command(self, since_s: float) -> CommandSeen:
         """Wait for the first safe_stop command after ``since_s``."""

@@ -256,7 +256,9 @@ class MockHunter:
     def _report(self, now_s: float) -> None:
         with_slow = self._tick % SLOW_EVERY == 0
         if "frozen" not in self.faults or not self._slow:
-            self._fast = self._fast_frames()
+            speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
+            motion = protocol.MOTION_STATUS.sent(WheelMotion(speed_mps, self.inner_rad))
+            self._fast = [motion, *(row.sent(_MOTOR_FAST) for row in protocol.MOTORS_FAST)]
             self._slow = self._slow_frames() if with_slow else self._slow
         if self.faults & {"silent", "bus_off"}:
             return
@@ -265,12 +267,6 @@ class MockHunter:
             release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
         frames = self._fast + (self._slow if with_slow else [])
         self._outgoing.extend((release_s, frame) for frame in frames)
-
-    def _fast_frames(self) -> list[Sent]:
-        """Make 0x221 and 0x251 to 0x253: every 20 ms."""
-        speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        motion = protocol.MOTION_STATUS.sent(protocol.WheelMotion(speed_mps, self.inner_rad))
-        return [motion, *(row.sent(_MOTOR_FAST) for row in protocol.MOTORS_FAST)]
 
     def _slow_frames(self) -> list[Sent]:
         """Make 0x211 and 0x261 to 0x263: every 100 ms."""
