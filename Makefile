@@ -28,7 +28,7 @@ install: $(STAMP)  ## the virtual environment with the locked dependencies
 doctor:  ## what this machine can and cannot do, and how to get the rest
 	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
 
-pictures: $(STAMP)  ## the pictures of docs, all but the film
+pictures: $(STAMP)  ## the pictures of docs that need no screen
 	$(BIN)/python docs/make_pictures.py
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime

@@ -16,7 +16,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -36,12 +36,7 @@ CA_DAYS = 3650
 CLOCK_SLACK = datetime.timedelta(days=1)
 """A certificate is valid from a day ago: boards' clocks are behind until they are set."""
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
-MAX_NAME_CHARS = 64  # The longest common name of a certificate (RFC 5280)
 _PEM = form.Encoding.PEM
-_KEY_USES = (
-    *("digital_signature", "content_commitment", "key_encipherment", "data_encipherment"),
-    *("key_agreement", "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
-)
 
 
 @command("deploy.certs:run_keys", "python -m deploy keys --out keys")
@@ -64,9 +59,8 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
     """
     public_path = directory / DEFAULT_PUBLIC_KEY.name
     private_path = public_path.with_suffix(".key")
-    for path in (private_path, public_path):
-        if path.exists():
-            raise UserError(f"{path} exists and is not overwritten; choose another --out")
+    if private_path.exists() or public_path.exists():
+        raise UserError(f"{directory} holds a key, which is not overwritten; choose another --out")
     key = ed25519.Ed25519PrivateKey.generate()
     write_private(private_path, _pem(key))
     public = key.public_key().public_bytes(_PEM, form.PublicFormat.SubjectPublicKeyInfo)
@@ -107,7 +101,16 @@ def certs(parser: argparse.ArgumentParser) -> None:
 def run_certs(arguments: argparse.Namespace) -> int:
     out = Path(arguments.out)
     hosts = list(dict.fromkeys(map(_host, [*LOOPBACK_HOSTS, *arguments.host])))
-    parties = _missing(out, arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
+    parties = {
+        tls.common_name(role, None if rights.all_vehicles else vehicle_id): role
+        for role, rights in tls.ROLES.items()
+        for vehicle_id in arguments.vehicle_id or [DEFAULT_VEHICLE_ID]
+    }
+    if max(map(len, parties)) > 64:  # The longest common name of a certificate (RFC 5280)
+        raise UserError("no certificate can name this vehicle: choose a shorter --vehicle-id")
+    missing = {name: role for name, role in parties.items() if not (out / name).exists()}
+    if not missing:
+        raise UserError(f"{out} has {', '.join(parties)} already, and nothing is overwritten")
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)  # As certificates have it
     ca_folder = out / "ca"
     if ca_folder.exists():
@@ -118,13 +121,13 @@ def run_certs(arguments: argparse.Namespace) -> int:
     days = min(arguments.days, (authority.certificate.not_valid_after_utc - now).days)
     if days < 1:
         raise UserError(f"the authority in {ca_folder} has expired: make another in a new --out")
-    for name, role in parties.items():
+    for name, role in missing.items():
         issued = issue(authority, name, role, hosts, now, days)
         certificate = issued.certificate.public_bytes(_PEM)
         files = {tls.CERTIFICATE_FILE: certificate, tls.KEY_FILE: _pem(issued.key)}
         _write_folder(out / name, authority, files)
     print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
-    for name in parties:
+    for name in missing:
         print(f"--tls {out / name}")
     print(f"valid until {now + datetime.timedelta(days=days):%Y-%m-%d}")
     return 0
@@ -137,21 +140,6 @@ def _host(text: str) -> x509.GeneralName:
         if re.fullmatch(r"[A-Za-z0-9.-]+", text):
             return x509.DNSName(text)
     raise UserError(f"host {text!r} is not valid: write a name or an address, without port")
-
-
-def _missing(out: Path, vehicle_ids: Sequence[str]) -> dict[str, str]:
-    """Return the role of each party without a folder, by the party's name."""
-    parties: dict[str, str] = {}
-    for role, rights in tls.ROLES.items():
-        for vehicle in (None,) if rights.all_vehicles else vehicle_ids:
-            parties[tls.common_name(role, vehicle)] = role
-    longest = max(parties, key=len)
-    if len(longest) > MAX_NAME_CHARS:
-        raise UserError(f"no certificate can name {longest}: choose a shorter --vehicle-id")
-    missing = {name: role for name, role in parties.items() if not (out / name).exists()}
-    if not missing:
-        raise UserError(f"{out} has {', '.join(parties)} already, and nothing is overwritten")
-    return missing
 
 
 def _write_folder(folder: Path, authority: CertificatePair, files: dict[str, bytes]) -> None:
@@ -197,12 +185,17 @@ def issue(
 
     `hosts` are the names under which a party that listens is reached.
     """
-    key = ec.generate_private_key(ec.SECP256R1())
-    uses = ("digital_signature",) if authority else ("key_cert_sign", "crl_sign")
+    key, is_authority = ec.generate_private_key(ec.SECP256R1()), authority is None
+    uses: dict[str, Any] = {
+        "digital_signature": not is_authority, "key_cert_sign": is_authority,
+        "crl_sign": is_authority, "content_commitment": False, "key_encipherment": False,
+        "data_encipherment": False, "key_agreement": False, "encipher_only": False,
+        "decipher_only": False,
+    }  # fmt: skip
     # Each with whether a reader that does not know it must refuse the certificate.
     extensions: list[tuple[x509.ExtensionType, bool]] = [
-        (x509.BasicConstraints(ca=not authority, path_length=None if authority else 0), True),
-        (x509.KeyUsage(**{use: use in uses for use in _KEY_USES}), True),
+        (x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None), True),
+        (x509.KeyUsage(**uses), True),
         (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False),
     ]
     if authority:

@@ -1,10 +1,9 @@
-"""Make the pictures of this folder anew: ``python docs/make_pictures.py [NAME.png ...]``."""
+"""Make pictures of this folder anew: ``python docs/make_pictures.py``.
 
-import asyncio
+The film, the cockpit and rerun's views are taken from the screen, by a person.
+"""
+
 import sys
-import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +11,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from bridge.rerun import LOOPBACK, Viewer, free_port
 from edge_runtime.cli import run_cli
-from edge_runtime.util import UserError, read_json
+from edge_runtime.util import read_json
 from hil_tests.campaign import draw_axes
-from hil_tests.processes import POLICY, PUBLIC_KEY, Process, drive_shown, run_command
 from trainer.environments import make_environment
 from trainer.evaluation import load_driver
-from trainer.person.tests.browser import (
-    PERSON_DRIVES,
-    POLICY_DRIVES,
-    open_browser,
-    quit_sitting,
-    until,
-)
-from trainer.training.metrics import read_metrics, write_figure
+from trainer.training.metrics import write_figure
 from trainer.util import kept
 
+FOLDER = Path(__file__).parent
 MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}  # Scenario -> seed and time, s
-LOADED_S, DRAWN_S = 20.0, 5.0
-"""Until some 10 MB are in the viewer, and until it has drawn them, in software."""
-TAKE_OVERS = 3  # Before the picture of the cockpit
 
 
 def moment(scenario: str) -> tuple[Any, Any]:
@@ -47,114 +35,19 @@ def moment(scenario: str) -> tuple[Any, Any]:
     return env, frames
 
 
-def from_above(out: Path, _work: Path) -> None:
-    Image.fromarray(moment(out.stem)[0].render()).save(out)
-
-
-def policy_sees(out: Path, _work: Path) -> None:
-    """Draw both frames of both scenarios, enlarged pixel by pixel."""
+def main(_: list[str]) -> int:
+    """Draw both scenarios from above, both frames of both, and success against latency."""
     figure = Figure(figsize=(8.6, 5.6), layout="constrained")
     for panels, scenario in zip(figure.subplots(len(MOMENTS), 2), MOMENTS, strict=True):
-        frames = moment(scenario)[1]
+        env, frames = moment(scenario)
+        Image.fromarray(env.render()).save(FOLDER / f"{scenario}.png")
         for panel, frame, when in zip(panels, frames, ("0.1 s ago", "now"), strict=True):
             panel.imshow(np.asarray(frame), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
             panel.set_title(f"{scenario.replace('_', ' ')}, {when}: 80 x 45 pixels", fontsize=10)
             panel.set_axis_off()
-    write_figure(figure, out)
-
-
-def success_against_latency(out: Path, _work: Path) -> None:
-    shipped = Path(kept("results/latency/left_turn/shipped.json"))
-    write_figure(draw_axes(read_json(shipped, "latency report")["latency"]), out)
-
-
-def rerun_loop(out: Path, work: Path) -> None:
-    """Show the loop, some seconds into a drive in real time whose network fails once."""
-    drive, rrd = work / "drive.mcap", work / "loop.rrd"
-    network = "--clock realtime --latency 50ms+-10ms,outage=0.4s@3s --episodes 2 --seed 8"
-    trust = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
-    record = ("record", "--out", str(drive), "--wait-s", "30")
-    drive_shown("pictures", trust, tuple(network.split()), record)
-    run_command("bridge", "view", str(drive), "--vehicle-id", "pictures", "--save", str(rrd))
-    screenshot(out, rrd, "sim_time", duration=8.0)
-
-
-def rerun_training(out: Path, work: Path) -> None:
-    """Show a short training at its end."""
-    rrd = work / "training.rrd"
-    words = "--episodes 40 --seed 1 --set batch_size=32 --set evaluate_every_steps=10"
-    words += f" --set evaluation_runs=10 --rerun {rrd} --out {work}/training"
-    run_command("trainer", "train", *words.split())
-    last = int(read_metrics(work / "training")[-1]["total_steps"]) - 1
-    screenshot(out, rrd, "step", sequence=last)
-
-
-def screenshot(out: Path, rrd: Path, timeline: str, **moment: Any) -> None:
-    """Write a recording's picture in rerun's viewer, without a screen.
-
-    ``moment`` is where the cursor stands on the timeline, as ``ViewerClient.set_time`` takes it.
-    Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
-    """
-    from rerun.experimental import ViewerClient
-
-    port = free_port()
-    options = ["--headless", "--hide-welcome-screen", "--window-size", "1400x900"]
-    viewer = Viewer([*options, "--port", str(port)], [port])
-    try:
-        client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-        client.open(str(rrd.resolve()))
-        time.sleep(LOADED_S)
-        client.set_time(timeline, **moment, play_state="paused")
-        time.sleep(DRAWN_S)
-        out.write_bytes(client.take_screenshot())
-    finally:
-        viewer.end()
-
-
-def cockpit(out: Path, work: Path) -> None:
-    """Show a training in the browser, in the middle of a take-over; it needs Chromium."""
-    words = "--human web --seed 1 --set evaluate_every_steps=60 --set evaluation_runs=10"
-    with Process("trainer", "train", *words.split(), "--out", str(work / "cockpit")) as training:
-        training.wait_for_line("cockpit: open ")
-        url = next(line for line in training.output.splitlines() if line.startswith("cockpit: "))
-        asyncio.run(_take_over(url.split()[-1], out))
-        training.succeed()
-
-
-async def _take_over(url: str, out: Path) -> None:
-    async with open_browser() as page:
-        await page.goto(url)
-        for key, seconds in [("ArrowUp", 1.5)] * TAKE_OVERS + [("ArrowDown", 0.5)]:
-            await until(page, POLICY_DRIVES)
-            await asyncio.sleep(2.5)
-            await page.keyboard.down(key)
-            await until(page, PERSON_DRIVES)
-            await asyncio.sleep(seconds)
-            await page.screenshot(path=out, full_page=True)  # The last one stays.
-            await page.keyboard.up(key)
-        await quit_sitting(page)
-
-
-PICTURES: dict[str, Callable[[Path, Path], None]] = {
-    "left_turn.png": from_above,
-    "congestion.png": from_above,
-    "policy_sees.png": policy_sees,
-    "cockpit.png": cockpit,
-    "success_against_latency.png": success_against_latency,
-    "rerun.png": rerun_loop,
-    "rerun_training.png": rerun_training,
-}
-"""Name -> what writes it, given its path and a directory for what is made on the way."""
-
-
-def main(names: list[str], out: Path = Path(__file__).parent) -> int:
-    """Make the named pictures, or all."""
-    if unknown := set(names) - set(PICTURES):
-        raise UserError(f"no picture {unknown.pop()!r}: choose from {', '.join(PICTURES)}")
-    with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
-        for name in names or PICTURES:
-            PICTURES[name](out / name, Path(folder))
-            print(out / name)
+    write_figure(figure, FOLDER / "policy_sees.png")
+    shipped = read_json(kept("results/latency/left_turn/shipped.json"), "latency report")
+    write_figure(draw_axes(shipped["latency"]), FOLDER / "success_against_latency.png")
     return 0
 
 

@@ -190,7 +190,6 @@ not_negative = whole_number(0)
 positive_number = number("a finite number above 0", lambda value: value > 0.0)
 not_negative_number = number("a finite number, at least 0", lambda value: value >= 0.0)
 seconds = number("a number of seconds from 0 to 1e9", lambda value: 0.0 <= value <= 1e9)
-share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "find the delay, jitter and loss that a policy can bear",
     ),
     "mock_hunter": (
-        "hil_tests.mock_hunter.process",
+        "hil_tests.mock_hunter",
         "run a simulated Hunter on a CAN bus, with its faults",
     ),
     "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),

@@ -1,8 +1,7 @@
 """``python -m hil_tests bench``: the loop against the least that could answer, and what it costs.
 
-Two processes answer the same states: the edge runtime, and the floor, which is this file run by
-itself. Their blocks take turns, so that the machine disturbs both alike. Then the runtime's memory,
-idle load and start.
+Two processes answer the same states by turns, so that the machine disturbs both alike: the edge
+runtime, and the floor, which is this file run by itself. Then the runtime's memory and idle load.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -24,11 +22,9 @@ import onnxruntime
 import zenoh
 
 from bridge.ports import add_options
-from bridge.report import ProgressBar
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
 from edge_runtime.files import write_json_out
-from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
@@ -39,47 +35,42 @@ OURS, FLOOR = "bench-ours", "bench-floor"
 PERIOD_S, LAST_ANSWER_S = 0.004, 0.2
 IDLE_S, MEMORY_SAMPLES, QUANTILES = 10.0, 10, (50, 90, 99)
 PICTURES = np.random.default_rng(0).integers(0, 256, (64, 2, 45, 80), dtype=np.uint8)
-EXAMPLE = examples("python -m hil_tests bench --blocks 5 --out runs/loop.json")
+EXAMPLE = examples("python -m hil_tests bench --states 1000 --out runs/loop.json")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("--policy", default=str(POLICY), help="policy file")
-    parser.add_argument("--public-key", default=str(PUBLIC_KEY), help="of the policy's signature")
-    parser.add_argument("--blocks", type=positive, default=20, help="blocks of each contender")
-    parser.add_argument("--states", type=positive, default=500, help="states in each block")
-    steps = "steps of the memory's run"
-    parser.add_argument("--steps", type=positive, default=100_000, help=steps)
+    states = "states that each answers; the memory's run has ten times as many"
+    parser.add_argument("--states", type=positive, default=10_000, help=states)
     add_options(parser, "--out")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the JSON."""
-    load_policy(arguments.policy, arguments.public_key)
     endpoint = free_endpoint()
-    policy = ("--policy", arguments.policy, "--public-key", arguments.public_key)
-    where = ("--connect", endpoint, "--vehicle-id", OURS)
+    policy = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
     with ExitStack() as stack:
         session = stack.enter_context(open_session(listen=endpoint, mode="router"))
         ours, floor = (Contender(session, name, stack) for name in (OURS, FLOOR))
         begun_s = time.perf_counter()
-        edge = stack.enter_context(Process("edge_runtime", "run", *policy, *where))
-        first_command_s = ours.rouse() - begun_s
-        words = ("hil_tests.bench_loop", arguments.policy, endpoint)
-        stack.enter_context(Process(*words, ready="ready"))
-        floor.rouse()
-        latency = alternate(ours, floor, arguments.blocks, arguments.states)
+        run_edge = ("edge_runtime", "run", *policy, "--connect", endpoint, "--vehicle-id", OURS)
+        edge = stack.enter_context(Process(*run_edge))
+        wait_until(lambda: ours.ask_ms(limit_s=0.02), OURS)
+        first_command_s = time.perf_counter() - begun_s
+        stack.enter_context(Process("hil_tests.bench_loop", str(POLICY), endpoint, ready="ready"))
+        wait_until(floor.ask_ms, FLOOR)
+        latency_ms = compare(ours, floor, arguments.states)
         begin_s = cpu_s(edge.pid)
         time.sleep(IDLE_S)
         idle = (cpu_s(edge.pid) - begin_s) / IDLE_S
         memory_mb = [edge.resident_mb()]
         for _ in range(MEMORY_SAMPLES):
-            for _ in range(arguments.steps // MEMORY_SAMPLES):
-                ours.ask()
+            for _ in range(arguments.states):
+                ours.ask_ms()
             memory_mb.append(edge.resident_mb())
     # The first tenth fills pools and windows; what comes after it must not grow.
     report = {
         "machine": {"processor": processor_model(), "cores": os.cpu_count()},
-        "source_revision": source_revision(), "latency": latency,
+        "source_revision": source_revision(), "states": arguments.states, "latency_ms": latency_ms,
         "process": {"first_command_s": first_command_s, "idle_load": idle, "memory_mb": memory_mb},
     }  # fmt: skip
     write_json_out(arguments.out, report)
@@ -88,84 +79,50 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Contender:
-    """Sends states to a process and notes when each was answered. A block is an episode."""
+    """Sends states to a process, each when the one before was answered."""
 
     def __init__(self, session: zenoh.Session, vehicle_id: str, stack: ExitStack) -> None:
-        self.vehicle_id = vehicle_id
-        self.arrivals: dict[int, float] = {}  # Step -> when its answer came (perf_counter, s)
-        self._step = self._episode = 0
+        self._step, self._arrived_s, self._answered = 0, 0.0, threading.Event()
         publisher = session.declare_publisher(wire.key(vehicle_id, "state"))
         self._put = stack.enter_context(publisher).put
         commands = wire.key(vehicle_id, "command")
         stack.enter_context(session.declare_subscriber(commands, self._on_command))
 
-    def send(self, final: bool = False) -> tuple[int, float]:
-        """Send the next state; return its step and when it was sent (perf_counter, s)."""
+    def ask_ms(self, limit_s: float = LAST_ANSWER_S) -> float | None:
+        """Send a state; return how long its answer took, ms, or None where none came in time."""
         self._step += 1
         seen = {"frames": PICTURES[self._step % len(PICTURES)].tobytes()}
-        state = make_state(
-            self._step, session="bench", episode=self._episode, final=final, observation=seen
-        )
-        payload = wire.encode(state)
+        payload = wire.encode(make_state(self._step, observation=seen))
+        self._answered.clear()
         sent_s = time.perf_counter()
         self._put(payload)
-        return self._step, sent_s
-
-    def end_block(self) -> None:
-        """Send a final state: the edge runtime stands by while the other process works."""
-        self.send(final=True)
-        self._episode += 1
-        self.arrivals.clear()
-
-    def rouse(self) -> float:
-        """Send states until the first answer comes; return when it came (perf_counter, s)."""
-        wait_until(lambda: self.send() and self.arrivals, self.vehicle_id, poll_s=0.02)
-        first_s = min(self.arrivals.values())
-        self.end_block()
-        return first_s
-
-    def ask(self) -> None:
-        """Send a state and wait for its answer."""
-        step, _ = self.send()
-        wait_until(lambda: self.arrivals.pop(step, None), self.vehicle_id, poll_s=0.0001)
-
-    def block_ms(self, count: int) -> np.ndarray:
-        """Return the latencies of a block's answers, ms; states without an answer are missing."""
-        sent: dict[int, float] = {}
-        next_s = time.perf_counter()
-        for _ in range(count):
-            next_s = max(next_s + PERIOD_S, time.perf_counter())
-            time.sleep(max(0.0, next_s - time.perf_counter()))
-            step, sent[step] = self.send()
-        time.sleep(LAST_ANSWER_S)
-        arrivals = dict(self.arrivals)
-        self.end_block()
-        return np.array([(arrivals[s] - at_s) * 1e3 for s, at_s in sent.items() if s in arrivals])
+        return (self._arrived_s - sent_s) * 1e3 if self._answered.wait(limit_s) else None
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         arrived_s = time.perf_counter()
         command = wire.decode_command(bytes(sample.payload))
         assert isinstance(command, wire.Command), command
-        self.arrivals.setdefault(command.step, arrived_s)
+        if command.step == self._step and not self._answered.is_set():
+            self._arrived_s = arrived_s
+            self._answered.set()
 
 
-def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
-    """Ask both in blocks by turns; who begins a pair changes, and the first pair is a warm-up."""
-    times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
-    with ProgressBar("pairs of blocks", blocks + 1) as bar:
-        for number in range(blocks + 1):
-            for contender in (ours, floor) if number % 2 else (floor, ours):
-                block = contender.block_ms(count)
-                if number:
-                    times[contender.vehicle_id].append(block)
-            bar.advance({})
-    own, bare = (np.concatenate(some) for some in times.values())
-    latency_ms = {}
+def compare(ours: Contender, floor: Contender, count: int) -> dict[str, dict[str, float]]:
+    """Ask both ``count`` times by turns; return how many answered, and quantiles of the time."""
+    times_ms: list[list[float | None]] = [[], []]
+    next_s = time.perf_counter()
+    for _ in range(count):
+        for contender, taken_ms in zip((ours, floor), times_ms, strict=True):
+            next_s = max(next_s + PERIOD_S, time.perf_counter())
+            time.sleep(max(0.0, next_s - time.perf_counter()))
+            taken_ms.append(contender.ask_ms())
+    answered = [[each for each in taken_ms if each is not None] for taken_ms in times_ms]
+    counts = {"ours": float(len(answered[0])), "floor": float(len(answered[1]))}
+    found = {"answered": counts}
     for quantile in QUANTILES:
-        mine, least = np.percentile(own, quantile), np.percentile(bare, quantile)
-        latency_ms[f"p{quantile}"] = {"ours": mine, "floor": least, "ratio": mine / least}
-    answered = {OURS: len(own), FLOOR: len(bare)}
-    return {"states": blocks * count, "answered": answered, "latency_ms": latency_ms}
+        mine, least = (float(np.percentile(each, quantile)) for each in answered)
+        found[f"p{quantile}"] = {"ours": mine, "floor": least, "ratio": mine / least}
+    return found
 
 
 def cpu_s(pid: int) -> float:

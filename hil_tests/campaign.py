@@ -23,18 +23,19 @@ from matplotlib.figure import Figure
 
 from bridge.network import parse_spec
 from bridge.outcomes import GOAL, success_estimate
-from bridge.report import EpisodeResult, ProgressBar, markdown_table
+from bridge.report import ProgressBar, markdown_table
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.drivers import Drivers
-from hil_tests.faults.rows import ROWS, Row
-from hil_tests.faults.run import run_faults
+from hil_tests.envelope import Drivers
+from hil_tests.faults.rows import Row
+from hil_tests.faults.run import ROWS, run_faults
 from trainer.training.metrics import write_figure
 from trainer.util import cores, kept
 
 Found = Mapping[str, Any]  # A part of a report's JSON
 PANELS = 3  # In a row
+TARGET = 0.98  # Share of successes that a network within the budget leaves
 
 
 class Axis(NamedTuple):
@@ -95,12 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
                 rows, arguments.tries, policy, lambda row: bar.advance({"row": row}),
                 arguments.jobs or cores(), arguments.public_key,
             )  # fmt: skip
-        text += ["## Faults", "", *render_faults(faults)]
+        text += ["## Faults", "", *(lines := render_faults(faults))]
         passed = faults["passed"]
-        for row in faults["rows"]:
-            for what in (*row["wrong"], *row["unsafe"], *row["crashes"]):
-                print(f"{row['name']}: {what}")
-        print("Every fault was met." if passed else "Not every fault was met.")
+        print("\n".join(line for line in lines if "MISSED" in line or not line.startswith("|")))
     write_json_out(out, result)
     write_atomic(markdown, ("\n".join(text).rstrip() + "\n").encode())
     print(f"{out} and {markdown}")
@@ -131,15 +129,14 @@ def render_faults(report: Found) -> list[str]:
         tries = f"{row['tries']} (+{row['disturbed']} again)" if row["disturbed"] else row["tries"]
         times = []
         for kind in ("reaction", "recovery"):
-            spread, limit = row[f"{kind}_ms"] or {}, row[f"{kind}_limit_ms"]
-            times.append(" / ".join(f"{value:.0f}" for value in spread.values()) or "-")
+            spread, limit = row[f"{kind}_ms"].values(), row[f"{kind}_limit_ms"]
+            times.append(" / ".join(f"{value:.0f}" for value in spread) or "-")
             times.append("-" if limit is None else f"{limit:.0f}")
-        late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
-        missed = [f"{count} {name} late" for name, count in late.items() if count]
-        missed += [f"{len(row[it])} {it}" for it in ("unsafe", "crashes", "wrong") if row[it]]
+        missed = ["late"] * (row["reaction_late"] + row["recovery_late"])
+        missed += [*row["wrong"], *row["unsafe"], *row["crashes"]]
         counted = sum(row["rejected"].values())
         met = f"met, {counted:,} rejected and counted" if counted else "met"
-        verdict = f"MISSED: {', '.join(missed)}" if missed else met
+        verdict = f"MISSED {row['name']}: {'; '.join(missed)}" if missed else met
         rows.append((row["done"], row["expected"], tries, *times, verdict))
     crashes, unsafe = report["crashes"], report["unsafe_commands"]
     return [*markdown_table(head, rows), f"{crashes} crashes and {unsafe} unsafe commands."]
@@ -153,30 +150,26 @@ def run_latency(
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     asked = {name: getattr(arguments, name) for name in ("scenario", "condition", "seed", "runs")}
     task = (str(policy), arguments.scenario, arguments.condition, arguments.public_key)
-    rows = {}
+    rows: dict[str, dict[str, Any]] = {}
     with Drivers(*task, arguments.jobs) as drivers, ProgressBar("networks", len(specs)) as bar:
         for spec in specs:
-            rows[spec] = make_row(spec, drivers.drive(parse_spec(spec), seeds))
+            results = drivers.drive(parse_spec(spec), seeds)
+            outcomes = Counter(result.outcome for result in results)
+            success = success_estimate(outcomes[GOAL], len(results))._asdict()  # Wilson, 95 %
+            rows[spec] = {"spec": spec, "episodes": len(results), "success": success}
+            rows[spec]["outcomes"] = dict(outcomes)
             bar.advance({"network": spec})
-    told = ("name", "title", "unit", "values", "specs")
     return {
         "policy": str(policy),
         "policy_id": drivers.policy_id,
         **asked,
-        "axes": [{name: getattr(axis, name) for name in told} for axis in axes],
+        "axes": [{**axis._asdict(), "specs": axis.specs} for axis in axes],
         "rows": rows,
-        "budget": budget(axes, rows, arguments.target, policy.stem),
+        "budget": budget(axes, rows, policy.stem),
     }
 
 
-def make_row(spec: str, results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Sum up the drives of a network; the success has Wilson's interval of 95 %."""
-    outcomes = Counter(result.outcome for result in results)
-    success = success_estimate(outcomes[GOAL], len(results))._asdict()
-    return {"spec": spec, "episodes": len(results), "success": success, "outcomes": dict(outcomes)}
-
-
-def budget(axes: Sequence[Axis], rows: Found, target: float, name: str) -> dict[str, Any]:
+def budget(axes: Sequence[Axis], rows: Found, name: str) -> dict[str, Any]:
     """Return each axis's limit, and a sentence of them.
 
     A limit is the largest value up to which every tested one is at the target; None: not even 0.
@@ -184,14 +177,14 @@ def budget(axes: Sequence[Axis], rows: Found, target: float, name: str) -> dict[
     limits, parts = {}, []
     for axis in axes:
         points = zip(axis.values, axis.specs, strict=True)
-        holds = takewhile(lambda point: rows[point[1]]["success"]["value"] >= target, points)
+        holds = takewhile(lambda point: rows[point[1]]["success"]["value"] >= TARGET, points)
         limit = max((value for value, _ in holds), default=None)
         limits[axis.name] = limit
         most = " (the most that was tested)" if limit == axis.values[-1] else ""
         found = f"{limit:g} {axis.unit}" if limit is not None else "not even 0"
         parts.append(f"{found}{most} of {axis.title}")
-    sentence = f"{name} holds at least {100 * target:g}% success up to {'; '.join(parts)}. "
-    return {"target_success": target, "limits": limits, "sentence": f"{sentence}One at a time."}
+    sentence = f"{name} holds at least {100 * TARGET:g}% success up to {'; '.join(parts)}. "
+    return {"target_success": TARGET, "limits": limits, "sentence": f"{sentence}One at a time."}
 
 
 def render_latency(latency: Found) -> list[str]:

@@ -21,12 +21,6 @@ def campaign(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     _add_common(parser, "SCENARIO")
     add("--runs", type=cli.whole_number(2), default=100, help="episodes per network")
-    add(
-        "--target",
-        type=cli.share,
-        default=0.98,
-        help="success rate that a network must keep, 0 to 1",
-    )
     add("--only", choices=("latency", "faults"), help="run one part (default: both)")
     rows = "run only these networks and faults, by name or pattern (delay, hunter_*); an unknown"
     add("--rows", metavar="NAME,...", help=f"{rows} name lists all")
@@ -44,7 +38,6 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--env", default="left_turn", help="scenario, gymnasium id or MODULE:ID")
     _add_common(parser, "ENV")
     add("--promise", type=inner, default=0.95, help="success rate that the policy must keep")
-    add("--confidence", type=inner, default=0.95, help="statistical confidence of each limit")
 
 
 def _add_common(parser: argparse.ArgumentParser, env: str) -> None:

@@ -55,27 +55,21 @@ def run(arguments: argparse.Namespace) -> int:
         control_period_s=arguments.period_s, algorithm="", training={}, created="",
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
+    bench, kept = Bench(vehicle, arguments.period_s), 0
     try:
-        kept = judge(Bench(vehicle, arguments.period_s))
+        for rule, is_kept in RULES.items():
+            try:
+                wrong = "" if is_kept(bench) else f"last report: {bench.last}"
+            # A driver may raise anything, and the next rule is due.
+            except (Exception, SystemExit) as error:
+                wrong = f"{type(error).__name__}: {error}"
+            print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
+            kept += not wrong
     finally:
         close_in_time(vehicle)  # the last rule does, where it came so far
         log.close()
     print(f"{vehicle.name}: {kept} rules kept, {len(RULES) - kept} broken")
     return 0 if kept == len(RULES) else 1
-
-
-def judge(bench: Bench) -> int:
-    """Try the rules in their order; return how many are kept."""
-    kept = 0
-    for rule, is_kept in RULES.items():
-        try:
-            wrong = "" if is_kept(bench) else f"last report: {bench.last}"
-        # A driver may raise anything, and the next rule is due.
-        except (Exception, SystemExit) as error:
-            wrong = f"{type(error).__name__}: {error}"
-        print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
-        kept += not wrong
-    return kept
 
 
 class Bench:
@@ -106,7 +100,7 @@ class Bench:
         self.last = report = self.call("feedback")
         numbers = (*report.action.values(), report.speed_mps)
         has_all = report.action.keys() == self.go.keys() and type(report.faults) is list
-        self.well_formed = self.well_formed and has_all and all(map(math.isfinite, numbers))
+        self.well_formed &= has_all and all(map(math.isfinite, numbers))
         return report
 
     def until(self, moves: bool, limit_s: float = PATIENCE_S, commands: bool = False) -> bool:
@@ -131,8 +125,7 @@ class Bench:
     def starts(self) -> bool:
         """Return whether commands move it after `enable`, from a stand."""
         self.call("enable")
-        self.until(moves=False)
-        return self.goes()
+        return self.until(moves=False) and self.goes()
 
     def waits(self) -> bool:
         """Return whether it stands after `enable`, until a command comes."""
@@ -186,7 +179,6 @@ class Bench:
         return True
 
 
-NO_NUMBERS = (math.nan, math.inf, -math.inf)
 # In this order, because one begins where another ends.
 RULES: dict[str, Callable[[Bench], bool]] = {
     "each action has a range": lambda it: (
@@ -206,7 +198,7 @@ RULES: dict[str, Callable[[Bench], bool]] = {
         it.stands_for_now() and it.goes()
     ),
     "NaN and infinity are a ValueError": lambda it: it.refuses(
-        *({**it.go, name: value} for name in it.go for value in NO_NUMBERS)
+        *({**it.go, name: float(text)} for name in it.go for text in ("nan", "inf", "-inf"))
     ),
     "a command that lacks its actions is a ValueError": lambda it: it.refuses({}, {"": 0.5}),
     "far beyond its limits it stays within them": Bench.stays_within,

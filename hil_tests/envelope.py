@@ -10,21 +10,28 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
+import signal
 import sys
-import time
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context
 from typing import Any
 
 from bridge.network import LatencySpec, parse_spec
-from bridge.outcomes import GOAL
+from bridge.outcomes import GOAL, TIMEOUT, TRUNCATED, UNKNOWN
+from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.drivers import Drivers
-from trainer.util import kept
+from trainer.environments import make_environment
+from trainer.evaluation import drive_episodes, load_driver, located, trained_in
+from trainer.util import cores, die_with_parent, kept, set_threads
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
+CONFIDENCE = 0.95  # Of a statement about an axis
 ZONE = 0.7
 """The test tells the promise from 0.7 times more, and 0.7 times fewer, failures: for 95 %, from
 98.5 % and from 91.5 %."""
@@ -75,8 +82,8 @@ class SequentialTest:
     fewer failures, and against ``ZONE`` more. BETWEEN: neither could be shown.
     """
 
-    def __init__(self, promise: float, confidence: float) -> None:
-        failing, error = 1.0 - promise, 1.0 - confidence
+    def __init__(self, promise: float) -> None:
+        failing, error = 1.0 - promise, 1.0 - CONFIDENCE
         self._steps = [
             (math.log(other / failing), math.log((1.0 - other) / promise))
             for other in (failing * (1.0 - ZONE), failing * (1.0 + ZONE))
@@ -103,47 +110,35 @@ class SequentialTest:
 class Search:
     """Looks for edges, and keeps the verdict of every point that was tried.
 
-    ``drive`` is called with the next seeds, from ``seed`` on and ``at_once`` at a time, until a
-    point is decided. ``confidence`` is that of a statement about an axis.
+    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided.
     """
 
-    def __init__(
-        self, drive: Drive, promise: float, confidence: float, seed: int = 0, at_once: int = AT_ONCE
-    ) -> None:
-        self._drive, self._seed, self._at_once = drive, seed, at_once
-        self._new_test = partial(SequentialTest, promise, confidence)
+    def __init__(self, drive: Drive, promise: float, seed: int = 0) -> None:
+        self._drive, self._promise, self._seed = drive, promise, seed
         self.tried: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
         """Drive a point until it is decided; return HOLDS, BREAKS or BETWEEN."""
         spec = network(at)
         if str(spec) not in self.tried:
-            test, verdict = self._new_test(), None
+            test, verdict = SequentialTest(self._promise), None
             while verdict is None:
                 first = self._seed + test.drives
-                for success in self._drive(spec, range(first, first + self._at_once)):
+                for success in self._drive(spec, range(first, first + AT_ONCE)):
                     verdict = verdict or test.add(success)
             found = {"verdict": verdict, "drives": test.drives, "successes": test.successes}
             self.tried[str(spec)] = found
             print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
         return str(self.tried[str(spec)]["verdict"])
 
-    def holds_up_to(self, ray: Ray, most: int) -> int:
-        """Return the largest step up to which every tried one holds, by bisection from 0.
-
-        Less may be worse: half of it is tried, too.
-        """
-        edge = self._bisect(ray, 0, most, (HOLDS,))[0]
-        if edge > 1 and self.verdict(ray(edge // 2)) != HOLDS:
-            edge = self._bisect(ray, 0, edge // 2, (HOLDS,))[0]
-        return edge
-
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
         """Return the largest step that holds, the smallest beyond it that breaks, both networks.
 
         None where none breaks.
         """
-        inside = self.holds_up_to(ray, most)
+        inside = self._bisect(ray, 0, most, (HOLDS,))[0]
+        if inside > 1 and self.verdict(ray(inside // 2)) != HOLDS:  # Less may be worse.
+            inside = self._bisect(ray, 0, inside // 2, (HOLDS,))[0]
         beyond = self._bisect(ray, inside, most, (HOLDS, BETWEEN))[1]
         outside = beyond if beyond <= most else None
         found = {"steps": (inside, outside), "inside": str(network(ray(inside)))}
@@ -186,26 +181,77 @@ def find_edges(search: Search) -> dict[str, dict[str, Any]]:
 def run(arguments: argparse.Namespace) -> int:
     """Find an envelope, and write it."""
     check_writable(arguments.out)
-    began_s, env = time.monotonic(), arguments.env
-    policy = arguments.policy or kept(f"results/policies/{env}.onnx")
-    task = (policy, env, arguments.condition, arguments.public_key, arguments.jobs)
+    policy = arguments.policy or kept(f"results/policies/{arguments.env}.onnx")
+    task = (policy, arguments.env, arguments.condition, arguments.public_key, arguments.jobs)
     with sigterm_as_interrupt(), Drivers(*task) as drivers:
 
         def drive(spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
             return [result.outcome == GOAL for result in drivers.drive(spec, seeds)]
 
-        promise, at_once = arguments.promise, max(drivers.jobs, AT_ONCE)
-        search = Search(drive, promise, arguments.confidence, arguments.seed, at_once)
+        search = Search(drive, arguments.promise, arguments.seed)
         found = {"edges": find_edges(search), "tried": search.tried}
     report = {
-        "schema": 2, "policy_id": drivers.policy_id, "policy": policy, "env": env,
-        "condition": arguments.condition, "promised_success": promise,
-        "confidence": arguments.confidence, "seed": arguments.seed,
-        "control_period_s": drivers.control_period_s, **found, "drives": drivers.driven,
-        "seconds": round(time.monotonic() - began_s, 1),
+        "schema": 2, "policy_id": drivers.policy_id, "policy": policy, "env": arguments.env,
+        "condition": arguments.condition, "promised_success": arguments.promise,
+        "confidence": CONFIDENCE, "seed": arguments.seed, **found,
         "command": f"python -m hil_tests {shlex.join(sys.argv[1:])}",
     }  # fmt: skip
     write_json_out(arguments.out, report)
     for name, edge in found["edges"].items():
         print(f"{name} holds up to {edge['limit']:g}, breaks at {edge['breaks_at']}")
     return 0
+
+
+class Drivers(ProcessPoolExecutor):
+    """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
+
+    Raises UserError where the policy does not load or the environment cannot be made.
+    """
+
+    def __init__(self, policy: str, env: str, condition: str, public_key: str | None, jobs: int):
+        policy = located(policy)
+        task = (policy, env, condition, public_key, trained_in(policy, public_key)[1])
+        self.policy_id = _load(*task)[2]
+        self._ends = {TRUNCATED}  # How any drive has ended
+        super().__init__(jobs or cores(), get_context("spawn"), partial(_begin, *task))
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown(cancel_futures=True)
+
+    def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[EpisodeResult]:
+        """Drive an episode for each seed; return the results without their actions.
+
+        Raises UserError where the environment does not report of each drive how it ended.
+        """
+        results = list(self.map(partial(_drive, spec), seeds))
+        self._ends.update(result.outcome for result in results)
+        # A step limit is a timeout as soon as the end of any other drive was reported.
+        if UNKNOWN in self._ends or len(self._ends) == 1:
+            raise UserError("no outcome or is_success in info tells whether it succeeded")
+        return [
+            replace(result, outcome=TIMEOUT) if result.outcome == TRUNCATED else result
+            for result in results
+        ]
+
+
+_mine: list[Any] = []  # Of a process of the pool: environment, driver, condition
+
+
+def _load(policy: str, env: str, condition: str, key: str | None, period_s: float | None) -> Any:
+    """Return the environment, the policy as its driver, and the policy's id."""
+    environment = make_environment(env, condition, period_s=period_s)
+    return environment, *load_driver(policy, environment, key)
+
+
+def _begin(*task: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
+    threading.Thread(target=die_with_parent, daemon=True).start()
+    set_threads(1)
+    environment, driver, _ = _load(*task)
+    _mine[:] = environment, driver, task[2]
+
+
+def _drive(spec: LatencySpec, seed: int) -> EpisodeResult:
+    env, driver, condition = _mine
+    (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
+    return replace(result, actions=[])

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -166,36 +166,25 @@ class Process:
             self.lines.append((seen_s, line.rstrip()))
 
 
-@contextlib.contextmanager
-def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
+def _operate(endpoint: str, vehicle_id: str, end: threading.Event) -> None:
     """Re-arm a vehicle after each safe stop, in place of the person of an unattended drive."""
-    end = threading.Event()
-
-    def watch() -> None:
-        while not end.wait(OPERATOR_LOOKS_EVERY_S):
-            with contextlib.suppress(UserError):  # no runtime yet, or no more
-                status = ask(endpoint, vehicle_id, "status")
-                stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
-                if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
-                    print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
-
-    watching = threading.Thread(target=watch)
-    watching.start()
-    try:
-        yield
-    finally:
-        end.set()
-        watching.join()
+    while not end.wait(OPERATOR_LOOKS_EVERY_S):
+        with contextlib.suppress(UserError):  # no runtime yet, or no more
+            status = ask(endpoint, vehicle_id, "status")
+            stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
+            if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
+                print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
 
 
-def run_command(*arguments: str) -> None:
+def run_command(*arguments: object) -> None:
     """Print ``python -m ...`` and run it to its end; UserError where it failed and has said why."""
-    print(f"\n$ python -m {shlex.join(arguments)}", flush=True)
+    words = ["python", "-m", *map(str, arguments)]
+    print(f"\n$ {shlex.join(words)}", flush=True)
     # Not `subprocess.call`: after ^C that kills a command which may still save something.
-    with subprocess.Popen([sys.executable, "-m", *arguments]) as process:
+    with subprocess.Popen([sys.executable, *words[1:]]) as process:
         status = process.wait()
     if status:
-        raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
+        raise UserError(f"{' '.join(words[:4])} ended with status {status}")
 
 
 def drive_shown(
@@ -213,7 +202,11 @@ def drive_shown(
         stack.enter_context(Process(*edge, ready="ready", shown=True))
         beside = Process("bridge", *listener, *common, shown=True) if listener else None
         stack.enter_context(beside or contextlib.nullcontext())
-        stack.enter_context(operator(endpoint, vehicle_id))
+        end = threading.Event()
+        operator = threading.Thread(target=_operate, args=(endpoint, vehicle_id, end))
+        stack.callback(operator.join)
+        stack.callback(end.set)
+        operator.start()
         where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
         run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
         if beside is not None:
@@ -230,9 +223,3 @@ def wait_until(
             return value
         time.sleep(poll_s)
     raise CommandTimeoutError(f"not within {timeout_s:g} s: {what}")
-
-
-def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:
-    """Return an edge runtime's options for a policy that may be unsigned."""
-    named = () if public_key is None else ("--public-key", public_key)
-    return ("--policy", str(policy), "--allow-unsigned", *named)

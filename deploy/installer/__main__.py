@@ -18,7 +18,7 @@ from pathlib import Path
 
 from deploy.installer import release
 from deploy.installer.release import BEFORE, CURRENT, DEFAULT_ROOT, PREVIOUS, Releases
-from deploy.installer.systemd import SERVICES, Systemd, UnhealthyError, choose
+from deploy.installer.systemd import Systemd, UnhealthyError, choose
 from edge_runtime.cli import SIGNALS, ArgumentParser, run_cli
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
@@ -45,7 +45,7 @@ def _run(argv: list[str]) -> int:
         raise UserError(f"nothing is installed in {releases.root}")
     service = choose(arguments.service, releases.root)
     if command == "status":
-        return status(releases, service, arguments.json)
+        return status(releases, service)
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     for one in SIGNALS:
@@ -77,34 +77,26 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         add = commands.add_parser(name, help=text, description=text).add_argument
         add("--root", metavar="DIR", default=DEFAULT_ROOT, help="folder of the installation")
-        who = "who runs the release, none for somebody else (default: as before, or systemd)"
-        add("--service", choices=SERVICES, help=who)
+        none = "at the first install: somebody else runs the release (default: systemd does)"
+        add("--service", choices=["none"], help=none)
         if name == "install":
             add("bundle", metavar="BUNDLE.tar")
             trust = "first install: the public key to trust from now on"
             add("--trust", metavar="KEY.pub", help=trust)
-        if name == "status":
-            add("--json", action="store_true", help="print JSON")
     return parser
 
 
-def status(releases: Releases, service: Systemd | None, as_json: bool) -> int:
-    """Print what is installed; return 1 where the current release is damaged."""
+def status(releases: Releases, service: Systemd | None) -> int:
+    """Print what is installed, as JSON; return 1 where the current release is damaged."""
     current = releases.linked(CURRENT)
     if current is None:
         raise UserError(f"nothing is installed in {releases.root}")
     is_whole = releases.is_whole(current)
     about = json.loads((releases.folder(current) / release.MANIFEST).read_bytes())
-    rows = {
-        "current": current,
-        "whole": "yes" if is_whole else "no: files are missing or changed",
-        "previous": releases.linked(PREVIOUS) or "none",
-        "vehicle_id": about["vehicle_id"],
-        "policy_id": about["policy_id"],
-        "service": service.describe() if service else "not run by the installer",
-        "trusts": releases.trusted.read_text(),
-    }
-    print(json.dumps(rows) if as_json else "\n".join(f"{k:<11} {v}" for k, v in rows.items()))
+    about.update(current=current, is_whole=is_whole, previous=releases.linked(PREVIOUS))
+    about["service"] = service.describe() if service else "not run by the installer"
+    about["trusts"] = releases.trusted.read_text()
+    print(json.dumps(about, indent=2))
     return 0 if is_whole else UNHEALTHY
 
 

@@ -22,7 +22,6 @@ MAIN_UNIT, CAN_UNIT, TRIAL_UNIT = "phil-edge.service", "phil-can.service", "phil
 USER = "phil"
 READY_S, SETTLE_S = 30.0, 3.0
 """How soon a trial must be ready, and how long a release must then stay healthy."""
-SERVICES = ("systemd", "none")
 UNIT_FOLDER = Path("/etc/systemd/system")
 BOOTED = Path("/run/systemd/system")
 """A folder where systemd runs this computer (sd_booted(3))."""
@@ -128,9 +127,8 @@ def choose(service: str | None, root: Path) -> Systemd | None:
     has_unit = (UNIT_FOLDER / MAIN_UNIT).exists()
     if service == "none" and has_unit:
         raise UserError("systemd runs this board: leave --service out, or `uninstall` first")
-    if service is None and BOOTED.is_dir() and not (root / CURRENT).exists():
-        service = "systemd"
-    return Systemd(root) if service == "systemd" or has_unit else None
+    is_first = BOOTED.is_dir() and not (root / CURRENT).exists()
+    return Systemd(root) if has_unit or (service is None and is_first) else None
 
 
 def _require_active(unit: str) -> None:

@@ -90,6 +90,6 @@ class Board:
         return self.run("install", bundle, "--trust", self.workshop.public_key)
 
     def status(self) -> dict:
-        done = self.run("status", "--json")
+        done = self.run("status")
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)

@@ -35,17 +35,10 @@ class ProcessService(Systemd):
 
     def start(self) -> None:
         folder = self._current.resolve()
-        command = [
-            "env",
-            "--default-signal",
-            "setsid",
-            str(folder / LAUNCHER),
-            "run",
-            "--config",
-            CONFIG,
-        ]
+        alone = ["env", "--default-signal", "setsid", str(folder / LAUNCHER)]
         with open(self._log, "wb") as log:
-            run = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+            words = [*alone, "run", "--config", CONFIG]
+            run = subprocess.Popen(words, cwd=folder, stdout=log, stderr=log)
         self._pid.write_text(str(run.pid))
         end_s = time.monotonic() + READY_S
         while "ready " not in self._log.read_text() and time.monotonic() < end_s and self.pid():

@@ -10,8 +10,7 @@ from unittest.mock import Mock
 
 import can
 import pytest
-from hil_tests.mock_hunter import MODELS, MockHunter
-from hil_tests.mock_hunter.process import Orders, serve
+from hil_tests.mock_hunter import MODELS, MockHunter, Orders, serve
 from hil_tests.processes import wait_until
 
 from edge_runtime.tests.rigs import LEFT_TURN, PEDAL

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -22,17 +21,9 @@ from edge_runtime.safety import Event
 from edge_runtime.vehicles.hunter import STATUS_SILENCE_S
 from edge_runtime.vehicles.plausibility import DEVIATES_S, FOLLOWS_S
 from hil_tests.faults.inside import BRIGHT
-from hil_tests.faults.observe import (
-    REACTION_LIMIT_S,
-    SET_POINT,
-    SPEED,
-    STATUS,
-    BusFrame,
-    CanMonitor,
-    CommandSeen,
-)
+from hil_tests.faults.observe import REACTION_LIMIT_S, SET_POINT, SPEED, STATUS, CanMonitor
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.rows import Try, at_any_phase, fault
+from hil_tests.faults.rows import Row, Try, at_any_phase
 from hil_tests.mock_hunter import BITS, FAULTS, MODELS
 
 QUIET_S = 0.5
@@ -40,6 +31,7 @@ QUIET_S = 0.5
 STANDS_WITHIN_S = 2.0
 """After the fault: our reaction, the chassis's own 0.5 s where it hears nothing, the braking."""
 _MOST_MPS = MODELS["hunter-2.0"].max_speed_mps
+_FAST_MPS = 0.97 * _MOST_MPS
 _DIFFERS_MPS = 0.15
 _ASTRAY_RAD = 0.048  # a tenth of full lock, at the inner wheel; the rows' policies go straight on
 _LATER_S = {
@@ -61,92 +53,59 @@ class Expect(NamedTuple):
     shows: Callable[[bytes], bool] = bool
 
 
-_STUCK = Expect("stuck", "stuck|speed stays")
-
-
-def speed_mps(frame: BusFrame) -> float:
+def speed_mps(data: bytes) -> float:
     """Decode the speed of SET_POINT or SPEED by hand."""
-    return _number(frame.data[:2])
+    return int.from_bytes(data[:2], "big", signed=True) * 1e-3
 
 
-def _number(data: bytes) -> float:
-    return int.from_bytes(data, "big", signed=True) * 1e-3
-
-
-def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
+def at_fault(expect: Expect, rig: Rig) -> Try:
     """Judge that it stops for the fault, stands when it is over, and drives once re-armed."""
-    rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
-    at_any_phase(number)
-    on_s = rig.chassis.switch(expect.name, True)
+    chassis, monitor = rig.chassis, rig.monitor
+    rig.switch(BRIGHT, "")
+    rig.wait_until_driving(lambda: any(speed_mps(d) > _FAST_MPS for _, d in monitor.of(SPEED)[-3:]))
+    at_any_phase(rig)
+    on_s = chassis.switch(expect.name, True)
+    if expect.name == "stuck":  # Nobody can know before it is asked for another speed.
+        rig.switch(BRIGHT, None)
     stop = rig.stop_command(on_s)
-    stands_s = rig.chassis.stands_s(on_s, STANDS_WITHIN_S)
+    stands_s = chassis.stands_s(on_s, STANDS_WITHIN_S)
     taken = expect.name in _REFUSED and rig.try_rearm()
     wrong = ["was re-armed while the fault lasted"] if taken else []
     if expect.can_id:
-        seen = (one for one in rig.monitor.of(expect.can_id, on_s) if expect.shows(one.data))
+        shown = (s for s, data in monitor.of(expect.can_id, on_s) if expect.shows(data))
     else:
-        seen = (one for one in reversed(rig.monitor.of(SPEED)) if one.seen_s <= on_s)
-    known = next(seen, None)
-    if known is None:
+        shown = (s for s, _ in reversed(monitor.of(SPEED)) if s <= on_s)
+    known_s = next(shown, None)
+    if known_s is None:
         raise TimeoutError(f"no frame shows {expect.name}")
-    done = _when_over(rig, expect, on_s, known.seen_s, stop, stands_s)
-    return replace(done, wrong=wrong + done.wrong)
-
-
-def stuck(rig: Rig, number: int) -> Try:
-    """Hold the motors' speed, which nobody can know before it is asked for another one."""
     rig.switch(BRIGHT, "")
-    rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
-    at_any_phase(number)
-    on_s = rig.chassis.switch("stuck", True)
-    held_mps = speed_mps(rig.monitor.of(SPEED)[-1])
-    rig.switch(BRIGHT, None)
-    stop = rig.stop_command(on_s)
-    stands_s = rig.chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
-    asked = rig.monitor.of(SET_POINT, on_s)  # the stop's at the latest is 0
-    known_s = next(one.seen_s for one in asked if held_mps - speed_mps(one) > _DIFFERS_MPS)
-    rig.switch(BRIGHT, "")
-    return _when_over(rig, _STUCK, on_s, known_s, stop, stands_s)
-
-
-def _drives(monitor: CanMonitor) -> bool:
-    recent = monitor.heard[-20:]
-    return any(one.can_id == SPEED and speed_mps(one) > 0.9 * _MOST_MPS for one in recent)
-
-
-def _when_over(
-    rig: Rig, expect: Expect, on_s: float, known_s: float, stop: CommandSeen, stands_s: float
-) -> Try:
-    """Switch the fault off, look whether the stop holds, and re-arm until the vehicle moves."""
-    rig.chassis.switch(expect.name, False)
+    chassis.switch(expect.name, False)
     time.sleep(QUIET_S)
     quiet_s = time.monotonic()
-    wrong = strange_frames(rig.monitor) + _named(rig, expect, on_s)
+    wrong += strange_frames(monitor) + _named(rig, expect, on_s)
     wrong += rig.timeline.drives_between(stop.seen_s, quiet_s)
-    if stop.reason != Event.VEHICLE.value:
-        wrong.append(f"stopped for {stop.reason}")
-    if rig.chassis.moved_between(stands_s, quiet_s):
-        wrong.append("moved before it was re-armed")
-    told_s = _told_s(rig.monitor, on_s, quiet_s)
-    recovered_s = rig.drive_again(ready=lambda: rig.chassis.moves)
+    wrong += [f"stopped for {stop.reason}"] * (stop.reason != Event.VEHICLE.value)
+    wrong += ["moved before it was re-armed"] * chassis.moved_between(stands_s, quiet_s)
+    told_s = _told_s(monitor, on_s, quiet_s)
+    recovered_s = rig.drive_again(ready=lambda: chassis.moves)
     return Try(told_s - known_s, recovered_s, stop.reason, wrong)
 
 
 def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
     """Return since when every set-point has been speed 0; ``until_s`` where it never was."""
     told_s = until_s
-    for one in reversed(monitor.of(SET_POINT, on_s)):
-        if speed_mps(one) != 0.0:
+    for seen_s, data in reversed(monitor.of(SET_POINT, on_s)):
+        if speed_mps(data) != 0.0:
             break
-        told_s = min(told_s, one.seen_s)
+        told_s = min(told_s, seen_s)
     return told_s
 
 
 def strange_frames(monitor: CanMonitor) -> list[str]:
     """Return lines where a frame or a set-point was on the bus that should never be."""
-    fast = [one for one in monitor.of(SET_POINT) if abs(speed_mps(one)) > _MOST_MPS]
-    wrong = [f"0x{one.can_id:x} was on the bus" for one in monitor.strange[:1]]
-    return wrong + [f"asked for {speed_mps(one):.2f} m/s" for one in fast[:1]]
+    wrong = [f"0x{can_id:x} was on the bus" for can_id in monitor.strange[:1]]
+    asked = (speed_mps(data) for _, data in monitor.of(SET_POINT))
+    return wrong + [f"asked for {each:.2f} m/s" for each in asked if abs(each) > _MOST_MPS][:1]
 
 
 def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
@@ -160,21 +119,23 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
 
 
 _EXPECTS = (
-    _STUCK,
+    Expect("stuck", "stuck|speed stays", SET_POINT,
+           lambda data: _FAST_MPS - speed_mps(data) > _DIFFERS_MPS),
     Expect("silent", "sends no 0x2"),
     Expect("frozen", "stands still"),
     Expect("bus_off", "sends no 0x2"),
     Expect("late", "sends no 0x2"),
-    Expect("full_lock", "the steering stays", SPEED, lambda d: abs(_number(d[6:])) > _ASTRAY_RAD),
-    Expect("lying", "reports", SPEED, lambda d: _number(d[:2]) > 1.2 * _MOST_MPS),
-    Expect("remote", "remote control", STATUS, lambda d: d[1] == 2),
-    Expect("estop", "emergency stop", STATUS, lambda d: d[0] == 1),
-    *(Expect(name, bit.words, STATUS, lambda d: any(d[4:6])) for name, bit in BITS.items()),
-)
-for _expect in _EXPECTS:
-    fault(
-        "set-point 0 on the bus, vehicle_fault; stands until re-armed", f"hunter_{_expect.name}",
-        f"Hunter: {FAULTS[_expect.name]}", rig={"vehicle": "hunter"}, flows=True,
-        reaction_limit_s=REACTION_LIMIT_S + _LATER_S.get(_expect.name, 0.0),
-        policy="mean" if _expect is _STUCK else "full",
-    )(stuck if _expect is _STUCK else partial(at_fault, _expect))  # fmt: skip
+    Expect("full_lock", "the steering stays", SPEED,
+           lambda data: abs(int.from_bytes(data[6:], "big", signed=True)) * 1e-3 > _ASTRAY_RAD),
+    Expect("lying", "reports", SPEED, lambda data: speed_mps(data) > 1.2 * _MOST_MPS),
+    Expect("remote", "remote control", STATUS, lambda data: data[1] == 2),
+    Expect("estop", "emergency stop", STATUS, lambda data: data[0] == 1),
+    *(Expect(name, bit.words, STATUS, lambda data: any(data[4:6])) for name, bit in BITS.items()),
+)  # fmt: skip
+ROWS = [
+    Row(f"hunter_{expect.name}", f"Hunter: {FAULTS[expect.name]}",
+        "set-point 0 on the bus, vehicle_fault; stands until re-armed", partial(at_fault, expect),
+        REACTION_LIMIT_S + _LATER_S.get(expect.name, 0.0), rig={"vehicle": "hunter"},
+        policy="mean", flows=True)
+    for expect in _EXPECTS
+]  # fmt: skip

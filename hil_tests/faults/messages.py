@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,7 +16,7 @@ from edge_runtime.cli import BAD_INPUT
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.wire import DRIVE, Command, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, noisy_state
-from hil_tests.faults.rows import Try, drives_on, fault
+from hil_tests.faults.rows import Row, Try, drives_on
 from hil_tests.processes import wait_until
 from hil_tests.testing.messages import make_command, make_feedback
 
@@ -25,12 +26,9 @@ COUNT, PER_S = 10_000, 2_500
 _FOREIGN = "garbage"
 """Session of the messages that mutations start from: what is valid still is rejected by it."""
 _HOUR_NS = 3600 * 1_000_000_000
-_COUNTED = "drives on; each rejected and counted by reason"
 
 
-@drives_on(_COUNTED, counted="edge", rig={"sender": True})
-def bad_states(rig: Rig, number: int) -> Try:
-    """Truncated, wrong schema, NaN, old, repeated, reordered, future states."""
+def bad_states(rig: Rig) -> Try:
     sent: Counter[str] = Counter()
     for turn in range(50):
         with rig.sender.lock:
@@ -62,18 +60,14 @@ def _bad_of(step: int, task: Task) -> Iterable[tuple[str, bytes]]:
     yield "stale", encode(noisy_state(step - 1, task))
 
 
-@drives_on(_COUNTED, counted="edge")
-def oversized(rig: Rig, number: int) -> Try:
-    """States of 10 MB."""
+def oversized(rig: Rig) -> Try:
     for _ in range(5):
         rig.probe.put("state", bytes(10_000_000))
         time.sleep(rig.period_s)
     return Try(rejected={"oversized": 5})
 
 
-@fault("answers the newest, or stops", rig={"sender": True}, alone=True)
-def flood(rig: Rig, number: int) -> Try:
-    """10,000 states a second for 2 s."""
+def flood(rig: Rig) -> Try:
     rig.sender.running.clear()
     begin_s, sent = time.monotonic(), 0
     while (now_s := time.monotonic()) < begin_s + FLOOD_S:
@@ -86,22 +80,18 @@ def flood(rig: Rig, number: int) -> Try:
     return Try(rig.timeline.longest_gap_s(begin_s, end_s), rig.recovered_after_s(end_s))
 
 
-@drives_on(_COUNTED, counted="edge")
-def second_simulator(rig: Rig, number: int) -> Try:
-    """A second simulator with the same id."""
+def second_simulator(rig: Rig) -> Try:
     steps = round(2.0 / rig.period_s)
     for step in range(steps):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
-        rig.timeline.states[("second", number, step)] = time.monotonic()
-        state = noisy_state(step, rig.task, session="second", episode=number)
+        rig.timeline.states[("second", rig.number, step)] = time.monotonic()
+        state = noisy_state(step, rig.task, session="second", episode=rig.number)
         rig.probe.put("state", encode(state))
         time.sleep(rig.period_s)
     return Try(rejected={"foreign_session": steps})
 
 
-@drives_on("second one refuses; drives on", counted="simulator", flows=False)
-def second_edge(rig: Rig, number: int) -> Try:
-    """A second edge runtime with the same id."""
+def second_edge(rig: Rig) -> Try:
     second = rig.start_edge()
     status = second.wait()
     time.sleep(rig.period_s)  # Until the probe has heard the last of it, and the first one's.
@@ -112,16 +102,12 @@ def second_edge(rig: Rig, number: int) -> Try:
     return Try(rejected=stale, wrong=[] if status == BAD_INPUT else [ended])
 
 
-@drives_on(_COUNTED, counted="edge")
-def garbage_states(rig: Rig, number: int) -> Try:
-    """10,000 random and mutated states."""
-    return _put_garbage(rig, "state", noisy_state(1, rig.task, session=_FOREIGN), number)
+def garbage_states(rig: Rig) -> Try:
+    return _put_garbage(rig, "state", noisy_state(1, rig.task, session=_FOREIGN))
 
 
-@drives_on(_COUNTED, counted="simulator", flows=False)
-def garbage_commands(rig: Rig, number: int) -> Try:
-    """10,000 random and mutated commands; future, old, wrong size."""
-    done = _put_garbage(rig, "command", _command(rig, session=_FOREIGN), number)
+def garbage_commands(rig: Rig) -> Try:
+    done = _put_garbage(rig, "command", _command(rig, session=_FOREIGN))
     others = {
         "unknown_step": _command(rig, ahead=1000),
         "stale": _command(rig, ahead=-3),
@@ -141,22 +127,18 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
     return make_command(max(0, step + ahead), sent_ns=time.time_ns(), **fields)
 
 
-@drives_on()
-def garbage_feedback(rig: Rig, number: int) -> Try:
-    """10,000 random and mutated feedback messages."""
-    _put_garbage(rig, "feedback", make_feedback(0, session=_FOREIGN), number)
+def garbage_feedback(rig: Rig) -> Try:
+    _put_garbage(rig, "feedback", make_feedback(0, session=_FOREIGN))
     return Try()
 
 
-@drives_on()
-def garbage_health(rig: Rig, number: int) -> Try:
-    """10,000 random and mutated health messages."""
+def garbage_health(rig: Rig) -> Try:
     wait_until(lambda: rig.timeline.health, "a health message")
-    _put_garbage(rig, "health", rig.timeline.health[-1], number)
+    _put_garbage(rig, "health", rig.timeline.health[-1])
     return Try()
 
 
-def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
+def _put_garbage(rig: Rig, topic: str, valid: Message) -> Try:
     """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
     decode = DECODERS[topic]
     legal = "foreign_session" if topic in ("state", "command") else ""
@@ -164,7 +146,7 @@ def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
         decode = Layout(rig.task).decode
     sent: Counter[str] = Counter()
     begin_s = time.monotonic()
-    for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):
+    for number, payload in enumerate(mutated(encode(valid), COUNT, rig.number)):
         rig.probe.put(topic, payload)
         found = decode(payload)
         sent[found.reason.value if isinstance(found, Rejection) else legal] += 1
@@ -209,3 +191,23 @@ _ABSURD: tuple[object, ...] = (
     None, True, -1, 2**63, -(2**63), float("nan"), float("inf"), 1e308, "", "x" * 300,
     b"", b"\xff" * 70_000, [], [float("nan")], [2.0], [[[[]]]], {}, {"a": {"b": {}}}, "drive",
 )  # fmt: skip
+_COUNTED: dict[str, Any] = {"expected": "drives on; each rejected and counted by reason"}
+_BY_EDGE, _BY_SIMULATOR = ({**_COUNTED, "counted": end} for end in ("edge", "simulator"))
+_ENDS: dict[str, Any] = {"flows": False}  # The simulator counts only when the drive has ended.
+ROWS = [
+    drives_on("bad_states", "Truncated, wrong schema, NaN, old, repeated, reordered, future states",
+              bad_states, **_BY_EDGE, rig={"sender": True}),
+    drives_on("oversized", "States of 10 MB", oversized, **_BY_EDGE),
+    Row("flood", "10,000 states a second for 2 s", "answers the newest, or stops", flood,
+        rig={"sender": True}, alone=True),
+    drives_on("second_simulator", "A second simulator with the same id", second_simulator,
+              **_BY_EDGE),
+    drives_on("second_edge", "A second edge runtime with the same id", second_edge,
+              "second one refuses; drives on", counted="simulator", **_ENDS),
+    drives_on("garbage_states", "10,000 random and mutated states", garbage_states, **_BY_EDGE),
+    drives_on("garbage_commands", "10,000 random and mutated commands; future, old, wrong size",
+              garbage_commands, **_BY_SIMULATOR, **_ENDS),
+    drives_on("garbage_feedback", "10,000 random and mutated feedback messages", garbage_feedback),
+    drives_on("garbage_health", "10,000 random and mutated health messages", garbage_health,
+              **_BY_SIMULATOR, **_ENDS),
+]  # fmt: skip

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import can
 import zenoh
@@ -36,9 +36,6 @@ RECOVERY_LIMIT_S = 1.0
 SET_POINT, STATUS, SPEED = HEARD = (0x111, 0x211, 0x221)
 _LOOPBACK = "127.0.0.1"
 _CHUNK_BYTES = 4096  # Small, so that a throttled relay hands over bit by bit
-_STATE_BYTES = 20
-"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
-(then 47 bytes for each are on the link)."""
 
 Place = tuple[str, int, int]  # Session, episode and step of a state
 
@@ -135,22 +132,19 @@ class Probe:
         timeline: DriveTimeline,
         stack: contextlib.ExitStack,
     ) -> None:
-        self._timeline = timeline
-        session = stack.enter_context(open_session(listen=listen, connect=connect, mode="router"))
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._timeline, self._vehicle_id = timeline, vehicle_id
+        opened = open_session(listen=listen, connect=connect, mode="router")
+        self._session = stack.enter_context(opened)
         for topic in ("state", "command", "health", "feedback"):
             key, hear = wire.key(vehicle_id, topic), partial(self._hear, topic)
-            publisher = session.declare_publisher(
-                key,
-                # BLOCK: a message that the campaign says it sent has been sent.
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                allowed_destination=zenoh.Locality.REMOTE,  # it hears the others, not itself
-            )
-            self._publishers[topic] = stack.enter_context(publisher)
-            stack.enter_context(session.declare_subscriber(key, hear))
+            # It hears the others, not itself.
+            hears: Any = {"handler": hear, "allowed_origin": zenoh.Locality.REMOTE}
+            stack.enter_context(self._session.declare_subscriber(key, **hears))
 
     def put(self, topic: str, payload: bytes) -> None:
-        self._publishers[topic].put(payload)
+        # BLOCK: a message that the campaign says it sent has been sent.
+        block = zenoh.CongestionControl.BLOCK
+        self._session.put(wire.key(self._vehicle_id, topic), payload, congestion_control=block)
 
     def _hear(self, topic: str, sample: zenoh.Sample) -> None:
         seen_s, offset_ns = time.monotonic(), time.time_ns() - time.monotonic_ns()
@@ -175,7 +169,6 @@ class Relay:
     """Passes TCP on from ``endpoint`` to ``target``, an endpoint of this machine."""
 
     def __init__(self, target: str) -> None:
-        self.last_state_s = -math.inf  # When the last bytes of a state went to whoever connected
         self._target = (_LOOPBACK, int(target.rpartition(":")[2]))
         self._flowing = threading.Event()
         self._flowing.set()
@@ -215,21 +208,15 @@ class Relay:
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # closed
             while True:
-                self._join(self._listener.accept()[0])
-
-    def _join(self, near: socket.socket) -> None:
-        with self._lock:
-            try:
-                if self._is_cut:
-                    raise ConnectionError
-                far = socket.create_connection(self._target, timeout=1.0)
-            except OSError:
-                near.close()
-                return
-            far.settimeout(None)
-            self._open += [near, far]
-        for pair in ((near, far, False), (far, near, True)):
-            threading.Thread(target=self._pump, args=pair, daemon=True).start()
+                near = self._listener.accept()[0]
+                with self._lock:
+                    if self._is_cut:
+                        near.close()
+                        continue
+                    far = socket.create_connection(self._target)
+                    self._open += [near, far]
+                for pair in ((near, far, False), (far, near, True)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
     def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
         with contextlib.suppress(OSError):
@@ -239,8 +226,6 @@ class Relay:
                 if to_caller:
                     time.sleep(len(data) / self._bytes_per_s)
                 sink.sendall(data)
-                if to_caller and len(data) > _STATE_BYTES:
-                    self.last_state_s = time.monotonic()
         _shut(source)
         _shut(sink)
 
@@ -251,39 +236,32 @@ def _shut(end: socket.socket) -> None:
     end.close()
 
 
-class BusFrame(NamedTuple):
-    """A frame, and its monotonic time."""
-
-    seen_s: float
-    can_id: int
-    data: bytes
-
-
 class CanMonitor(can.Listener):
     """Listens to a CAN bus in a thread, and keeps the frames of HEARD."""
 
     def __init__(self, bus: str) -> None:
-        self.heard: list[BusFrame] = []
-        self.strange: list[BusFrame] = []  # Not the Hunter's: nobody should send any
+        self.heard: list[tuple[float, int, bytes]] = []  # Monotonic time, identifier, data
+        self.strange: list[
+            int
+        ] = []  # Identifiers that are not the Hunter's: nobody should send any
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=0.1)
 
-    def of(self, can_id: int, since_s: float = -math.inf) -> list[BusFrame]:
-        """Return the frames of an identifier since a moment, in order."""
-        return [one for one in self.heard if one.can_id == can_id and one.seen_s > since_s]
+    def of(self, can_id: int, since_s: float = -math.inf) -> list[tuple[float, bytes]]:
+        """Return times and data of the frames of an identifier since a moment, in order."""
+        return [(s, data) for s, heard_id, data in self.heard if heard_id == can_id and s > since_s]
 
     def close(self) -> None:
         self._notifier.stop()
         self._bus.shutdown()
 
     def on_message_received(self, msg: can.Message) -> None:
-        # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
-        seen_s = msg.timestamp + time.monotonic() - time.time()
-        heard = BusFrame(seen_s, msg.arbitration_id, bytes(msg.data))
-        if heard.can_id in HEARD:
-            self.heard.append(heard)
-        if heard.can_id not in FRAMES or msg.is_extended_id:
-            self.strange.append(heard)
+        if msg.arbitration_id in HEARD:
+            # By the kernel, on the wall clock: how late this thread runs does not count.
+            seen_s = msg.timestamp + time.monotonic() - time.time()
+            self.heard.append((seen_s, msg.arbitration_id, bytes(msg.data)))
+        if msg.arbitration_id not in FRAMES or msg.is_extended_id:
+            self.strange.append(msg.arbitration_id)
 
     def on_error(self, exc: Exception) -> None:
         """Ignore what a socket cannot unpack: it is no frame."""

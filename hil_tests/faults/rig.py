@@ -58,7 +58,7 @@ class Rig:
     sender: Sender
     relay: Relay
     router: Process
-    chassis: ChassisProcess
+    chassis: Chassis
     monitor: CanMonitor
 
     def __init__(
@@ -71,6 +71,7 @@ class Rig:
         sender: bool = False,
         ride_s: float = 0.0,
     ) -> None:
+        self.number = 0  # Of the try
         self.timeline = DriveTimeline()
         self.crashes: list[str] = []
         self.task, self.period_s = task, task.control_period_s
@@ -99,8 +100,8 @@ class Rig:
             if vehicle == "hunter":
                 bus = free_bus()
                 self._edge += ["--bus", bus]
-                self.chassis = ChassisProcess(bus)
-                self._keep(self.chassis.process)
+                self.chassis = Chassis(bus)
+                self._keep(self.chassis)
                 self.monitor = CanMonitor(bus)
                 self._closing.callback(self.monitor.close)
             self.edge = self.start_edge()
@@ -143,11 +144,7 @@ class Rig:
     def switch(self, name: str, word: str | None) -> None:
         """Write a word into one of the files that the faulty ends look at; None removes it."""
         path = self._directory / name
-        if word is None:
-            path.unlink(missing_ok=True)
-            return
-        path.with_suffix(".new").write_text(word)
-        path.with_suffix(".new").replace(path)
+        path.unlink(missing_ok=True) if word is None else path.write_text(word)
 
     def try_rearm(self) -> bool:
         """Ask once for a re-arm; return whether the runtime accepted it."""
@@ -189,11 +186,9 @@ class Rig:
 
     def own_brake_s(self, since_s: float) -> float:
         """Wait for the simulated vehicle's own brake after ``since_s``; return when it went on."""
-
-        def pressed_s() -> float | None:
-            return next((at_s for at_s, on in self.brakes() if on and at_s > since_s), None)
-
-        return float(wait_until(pressed_s, "the simulator's own brake"))
+        what = "the simulator's own brake"
+        pressed = wait_until(lambda: [s for s, on in self.brakes() if on and s > since_s], what)
+        return float(pressed[0])
 
     def stop_command(self, since_s: float) -> CommandSeen:
         """Wait for the first safe_stop command after ``since_s``."""
@@ -307,16 +302,17 @@ def noisy_state(step: int, task: Task = TASK, **changes: Any) -> State:
     return make_state(step, **{**fields, **changes})
 
 
-class ChassisProcess:
+class Chassis(Process):
     """``python -m hil_tests mock_hunter`` beside a rig: its faults, and what it really did."""
 
-    def __init__(self, bus: str, *arguments: str) -> None:
-        self.process = Process("hil_tests", "mock_hunter", "--bus", bus, *arguments, ready="ready")
+    def __init__(self, bus: str) -> None:
+        super().__init__("hil_tests", "mock_hunter", "--bus", bus, ready="ready")
 
     @property
     def truth(self) -> list[tuple[float, bool]]:
         """Since when (monotonic s) it moves or stands, whatever it reports."""
-        return [(float(t), does == "moves") for t, does in self._said(_TOLD)]
+        told = (_TOLD.match(line) for _, line in self.lines)
+        return [(float(each[1]), each[2] == "moves") for each in told if each]
 
     @property
     def moves(self) -> bool:
@@ -324,12 +320,11 @@ class ChassisProcess:
 
     def switch(self, name: str, on: bool) -> float:
         """Switch a fault; return when it took effect, monotonic s."""
-        word = "on" if on else "off"
-        done = re.compile(rf"(fault) t=([\d.]+) {name}={word}")
-        count = len(self._said(done))
-        self.process.tell(f"{name} {word}")
-        found = wait_until(lambda: self._said(done)[count:], f"fault {name} {word}")
-        return float(found[0][1])
+        done, count = f"{name}={'on' if on else 'off'}", len(self.lines)
+        self.tell(f"{name} {'on' if on else 'off'}")
+        wait_until(lambda: any(line.endswith(done) for _, line in self.lines[count:]), done)
+        (line,) = (line for _, line in self.lines[count:] if line.endswith(done))
+        return float(line.split()[1].removeprefix("t="))
 
     def stands_s(self, since_s: float, timeout_s: float) -> float:
         """Return when it stood, at or after a moment; TimeoutError where it goes on moving."""
@@ -340,10 +335,6 @@ class ChassisProcess:
         """Return whether it moved at any moment in between."""
         before = [moves for since_s, moves in self.truth if since_s <= begin_s][-1:]
         return any(before + [moves for since_s, moves in self.truth if begin_s < since_s < end_s])
-
-    def _said(self, pattern: re.Pattern[str]) -> list[tuple[str, str]]:
-        found = (pattern.match(line) for _, line in self.process.lines)
-        return [(each[1], each[2]) for each in found if each]
 
 
 def free_bus() -> str:

@@ -1,8 +1,8 @@
-"""The table of faults, and its rows of both ends and of the link between them.
+"""Faults of both ends, of the link between them, of the mock vehicle and of a recorder.
 
-A row is a function that takes a driving rig and the number of its try, does the fault once, undoes
-it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it puts it
-into ROWS. Faults of messages and of a Hunter have files of their own; `run.py` names them.
+A function here takes a driving rig, does a fault once, undoes it, and returns a `Try`. A `Row` in
+ROWS says what it does, in words, and what is expected. Faults of messages and of a Hunter have
+files of their own; `run.py` joins the three tables.
 
 The last rows are of a drive with ride-through of RIDE_S. While no state or no command comes, the
 last command's plan is played: through what is shorter, nothing brakes. What is longer brakes,
@@ -11,8 +11,6 @@ RIDE_S later than without it. A fault of the vehicle and a stop end it at once.
 
 from __future__ import annotations
 
-import math
-import os
 import resource
 import signal
 import subprocess
@@ -27,12 +25,13 @@ from typing import Any, Literal
 import numpy as np
 
 from bridge.recording import Recording, heard_of
-from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state
+from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state, encode
 from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
-from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, Relay
-from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig
+from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S
+from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig, noisy_state
 from hil_tests.processes import wait_until
 from hil_tests.testing.policies import T
+from trainer.util import cores
 
 
 @dataclass(frozen=True)
@@ -52,10 +51,6 @@ class Try:
     rejected: Mapping[str, int] = field(default_factory=dict)
 
 
-DoFault = Callable[[Rig, int], Try]
-"""Called with a rig that drives and the number of the try, which is its seed, too."""
-
-
 @dataclass(frozen=True)
 class Row:
     """A row of the table of faults."""
@@ -63,7 +58,7 @@ class Row:
     name: str
     done: str
     expected: str
-    run: DoFault
+    run: Callable[[Rig], Try]  # Called with a rig that drives; ``rig.number`` is the try's
     reaction_limit_s: float | None = REACTION_LIMIT_S
     recovery_limit_s: float | None = RECOVERY_LIMIT_S
     rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
@@ -78,33 +73,16 @@ class Row:
     when the drive has ended: each try then has a rig of its own."""
 
 
-ROWS: list[Row] = []
+def drives_on(
+    name: str, done: str, run: Callable[[Rig], Try], expected: str = "drives on", **options: Any
+) -> Row:
+    """Make a row of a fault through which the drive goes on.
 
-
-def fault(
-    expected: str, name: str = "", done: str = "", **options: Any
-) -> Callable[[DoFault], DoFault]:
-    """Put a function into the table, under its name and docstring or ``name`` and ``done``.
-
-    ``options`` are those of `Row`.
-    """
-
-    def add(run: DoFault) -> DoFault:
-        said = done or " ".join((run.__doc__ or "").split()).rstrip(".")
-        ROWS.append(Row(name or run.__name__, said, expected, run, **options))
-        return run
-
-    return add
-
-
-def drives_on(expected: str = "drives on", **options: Any) -> Callable[[DoFault], DoFault]:
-    """Put a fault into the table through which the drive goes on.
-
-    The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
+    ``run`` returns what else is to be judged; ``rejected`` are the messages that it sent to be
     rejected.
     """
-    through: dict[str, Any] = {"goes_on": True, "recovery_limit_s": None, "flows": True}
-    return fault(expected, **{**through, **options})
+    through = {"goes_on": True, "recovery_limit_s": None, "flows": True}
+    return Row(name, done, expected, run, **{**through, **options})
 
 
 LASTS_S = 1.0
@@ -116,23 +94,18 @@ SETTLED_S = 0.5
 _FULL_AT_BYTES = 200_000  # Several of the recorder's chunks
 _CANNOT_WRITE = 1  # Exit status of a recorder that cannot write
 _FEWEST_STATES = 5
-_EXPECT_OWN = "simulator brakes by itself: no_command"
-_EXPECT_BOTH = "both ends stop, each by itself"
-_EXPECT_STOP = "edge sends safe_stop: no_fresh_state"
 
 
-def at_any_phase(number: int) -> None:
+def at_any_phase(rig: Rig) -> None:
     """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(number).uniform(0, T)))
+    time.sleep(float(np.random.default_rng(rig.number).uniform(0, T)))
 
 
 def sleep_until(time_s: float) -> None:
     time.sleep(max(0.0, time_s - time.monotonic()))
 
 
-@fault(_EXPECT_OWN)
-def edge_killed(rig: Rig, number: int) -> Try:
-    """SIGKILL to the edge runtime; a new one."""
+def edge_killed(rig: Rig) -> Try:
     begin_s = time.monotonic()
     rig.edge.kill()
     reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
@@ -141,9 +114,7 @@ def edge_killed(rig: Rig, number: int) -> Try:
     return Try(reaction_s, rig.recovered_after_s(ended_s), "no_command")
 
 
-@fault(_EXPECT_OWN, flows=True)
-def edge_stopped(rig: Rig, number: int) -> Try:
-    """Edge runtime stopped for 1 s and continued."""
+def edge_stopped(rig: Rig) -> Try:
     begin_s = time.monotonic()
     rig.edge.send(signal.SIGSTOP)
     reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
@@ -160,9 +131,7 @@ def _stopped_first(rig: Rig, since_s: float) -> list[str]:
     return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
 
 
-@fault(_EXPECT_STOP)
-def simulator_killed(rig: Rig, number: int) -> Try:
-    """SIGKILL to the simulator; a new one."""
+def simulator_killed(rig: Rig) -> Try:
     begin_s, states = time.monotonic(), rig.timeline.states
     rig.simulator.kill()
     stop = rig.stop_command(begin_s)
@@ -172,63 +141,46 @@ def simulator_killed(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-def _link_fails(fail: Callable[[Relay], None], lasts_s: float, rig: Rig, number: int) -> Try:
+def _link_fails(
+    rig: Rig, fail: Callable[[], None], restore: Callable[[], None], lasts_s: float = 0.0
+) -> Try:
     """Judge that both ends stop, and that nothing that was held up is driven on."""
     begin_s = time.monotonic()
-    fail(rig.relay)
+    fail()
     stop_s, reason = rig.logged_stop(begin_s)
-    last_s = rig.relay.last_state_s
     rig.own_brake_s(begin_s)
     sleep_until(begin_s + max(lasts_s, 2.5 * rig.period_s))  # longer than silence
-    ended_s = time.monotonic()
-    rig.relay.restore()
-    recovered_s, wrong = rig.recovered_after_s(ended_s), _stopped_first(rig, ended_s)
-    return Try(stop_s - last_s, recovered_s, reason, wrong)
+    cut_until_s = time.monotonic()
+    restore()
+    recovered_s, wrong = rig.recovered_after_s(time.monotonic()), _stopped_first(rig, cut_until_s)
+    return Try(stop_s - rig.last_state_s(before_s=begin_s), recovered_s, reason, wrong)
 
 
-for _name, _done, _fail, _for_s in (
-    ("link_cut", "TCP cut for 1 s and restored", Relay.cut, LASTS_S),
-    ("link_stalled", "TCP held for 0.6 s, then all at once", Relay.stall, STALLED_S),
-):
-    relayed = fault(_EXPECT_BOTH, _name, _done, rig={"between": "relay"})
-    relayed(partial(_link_fails, _fail, _for_s))
+def router_restarted(rig: Rig) -> Try:
+    def restart() -> None:
+        rig.router = rig.start_router()
+        rig.router.wait_for_line("ready")
 
-
-@fault(_EXPECT_BOTH, rig={"between": "router"})
-def router_restarted(rig: Rig, number: int) -> Try:
-    """SIGKILL to the router; a new one."""
-    begin_s = time.monotonic()
-    rig.router.kill()
-    stop_s, reason = rig.logged_stop(begin_s)
-    rig.router = rig.start_router()
-    ended_s = rig.router.wait_for_line("ready")
-    reaction_s = stop_s - rig.last_state_s(before_s=begin_s)
-    return Try(reaction_s, rig.recovered_after_s(ended_s), reason)
+    return _link_fails(rig, rig.router.kill, restart)
 
 
 _STEPS = (signal.SIGUSR1, signal.SIGUSR2)  # An hour ahead, and back
 
 
-@drives_on()
-def clock_stepped_edge(rig: Rig, number: int) -> Try:
-    """Edge's wall clock 1 h ahead and back."""
-    rig.edge.send(_STEPS[number % 2])
+def clock_stepped_edge(rig: Rig) -> Try:
+    rig.edge.send(_STEPS[rig.number % 2])
     time.sleep(LASTS_S)
     return Try()
 
 
-@fault(_EXPECT_STOP)
-def clock_stepped_simulator(rig: Rig, number: int) -> Try:
-    """Simulator's wall clock 1 h ahead or back: no stamp is believed before the stop."""
+def clock_stepped_simulator(rig: Rig) -> Try:
     begin_s = time.monotonic()
-    rig.simulator.send(_STEPS[number % 2])
+    rig.simulator.send(_STEPS[rig.number % 2])
     stop = rig.stop_command(begin_s)
     return Try(stop.seen_s - begin_s, rig.recovered_after_s(stop.seen_s), stop.reason)
 
 
-@fault("edge sends safe_stop: inference_too_long", flows=True, alone=True)
-def slow_inference(rig: Rig, number: int) -> Try:
-    """Inference of about 2.5 T for 0.5 s."""
+def slow_inference(rig: Rig) -> Try:
     begin_s, states = time.monotonic(), rig.timeline.states
     rig.switch(SLOW, "")
     stop = rig.stop_command(begin_s)
@@ -239,12 +191,10 @@ def slow_inference(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(time.monotonic()), stop.reason)
 
 
-@fault("drives on or safe_stop", alone=True)
-def cpu_starved(rig: Rig, number: int) -> Try:
-    """Two spinning processes for each core, 2 s."""
+def cpu_starved(rig: Rig) -> Try:
     begin_s = time.monotonic()
     words = [sys.executable, "-c", "while True: pass"]
-    spinners = [subprocess.Popen(words) for _ in range(2 * (os.cpu_count() or 1))]
+    spinners = [subprocess.Popen(words) for _ in range(2 * cores())]
     time.sleep(2.0)
     ended_s = time.monotonic()
     for spinner in spinners:
@@ -254,10 +204,7 @@ def cpu_starved(rig: Rig, number: int) -> Try:
     return Try(rig.timeline.longest_gap_s(begin_s, ended_s), recovered_s)
 
 
-_MOCKED: Any = {"rig": {"vehicle": MOCK}, "policy": "steady"}
-
-
-def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
+def _vehicle_is(word: str, rig: Rig) -> Try:
     """Judge that it stops for the fault, stays stopped after it, and drives once re-armed."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
@@ -276,22 +223,7 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong)
 
 
-for _word, _done, _after_s in (
-    ("silent", "vehicle silent", 0.0),
-    ("stuck", "vehicle's pedal stuck", 0.0),
-    ("lying", "vehicle reports a speed that cannot be", 0.0),
-    ("self_braking", "vehicle says that it brakes by itself while it is to drive", 0.1),
-):
-    fault(
-        "edge sends safe_stop: vehicle_fault; stays until re-armed", f"vehicle_{_word}", _done,
-        **_MOCKED, flows=True, reaction_limit_s=REACTION_LIMIT_S + _after_s,
-    )(partial(_vehicle_is, _word))  # fmt: skip
-
-
-@fault("nothing; then waits for a re-arm", reaction_limit_s=None, policy="steady",
-       rig={"vehicle": MOCK, "sender": True})  # fmt: skip
-def vehicle_fault_between_episodes(rig: Rig, number: int) -> Try:
-    """Emergency stop pressed for 1 s after the end of an episode."""
+def vehicle_fault_between_episodes(rig: Rig) -> Try:
     rig.sender.running.clear()
     rig.sender.send_next(final=True)
     time.sleep(SETTLED_S)
@@ -306,9 +238,7 @@ def vehicle_fault_between_episodes(rig: Rig, number: int) -> Try:
     return Try(None, rig.drive_again(), "vehicle_fault", wrong)
 
 
-@fault("stands; stays until an enable succeeds", reaction_limit_s=None, **_MOCKED)
-def vehicle_not_enabled(rig: Rig, number: int) -> Try:
-    """Vehicle at fault; the driver's `enable` raises at the re-arm."""
+def vehicle_not_enabled(rig: Rig) -> Try:
     rig.switch(VEHICLE, "lying")
     rig.stop_command(time.monotonic())
     rig.switch(VEHICLE, "locked")
@@ -323,21 +253,16 @@ def vehicle_not_enabled(rig: Rig, number: int) -> Try:
     return Try(None, rig.drive_again(), "vehicle_fault", wrong)
 
 
-@drives_on("recorder says so and ends; the recording is readable; drives on")
-def disk_full(rig: Rig, number: int) -> Try:
-    """Disk full while recording."""
+def disk_full(rig: Rig) -> Try:
     recorder, path = rig.start_recorder()
     # No file may grow beyond a limit: the same failing write as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (_FULL_AT_BYTES, _FULL_AT_BYTES))
-    status, said = recorder.wait(), recorder.errors
-    told = status == _CANNOT_WRITE and "error: recording" in said
-    wrong = [] if told else [f"it ended with status {status} and said {said[-200:]!r}"]
+    told = recorder.wait() == _CANNOT_WRITE and "error: recording" in recorder.errors
+    wrong = [] if told else [f"it said {recorder.errors[-200:]!r}"]
     return Try(wrong=wrong + _too_few(states_in(path)))
 
 
-@drives_on("at most 1 s of the recording is lost; drives on")
-def recorder_killed(rig: Rig, number: int) -> Try:
-    """SIGKILL to the recorder."""
+def recorder_killed(rig: Rig) -> Try:
     recorder, path = rig.start_recorder()
     time.sleep(2.5)
     sent = len(rig.timeline.states)
@@ -363,15 +288,12 @@ def _too_few(states: list[State]) -> list[str]:
 
 SHORT_S, RIDING_S = 0.4, 0.3
 """An outage through which it rides, and where in one it surely rides."""
-_LATER_S = REACTION_LIMIT_S + RIDE_S
-_VEHICLE = {"ride_s": RIDE_S, "vehicle": MOCK}
 
 
-def _link_slows(periods: float, rig: Rig, number: int) -> Try:
+def _link_slows(periods: float, rig: Rig) -> Try:
     """Judge that it stops though states go on coming, and that no late one is driven on."""
     time.sleep(SETTLED_S)
-    begin_s, entries = time.monotonic(), rig.task.observation.values()
-    state_bytes = sum(math.prod(e.shape) * np.dtype(e.dtype).itemsize for e in entries)
+    begin_s, state_bytes = time.monotonic(), len(encode(noisy_state(0, rig.task)))
     rig.relay.throttle(state_bytes / (periods * rig.period_s))
     stop_s, reason = rig.logged_stop(begin_s)
     time.sleep(LASTS_S)
@@ -380,29 +302,6 @@ def _link_slows(periods: float, rig: Rig, number: int) -> Try:
     ended_s = time.monotonic()
     recovered_s = rig.drive_again() if rig.has_vehicle else rig.recovered_after_s(ended_s)
     return Try(None, recovered_s, reason, late)
-
-
-for _name, _periods, _rig in (
-    ("link_slow", 1.4, {}), ("ride_link_slow", 1.4, _VEHICLE), ("ride_link_slower", 4.0, _VEHICLE),
-):  # fmt: skip
-    fault(_EXPECT_STOP, _name,
-          f"TCP slower than the states: one comes each {_periods:g} T, ever later",
-          reaction_limit_s=None, policy="steady",
-          rig={**_rig, "between": "relay"})(partial(_link_slows, _periods))  # fmt: skip
-
-
-@fault("rides: nobody brakes", reaction_limit_s=_LATER_S, rig=_VEHICLE, policy="steady")
-def ride_states_lost(rig: Rig, number: int) -> Try:
-    """No states for 0.4 s."""
-    pause = partial(rig.simulator.send, signal.SIGSTOP)
-    return _rides(rig, pause, partial(rig.simulator.send, signal.SIGCONT))
-
-
-@fault("rides: nobody brakes", reaction_limit_s=_LATER_S, policy="steady",
-       rig={**_VEHICLE, "between": "relay"})  # fmt: skip
-def ride_link_stalled(rig: Rig, number: int) -> Try:
-    """TCP held for 0.4 s, both ways, then all at once."""
-    return _rides(rig, rig.relay.stall, rig.relay.restore)
 
 
 def _rides(rig: Rig, fail: Callable[[], None], restore: Callable[[], None]) -> Try:
@@ -422,7 +321,7 @@ def _rides(rig: Rig, fail: Callable[[], None], restore: Callable[[], None]) -> T
     return Try(rig.timeline.longest_gap_s(begin_s, end_s), recovered_s, wrong=wrong)
 
 
-def _stops(reason: str, do: Callable[[Rig], Any] | None, rig: Rig, number: int) -> Try:
+def _stops(reason: str, do: Callable[[Rig], Any] | None, rig: Rig) -> Try:
     """Judge that it stops for what is done while it rides, and stays stopped."""
     time.sleep(SETTLED_S)
     begin_s = time.monotonic()
@@ -448,16 +347,79 @@ def _stops(reason: str, do: Callable[[Rig], Any] | None, rig: Rig, number: int) 
     return Try(stop.seen_s - since_s, None, stop.reason, wrong)
 
 
-for _name, _done, _reason, _do, _limit_s in (
-    ("too_long", "no states for longer than it may ride", "no_fresh_state", None, _LATER_S),
-    ("vehicle_fault", "vehicle reports what cannot be while it is ridden", "vehicle_fault",
-     lambda rig: rig.switch(VEHICLE, "lying"), REACTION_LIMIT_S),
-    ("ended", "edge runtime ended while it rides; a new one", "runtime_ended",
-     lambda rig: rig.edge.send(signal.SIGTERM), REACTION_LIMIT_S),
-):  # fmt: skip
-    fault(f"edge sends safe_stop: {_reason}; stays stopped", f"ride_{_name}", _done,
-          reaction_limit_s=_limit_s, recovery_limit_s=None, rig=_VEHICLE,
-          policy="steady")(partial(_stops, _reason, _do))  # fmt: skip
-fault(_EXPECT_OWN, "ride_edge_killed",
-      "SIGKILL to the edge runtime, which the simulator rides out; a new one",
-      reaction_limit_s=_LATER_S, rig={"ride_s": RIDE_S})(edge_killed)  # fmt: skip
+_OWN = "simulator brakes by itself: no_command"
+_BOTH = "both ends stop, each by itself"
+_STOP = "edge sends safe_stop: no_fresh_state"
+_REARM = "edge sends safe_stop: vehicle_fault; stays until re-armed"
+_RIDES = "rides: nobody brakes"
+_LATER_S = REACTION_LIMIT_S + RIDE_S
+_RELAY, _RIDING = {"between": "relay"}, {"ride_s": RIDE_S, "vehicle": MOCK}
+_STEADY: Any = {"policy": "steady"}
+_MOCKED: Any = {**_STEADY, "rig": {"vehicle": MOCK}}
+_STUCK: Any = {**_MOCKED, "flows": True}
+_SLOW: Any = {**_STEADY, "reaction_limit_s": None}
+_RIDDEN: Any = {**_STEADY, "rig": _RIDING, "reaction_limit_s": _LATER_S}
+_ENDED: Any = {**_RIDDEN, "recovery_limit_s": None}
+ROWS = [
+    Row("edge_killed", "SIGKILL to the edge runtime; a new one", _OWN, edge_killed),
+    Row("edge_stopped", "Edge runtime stopped for 1 s and continued", _OWN, edge_stopped,
+        flows=True),
+    Row("simulator_killed", "SIGKILL to the simulator; a new one", _STOP, simulator_killed),
+    Row("link_cut", "TCP cut for 1 s and restored", _BOTH,
+        lambda rig: _link_fails(rig, rig.relay.cut, rig.relay.restore, LASTS_S), rig=_RELAY),
+    Row("link_stalled", "TCP held for 0.6 s, then all at once", _BOTH,
+        lambda rig: _link_fails(rig, rig.relay.stall, rig.relay.restore, STALLED_S), rig=_RELAY),
+    Row("router_restarted", "SIGKILL to the router; a new one", _BOTH, router_restarted,
+        rig={"between": "router"}),
+    drives_on("clock_stepped_edge", "Edge's wall clock 1 h ahead and back", clock_stepped_edge),
+    Row("clock_stepped_simulator",
+        "Simulator's wall clock 1 h ahead or back: no stamp is believed before the stop",
+        _STOP, clock_stepped_simulator),
+    Row("slow_inference", "Inference of about 2.5 T for 0.5 s",
+        "edge sends safe_stop: inference_too_long", slow_inference, flows=True, alone=True),
+    Row("cpu_starved", "Two spinning processes for each core, 2 s", "drives on or safe_stop",
+        cpu_starved, alone=True),
+    Row("vehicle_silent", "vehicle silent", _REARM, partial(_vehicle_is, "silent"), **_STUCK),
+    Row("vehicle_stuck", "vehicle's pedal stuck", _REARM, partial(_vehicle_is, "stuck"), **_STUCK),
+    Row("vehicle_lying", "vehicle reports a speed that cannot be", _REARM,
+        partial(_vehicle_is, "lying"), **_STUCK),
+    Row("vehicle_self_braking", "vehicle says that it brakes by itself while it is to drive",
+        _REARM, partial(_vehicle_is, "self_braking"), **_STUCK,
+        reaction_limit_s=REACTION_LIMIT_S + 0.1),
+    Row("vehicle_fault_between_episodes",
+        "Emergency stop pressed for 1 s after the end of an episode",
+        "nothing; then waits for a re-arm", vehicle_fault_between_episodes, **_SLOW,
+        rig={"vehicle": MOCK, "sender": True}),
+    Row("vehicle_not_enabled", "Vehicle at fault; the driver's `enable` raises at the re-arm",
+        "stands; stays until an enable succeeds", vehicle_not_enabled, **_MOCKED,
+        reaction_limit_s=None),
+    drives_on("disk_full", "Disk full while recording", disk_full,
+              "recorder says so and ends; the recording is readable; drives on"),
+    drives_on("recorder_killed", "SIGKILL to the recorder", recorder_killed,
+              "at most 1 s of the recording is lost; drives on"),
+    Row("link_slow", "TCP slower than the states: one comes each 1.4 T, ever later", _STOP,
+        partial(_link_slows, 1.4), **_SLOW, rig=_RELAY),
+    Row("ride_link_slow", "TCP slower than the states: one comes each 1.4 T, ever later", _STOP,
+        partial(_link_slows, 1.4), **_SLOW, rig={**_RIDING, **_RELAY}),
+    Row("ride_link_slower", "TCP slower than the states: one comes each 4 T, ever later", _STOP,
+        partial(_link_slows, 4.0), **_SLOW, rig={**_RIDING, **_RELAY}),
+    Row("ride_states_lost", "No states for 0.4 s", _RIDES,
+        lambda rig: _rides(rig, partial(rig.simulator.send, signal.SIGSTOP),
+                           partial(rig.simulator.send, signal.SIGCONT)), **_RIDDEN),
+    Row("ride_link_stalled", "TCP held for 0.4 s, both ways, then all at once", _RIDES,
+        lambda rig: _rides(rig, rig.relay.stall, rig.relay.restore),
+        **{**_RIDDEN, "rig": {**_RIDING, **_RELAY}}),
+    Row("ride_too_long", "no states for longer than it may ride", f"{_STOP}; stays stopped",
+        partial(_stops, "no_fresh_state", None), **_ENDED),
+    Row("ride_vehicle_fault", "vehicle reports what cannot be while it is ridden",
+        "edge sends safe_stop: vehicle_fault; stays stopped",
+        partial(_stops, "vehicle_fault", lambda rig: rig.switch(VEHICLE, "lying")),
+        **{**_ENDED, "reaction_limit_s": REACTION_LIMIT_S}),
+    Row("ride_ended", "edge runtime ended while it rides; a new one",
+        "edge sends safe_stop: runtime_ended; stays stopped",
+        partial(_stops, "runtime_ended", lambda rig: rig.edge.send(signal.SIGTERM)),
+        **{**_ENDED, "reaction_limit_s": REACTION_LIMIT_S}),
+    Row("ride_edge_killed",
+        "SIGKILL to the edge runtime, which the simulator rides out; a new one", _OWN,
+        edge_killed, reaction_limit_s=_LATER_S, rig={"ride_s": RIDE_S}),
+]  # fmt: skip

@@ -16,17 +16,18 @@ from typing import Any
 
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
+from hil_tests.faults import hunter, messages, rows
 from hil_tests.faults.observe import later_s, longest_gap_s
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase
-from hil_tests.processes import POLICY, trusting
+from hil_tests.processes import POLICY
 from hil_tests.testing.policies import TASK, write_policy
 
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-POLICIES = {"steady": ("constant", 0.6), "full": ("constant", 1.0), "mean": ("mean", 0.0)}
+ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS]
+POLICIES = {"steady": ("constant", 0.6), "mean": ("mean", 0.0)}
 """Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
 frames, the brake on all others."""
 
@@ -57,11 +58,12 @@ def run_faults(
     given = load_policy(policy, public_key, allow_unsigned=True).manifest
     ended = threading.Event()  # No more tries are begun
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
-        policies = {"given": trusting(policy, public_key)}
+        policies = {"given": ["--policy", str(policy), "--allow-unsigned"]}
+        policies["given"] += ["--public-key", public_key] if public_key else []
         for kind, made in POLICIES.items():
             path = Path(folder, f"{kind}.onnx")
             write_policy(path, *made)
-            policies[kind] = trusting(path, None)
+            policies[kind] = ["--policy", str(path), "--allow-unsigned"]
 
         def do(row: Row) -> dict[str, Any]:
             task, outcome = given if row.policy == "given" else TASK, Outcome()
@@ -77,10 +79,10 @@ def run_faults(
 
         found: dict[str, dict[str, Any]] = {}
         for alone in (False, True):
-            rows = [row for row in chosen if row.alone == alone]
+            some = [row for row in chosen if row.alone == alone]
             with ThreadPoolExecutor(1 if alone else jobs) as pool:
                 try:
-                    found.update(zip((row.name for row in rows), pool.map(do, rows), strict=True))
+                    found.update(zip((row.name for row in some), pool.map(do, some), strict=True))
                 except BaseException:  # ^C, too
                     ended.set()
                     raise
@@ -106,14 +108,14 @@ def use_rig(
     with rig:
         usable = True
         while usable and len(outcome.tries) < tries and not ended.is_set():
-            number, begin_s = len(outcome.tries), time.monotonic()
+            rig.number, begin_s = len(outcome.tries), time.monotonic()
             try:
                 rig.wait_until_driving()
-                at_any_phase(number)
+                at_any_phase(rig)
                 begin_s = time.monotonic()
-                done, usable = do_fault(row, rig, number), row.counted != "simulator"
+                done, usable = do_fault(row, rig), row.counted != "simulator"
             except (OSError, UserError) as error:  # a time-out, or a process that is gone
-                done, usable = Try(wrong=[f"try {number}: {error}"]), False
+                done, usable = Try(wrong=[f"try {rig.number}: {error}"]), False
             gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
             stalled = row.flows and gap_s > STALLED_PERIODS * rig.period_s
             if stalled and usable and outcome.disturbed < MOST_DISTURBED:
@@ -125,11 +127,11 @@ def use_rig(
     outcome.crashes += rig.crashes
 
 
-def do_fault(row: Row, rig: Rig, number: int) -> Try:
+def do_fault(row: Row, rig: Rig) -> Try:
     """Do the fault of a row once, and judge it where the drive was to go on."""
     before = rig.edge_counts() if row.counted == "edge" else Counter()
     begin_s = time.monotonic()
-    done = row.run(rig, number)
+    done = row.run(rig)
     if not row.goes_on:
         return done
     end_s = time.monotonic()
@@ -151,35 +153,28 @@ def report_row(row: Row, outcome: Outcome, later_s: float = 0.0) -> dict[str, An
     For another T than 0.1 s a reaction may take ``later_s`` longer, which is the difference of 2 T,
     and a recovery that of the five states that it takes.
     """
-    times = {
-        **_times("reaction", "reactions", outcome, row.reaction_limit_s, later_s),
-        **_times("recovery", "recoveries", outcome, row.recovery_limit_s, 2.5 * later_s),
-    }
-    late = times["reactions_late"] + times["recoveries_late"]
+    report: dict[str, Any] = {"name": row.name, "done": row.done, "expected": row.expected}
+    report |= {"tries": len(outcome.tries), "disturbed": outcome.disturbed}
+    late = 0
+    for kind, limit_s, more_s in (
+        ("reaction", row.reaction_limit_s, later_s),
+        ("recovery", row.recovery_limit_s, 2.5 * later_s),
+    ):
+        most_ms = math.inf if limit_s is None else round((limit_s + more_s) * 1e3, 1)
+        times_s = [getattr(each, f"{kind}_s") for each in outcome.tries]
+        times_ms = [round(time_s * 1e3, 1) for time_s in times_s if time_s is not None]
+        figures: dict[str, Any] = {"min": min, "median": statistics.median, "max": max}
+        report[f"{kind}_ms"] = {name: of(times_ms) for name, of in figures.items() if times_ms}
+        report[f"{kind}_limit_ms"] = None if limit_s is None else most_ms
+        report[f"{kind}_late"] = sum(time_ms > most_ms for time_ms in times_ms)
+        late += report[f"{kind}_late"]
     wrong = [text for each in outcome.tries for text in each.wrong]
     return {
-        **{name: getattr(row, name) for name in ("name", "done", "expected")},
-        "tries": len(outcome.tries),
-        "disturbed": outcome.disturbed,
-        **times,
+        **report,
         "reasons": dict(Counter(each.reason for each in outcome.tries if each.reason)),
         "rejected": dict(sum((Counter(each.rejected) for each in outcome.tries), Counter())),
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,
         "passed": not (late or wrong or outcome.unsafe or outcome.crashes),
-    }
-
-
-def _times(
-    kind: str, plural: str, outcome: Outcome, limit_s: float | None, later_s: float
-) -> dict[str, Any]:
-    most_ms = math.inf if limit_s is None else round((limit_s + later_s) * 1e3, 1)
-    found = [getattr(each, f"{kind}_s") for each in outcome.tries]
-    found_ms = [round(value_s * 1e3, 1) for value_s in found if value_s is not None]
-    figures: dict[str, Any] = {"min": min, "median": statistics.median, "max": max}
-    return {
-        f"{kind}_ms": {name: of(found_ms) for name, of in figures.items()} if found_ms else None,
-        f"{kind}_limit_ms": None if limit_s is None else most_ms,
-        f"{plural}_late": sum(value_ms > most_ms for value_ms in found_ms),
     }

@@ -1,4 +1,6 @@
-"""A Hunter of arithmetic on a CAN bus: frames and time in, frames out. `process.py` has the clock.
+"""``python -m hil_tests mock_hunter``: a Hunter of arithmetic on a CAN bus, with its faults.
+
+`MockHunter` has no clock: frames and time in, frames out. `serve` runs it on a bus.
 
 The rules of the chassis come first: CONTROL says who drives, BITS which errors stop it, FAULTS what
 can be switched on. The manual leaves open what follows when the remote control or the emergency
@@ -9,15 +11,24 @@ is (and that one is documented).
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import math
+import queue
+import signal
+import sys
+import threading
+import time
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import NamedTuple
 
-from edge_runtime.util import UserError
-from edge_runtime.vehicles.hunter import protocol
+import can
+
+from edge_runtime.cli import examples
+from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus, protocol
 from edge_runtime.vehicles.hunter.protocol import Sent, WheelMotion
 from edge_runtime.vehicles.mapping import clamp
 
@@ -104,7 +115,7 @@ class Parameters:
     max_speed_mps: float
     max_inner_rad: float
     command_timeout_s: float = 0.5
-    # Assumed, since the manual says nothing of the actuators: measure them, and pass them by --set.
+    # Assumed, since the manual says nothing of the actuators: measure them.
     dead_time_s: float = 0.03  # From a command on the bus to the first movement of an actuator
     speed_time_constant_s: float = 0.1
     acceleration_mps2: float = 2.0
@@ -117,16 +128,6 @@ MODELS: dict[str, Parameters] = {
     "hunter-2.0": Parameters(1.5, 0.576),
     "hunter-se": Parameters(4.8, 0.400, acceleration_mps2=3.0, braking_mps2=4.0),
 }
-TUNABLE = [field.name for field in fields(Parameters)]
-
-
-def make_parameters(model: str, changes: Mapping[str, float]) -> Parameters:
-    """Return a model's row with some numbers replaced. Raises UserError for bad numbers."""
-    if unknown := changes.keys() - TUNABLE:
-        raise UserError(f"no parameter {min(unknown)!r}; choose from {', '.join(TUNABLE)}")
-    if not all(0.0 < value < math.inf for value in changes.values()):
-        raise UserError(f"parameters must be above 0 and finite, not {dict(changes)}")
-    return replace(MODELS[model], **changes)
 
 
 class MockHunter:
@@ -255,7 +256,9 @@ class MockHunter:
     def _report(self, now_s: float) -> None:
         with_slow = self._tick % SLOW_EVERY == 0
         if "frozen" not in self.faults or not self._slow:
-            self._fast = self._fast_frames()
+            speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
+            motion = protocol.MOTION_STATUS.sent(WheelMotion(speed_mps, self.inner_rad))
+            self._fast = [motion, *(row.sent(_MOTOR_FAST) for row in protocol.MOTORS_FAST)]
             self._slow = self._slow_frames() if with_slow else self._slow
         if self.faults & {"silent", "bus_off"}:
             return
@@ -264,12 +267,6 @@ class MockHunter:
             release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
         frames = self._fast + (self._slow if with_slow else [])
         self._outgoing.extend((release_s, frame) for frame in frames)
-
-    def _fast_frames(self) -> list[Sent]:
-        """Make 0x221 and 0x251 to 0x253: every 20 ms."""
-        speed_mps = self.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
-        motion = protocol.MOTION_STATUS.sent(protocol.WheelMotion(speed_mps, self.inner_rad))
-        return [motion, *(row.sent(_MOTOR_FAST) for row in protocol.MOTORS_FAST)]
 
     def _slow_frames(self) -> list[Sent]:
         """Make 0x211 and 0x261 to 0x263: every 100 ms."""
@@ -282,3 +279,69 @@ class MockHunter:
         status = (self.state, mode, _BATTERY_V, faults, int(self.brake_locked), counter)
         motors = [row.sent(_MOTOR_SLOW) for row in protocol.MOTORS_SLOW]
         return [protocol.SYSTEM_STATUS.sent(status), *motors]
+
+
+EXAMPLE = examples(
+    "python -m hil_tests mock_hunter",
+    "python -m hil_tests mock_hunter --bus socketcan:vcan0",
+)
+_tell = partial(print, flush=True)
+Orders = queue.SimpleQueue[tuple[str, bool]]  # a fault's name, and whether it is switched on
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        f"{parser.description} "
+        "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
+        f" Known are {', '.join(FAULTS)}."
+    )
+    add = parser.add_argument
+    add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
+    add("--model", default="hunter-2.0", choices=list(MODELS), help="which Hunter")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Be a Hunter until a signal comes."""
+    ending, orders = threading.Event(), Orders()
+    with open_bus(parse_bus(arguments.bus)) as bus:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: ending.set())
+        threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
+        _tell(f"ready bus={arguments.bus} model={arguments.model}")
+        serve(MockHunter(MODELS[arguments.model], time.monotonic()), bus, orders, ending)
+    return 0
+
+
+def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading.Event) -> None:
+    """Run a mock on a bus; print every change as one line with its time (monotonic)."""
+    said = ""
+    while not ending.is_set():
+        while not orders.empty():
+            (name, on), now_s = orders.get(), time.monotonic()
+            hunter.switch(name, on, now_s)
+            _tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
+        for frame, data in hunter.due(time.monotonic()):
+            message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
+            with contextlib.suppress(can.CanError):  # the driver notices
+                bus.send(message)
+        if (words := hunter.describe()) != said:
+            said = words
+            _tell(f"chassis t={time.monotonic():.6f} {words}")
+        with contextlib.suppress(can.CanError):  # what a socket cannot unpack is no frame
+            heard = bus.recv(max(0.0, hunter.next_s - time.monotonic()))
+            if heard is None or heard.is_extended_id or heard.is_remote_frame or heard.is_fd:
+                continue  # the chassis has data frames with an 11-bit identifier only
+            if not heard.is_error_frame:
+                hunter.receive(heard.arbitration_id, bytes(heard.data), time.monotonic())
+
+
+def _read_orders(orders: Orders) -> None:
+    """Read `NAME on` or `NAME off`, line by line, from standard input."""
+    with open(0, errors="replace", closefd=False) as lines:
+        for line in lines:
+            name, _, word = line.strip().partition(" ")
+            if name in FAULTS and word in ("on", "off"):
+                orders.put((name, word == "on"))
+            else:
+                message = f"error: {line.strip()!r} is no order: use NAME on, or NAME off"
+                print(message, file=sys.stderr, flush=True)

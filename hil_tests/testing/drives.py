@@ -22,9 +22,8 @@ from hil_tests.processes import PATIENCE_S, Process, wait_until
 from hil_tests.testing.messages import make_state
 from hil_tests.testing.policies import T, write_policy
 
-TOY, SHORT_TOY, SLOW_TOY = (
-    f"hil_tests.testing.environments:{name}-v0"
-    for name in ("BridgeToy", "BridgeToyShort", "BridgeToySlow")
+TOY, SLOW_TOY = (
+    f"hil_tests.testing.environments:{name}-v0" for name in ("BridgeToy", "BridgeToySlow")
 )
 LEFT_TURN = Path(__file__).parents[1] / "recordings" / "left_turn.mcap"
 

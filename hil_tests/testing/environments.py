@@ -67,7 +67,6 @@ class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 VARIANTS: dict[str, dict[str, float]] = {
     "BridgeToy-v0": {},
-    "BridgeToyShort-v0": {"max_steps": 25},
     # Long, and slow enough for a person (or a test) to kill something in the middle.
     "BridgeToySlow-v0": {"goal_m": 1000.0, "max_steps": 60, "wall_s": 0.02},
 }

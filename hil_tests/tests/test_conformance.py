@@ -7,7 +7,7 @@ from edge_runtime.controller import ActionLimit
 from edge_runtime.vehicles.mock import MockVehicle
 from hil_tests.__main__ import main
 from hil_tests.conformance import RULES
-from hil_tests.faults.rig import ChassisProcess, free_bus
+from hil_tests.faults.rig import Chassis, free_bus
 from hil_tests.testing.commands import exit_status
 
 LIMITS = {
@@ -120,7 +120,6 @@ def test_the_hunter_keeps_every_rule_over_the_mock_chassis(tmp_path, capsys):
     bus, config = free_bus(), tmp_path / "edge.toml"
     link = "connect = 'tls/10.0.0.1:7447'"  # It opens none, and has no --tls.
     config.write_text(f"{link}\nvehicle.driver = 'hunter'\nvehicle.hunter.bus = '{bus}'\n")
-    chassis = ChassisProcess(bus)
-    with chassis.process:
+    with Chassis(bus):
         status = exit_status(main, ["conformance", "--config", str(config)])
     assert status == 0, capsys.readouterr().out

@@ -23,7 +23,7 @@ LIMITS = {"delay_ms": 300.0, "jitter_ms": 25.0, "tail_jitter_ms": 60.0, "loss_pe
 
 
 def decided(share, promise, rng):
-    test, verdict = SequentialTest(promise, 0.95), None
+    test, verdict = SequentialTest(promise), None
     while verdict is None:
         verdict = test.add(rng.random() < share)
     return verdict, test.drives
@@ -74,7 +74,7 @@ def test_bisection_finds_a_planted_edge_at_the_resolution(data):
     name = data.draw(st.sampled_from([name for name in AXES if name != "burst_messages"]))
     most, step = AXES[name]
     steps = data.draw(st.integers(1, round(most / step) - 1))
-    search = Search(lucky(lambda at: at[name] / (steps * step)), 0.95, 0.95)
+    search = Search(lucky(lambda at: at[name] / (steps * step)), 0.95)
     found = search.edge(lambda k: {name: k * step}, round(most / step))
     assert found["steps"] == (steps, steps + 1)
     sides = [search.tried[found[side]]["verdict"] for side in ("inside", "outside")]
@@ -87,7 +87,7 @@ def test_the_axes_are_searched_alone_and_together(jointly, share):
     def harm(at):
         return jointly(at[name] / limit for name, limit in LIMITS.items())
 
-    edges = find_edges(Search(lucky(harm), 0.95, 0.95))
+    edges = find_edges(Search(lucky(harm), 0.95))
     together = edges.pop("together")
     assert {name: edge["limit"] for name, edge in edges.items()} == LIMITS
     assert edges["loss_percent"]["outside"] == "loss=13%"
@@ -97,7 +97,7 @@ def test_the_axes_are_searched_alone_and_together(jointly, share):
 
 def test_what_fails_without_a_network_has_no_envelope():
     with pytest.raises(UserError):
-        find_edges(Search(lambda spec, seeds: [seed % 5 > 0 for seed in seeds], 0.95, 0.95))
+        find_edges(Search(lambda spec, seeds: [seed % 5 > 0 for seed in seeds], 0.95))
 
 
 def test_bursts_come_on_top_of_the_loss():

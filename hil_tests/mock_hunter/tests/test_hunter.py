@@ -2,7 +2,7 @@
 
 import pytest
 
-from hil_tests.faults.rig import ChassisProcess, free_bus
+from hil_tests.faults.rig import Chassis, free_bus
 from hil_tests.mock_hunter import BITS, MODELS, MockHunter
 
 P = MODELS["hunter-2.0"]
@@ -141,11 +141,10 @@ def test_a_person_and_the_brake_outrank_the_bus_and_give_control_back(name, byte
 
 
 def test_as_a_process_it_obeys_orders_and_ends_on_a_signal():
-    chassis = ChassisProcess(free_bus())
-    with chassis.process:
+    with Chassis(free_bus()) as chassis:
         for words in ("meteor on", "\udcff"):  # the second is no UTF-8
-            chassis.process.tell(words)
-            chassis.process.wait_for_line("is no order")
+            chassis.tell(words)
+            chassis.wait_for_line("is no order")
         chassis.switch("remote", True)
-        chassis.process.wait_for_line("control=remote ")
-    assert chassis.process.end() == 0
+        chassis.wait_for_line("control=remote ")
+    assert chassis.end() == 0
