@@ -186,7 +186,10 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     directory = str(run.directory)
     words = ["--config", f"{directory}/config.toml", "--episodes", "5", "--resume"]
     words += ["--out", directory]
-    assert main(["train", *words]) == 0
+    with pytest.raises(UserError, match="is typed: give --"):
+        main(["train", *words])
+    typed = ["--scenario", ROVER, "--algorithm", row]
+    assert main(["train", *words, *typed]) == 0
     assert len(run.metrics) == 5
 
 
