@@ -124,6 +124,8 @@ def claimed(directory: Path) -> Iterator[None]:
     with held(directory) as mine:
         if not mine:
             raise UserError(f"{directory} is being trained in by another process")
+        for draft in directory.glob(f".{16 * '[0-9a-f]'}.tmp"):  # Of a writer that was killed
+            draft.unlink(missing_ok=True)
         try:
             yield
         finally:

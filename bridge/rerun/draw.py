@@ -36,6 +36,7 @@ RED, GREY = (220, 50, 50), (120, 124, 130)
 MARGIN_M = 8.0  # Ground shown beyond the path
 CAMERA = "camera"  # From here the road is seen
 MOST_LINES = 16  # Numbers of an observation that a plot can show
+MOST_DRAWN = 2**32  # Steps on the time axis: rerun counts its ns in 64 bits
 PICTURE_INTERVAL_S = 0.1
 """Ten pictures a second, as many as a control period of ours makes, are plenty for an eye."""
 WHOLE = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
@@ -320,6 +321,7 @@ class WireLog:
 
     def _stand_at(self, session: str, episode: int, step: int) -> None:
         step += self._starts.setdefault((session, episode), self._end_step)
+        step = min(step, MOST_DRAWN)
         self._end_step = max(self._end_step, step + 1)
         self._canvas.stand_at(step, sim_time=step * self._period_s)
 

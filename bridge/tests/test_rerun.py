@@ -107,6 +107,9 @@ def test_episodes_stand_end_to_end_and_a_second_session_behind_the_first(log):
         log.write_state(make_state(step, session=session, episode=episode), 10**18)
     calls = log._canvas.recording.set_time.call_args_list
     assert [call.kwargs["sequence"] for call in calls if call.args == ("step",)] == [0, 7, 8, 5, 9]
+    for episode in range(100):  # However long they say that they are.
+        log.write_state(make_state(10**8, episode=episode, sim_time_s=1.99e8), 10**18)
+    assert log._canvas.recording.set_time.call_args.kwargs["duration"] * 1e9 < 2**63
 
 
 def test_a_scene_survives_the_wire_without_what_is_not_drawn():

@@ -92,7 +92,9 @@ def status(releases: Releases, service: Systemd | None) -> int:
     if current is None:
         raise UserError(f"nothing is installed in {releases.root}")
     is_whole = releases.is_whole(current)
-    about = json.loads((releases.folder(current) / release.MANIFEST).read_bytes())
+    about = {}
+    with contextlib.suppress(OSError, ValueError):
+        about = json.loads((releases.folder(current) / release.MANIFEST).read_bytes())
     about.update(current=current, is_whole=is_whole, previous=releases.linked(PREVIOUS))
     about["service"] = service.describe() if service else "not run by the installer"
     about["trusts"] = releases.trusted.read_text()
@@ -106,7 +108,7 @@ def install(releases: Releases, service: Systemd | None, path: str, trust: str |
     `trust` is the path of a public key. Raises UserError where the bundle may not be installed
     here, UnhealthyError where it may not run and the board is as before.
     """
-    kept = releases.trusted.read_text() if releases.trusted.exists() else None
+    kept = releases.trusted.read_text(errors="replace") if releases.trusted.exists() else None
     key = release.read_public_key(trust) if trust is not None else kept
     if key is None:
         raise UserError("this board trusts no key yet: name your public key with --trust")
@@ -174,7 +176,8 @@ def _switch(releases: Releases, service: Systemd, version: str) -> None:
             signal.signal(one, signal.SIG_IGN)
         with contextlib.suppress(Exception):  # What does not stop is still replaced.
             service.stop()
-        releases.move(BEFORE, CURRENT)
+        if releases.linked(CURRENT) != good:
+            releases.move(BEFORE, CURRENT)
         if good:
             with contextlib.suppress(Exception):  # On a full disk the new units stay.
                 service.prepare(releases.folder(good))

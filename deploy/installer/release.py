@@ -10,8 +10,8 @@ ROOT/previous -> releases/V  the release that `rollback` goes back to
 ROOT/.before  -> releases/V  during a switch: the release that was current before it
 ROOT/state/hold              locked during a switch, and then the service sends no command
 
-Each link changes by one rename. ROOT/releases and ROOT/state are the installer's alone: it removes
-every release that no link names. All else in ROOT stays.
+Each link changes by one rename. A release that no link names is removed; a folder is one only with
+its contents.json. ROOT/state is the installer's alone. All else in ROOT stays.
 
 A release holds the bundle's files, and
 
@@ -25,7 +25,6 @@ from __future__ import annotations
 import base64
 import compileall
 import contextlib
-import fcntl
 import hashlib
 import io
 import json
@@ -51,6 +50,8 @@ MANIFEST, CONFIG, WHEELS, TLS = "manifest.json", "config.toml", "wheels/", "tls/
 POLICY, PUBLIC_KEY = "policy.onnx", "policy.pub"
 SITE, LAUNCHER, CONTENTS = "site-packages", "bin/phil-edge", "contents.json"
 CURRENT, PREVIOUS, BEFORE = "current", "previous", ".before"
+LINKS = CURRENT, PREVIOUS, BEFORE, ".next"
+DRAFT, DAMAGED = ".draft", ".damaged"
 _MAX_BUNDLE_MIB = 1024
 _ED25519 = bytes.fromhex("302a300506032b6570032100")
 """Precedes the 32 bytes of a key in a SubjectPublicKeyInfo of Ed25519 (RFC 8410)."""
@@ -146,14 +147,17 @@ class Releases:
     def linked(self, name: str) -> str | None:
         """The version that a link names; None without the link or its release."""
         link = self.root / name
-        return link.resolve().name if link.exists() else None
+        return link.resolve().name if link.is_symlink() and link.exists() else None
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Be the only installer here; before and after, remove what no link names.
 
-        Raises UserError where another installer is at work.
+        Raises UserError where another installer is at work, or a link's place is taken.
         """
+        for link in (self.root / name for name in LINKS):
+            if link.exists() and not link.is_symlink():
+                raise UserError(f"{link} is no link of an installation; move it away")
         for folder in (self._releases, self.hold.parent):
             folder.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as undo:
@@ -168,9 +172,10 @@ class Releases:
     def _tidy(self) -> None:
         if self.linked(BEFORE) == self.linked(CURRENT):  # The switch was not made, or was undone.
             self._unlink(BEFORE)
-        named = {self.linked(name) for name in (CURRENT, PREVIOUS, BEFORE)}
+        named = {self.linked(name) for name in LINKS}
         for path in self._releases.glob("*"):
-            if path.name not in named:
+            is_release = path.name in (DRAFT, DAMAGED) or (path / CONTENTS).exists()
+            if is_release and path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
 
     @contextlib.contextmanager
@@ -183,7 +188,8 @@ class Releases:
         with open(os.open(self.hold, os.O_RDWR | os.O_CREAT, 0o600), "rb") as stream:
             os.fchown(stream.fileno(), -1, gid)
             os.fchmod(stream.fileno(), 0o640)
-            fcntl.flock(stream, fcntl.LOCK_EX)
+            if not try_to_lock_file(stream.fileno()):
+                raise UserError(f"another process has locked {self.hold}")
             yield
 
     def good(self) -> str | None:
@@ -217,7 +223,7 @@ class Releases:
     def unpack(self, version: str, files: dict[str, bytes]) -> None:
         """Make a release of a bundle's files: it gets its name when all of it is on the disk."""
         folder = self.folder(version)
-        draft = folder.with_name(".draft")
+        draft = folder.with_name(DRAFT)
         draft.mkdir(mode=0o700)
         for name, data in files.items():
             if name.startswith(WHEELS):
@@ -237,17 +243,19 @@ class Releases:
         draft.chmod(0o755)
         os.sync()
         if folder.exists():  # It is damaged.
-            folder.rename(folder.with_name(".damaged"))
+            folder.rename(folder.with_name(DAMAGED))
         draft.rename(folder)
         os.sync()
 
     def remove_all(self) -> None:
         """Remove the installation, the trusted key last."""
-        for folder in (self._releases, self.hold.parent):
-            shutil.rmtree(folder)
-        for name in (CURRENT, PREVIOUS, BEFORE, ".next", self.trusted.name):
+        for name in LINKS:
             self._unlink(name)
+        self._tidy()
+        shutil.rmtree(self.hold.parent)
+        self._unlink(self.trusted.name)
         with contextlib.suppress(OSError):  # What else lies there stays.
+            self._releases.rmdir()
             self.root.rmdir()
 
 

@@ -125,7 +125,7 @@ def test_a_policy_that_may_not_drive_there_changes_nothing_and_damage_is_said(bo
     fails(board.install(workshop.make_faulty(0.3, *change)[0]), 1, "opset")
     assert board.status()["current"] == manifest.version
     assert len(list((board.root / "releases").iterdir())) == 1
-    (board.root / "current/site-packages/edge_runtime/safety.py").write_text("# nothing left\n")
+    (board.root / "current/manifest.json").write_text("# nothing left\n")
     shown = board.run("status")
     assert shown.returncode == 1
     assert json.loads(shown.stdout)["is_whole"] is False

@@ -265,3 +265,49 @@ def test_a_damaged_release_is_made_again_beside_the_service(board):
     assert board.releases.linked(CURRENT) == EARLIER
     assert board.run("install", OLD) == 0
     assert board.releases.is_whole(OLD)
+
+
+@pytest.mark.parametrize("name", [CURRENT, PREVIOUS, ".before", ".next"])
+def test_what_stands_in_a_links_place_is_refused_and_the_service_goes_on(board, name):
+    place = board.releases.root / name
+    place.unlink(missing_ok=True)
+    place.mkdir()
+    for words in (["install", NEW], ["rollback"], ["uninstall"]):
+        assert board.run(*words) == 2
+        assert board.service.running == OLD
+    assert {board.releases.is_whole(version) for version in (EARLIER, OLD)} == {True}
+
+
+def test_what_is_no_release_stays(board):
+    lost = board.releases.folder("lost+found") / "#1"
+    lost.parent.mkdir()
+    lost.write_text("of another")
+    lost.parent.with_name("notes").write_text("of another")
+    commands = (["install", NEW], ["rollback"], ["uninstall"])
+    assert [board.run(*words) for words in commands] == [0, 0, 0]
+    left = sorted(path.name for path in board.releases.root.rglob("*"))
+    assert left == ["#1", "lost+found", "notes", "releases", "unit"]
+
+
+def test_a_hold_that_another_has_locked_stops_nothing(board):
+    with open(board.releases.hold) as hold:
+        fcntl.flock(hold, fcntl.LOCK_SH)
+        assert board.run("install", NEW) == 2
+    assert board.service.running == OLD
+
+
+def test_the_old_release_goes_on_where_the_disk_can_no_more_be_written(board, monkeypatch):
+    stop = board.service.stop
+
+    def fail(event: str) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), "disk")
+
+    with contextlib.ExitStack() as until_started:
+
+        def stop_and_fail() -> None:
+            stop()
+            until_started.enter_context(at_step(1, board.releases.root, fail))
+
+        monkeypatch.setattr(board.service, "stop", stop_and_fail)
+        assert board.run("install", NEW) != 0
+    assert board.service.running == OLD

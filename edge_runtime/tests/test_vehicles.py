@@ -104,7 +104,7 @@ def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words
 )  # fmt: skip
 def test_limits_that_bound_nothing_are_refused_wherever_they_are_read(limit, monkeypatch):
     find_vehicle("carts:Cart")
-    for limits in ({"pedal": ActionLimit(*limit)}, {"pedal": limit}, None):
+    for limits in ({"pedal": ActionLimit(*limit)}, {"pedal": limit}, {}, None):
         monkeypatch.setattr(sys.modules["carts"].Cart, "limits", limits)
         for read in (make_vehicle, vehicle_limits):
             with pytest.raises(UserError, match="limits"):

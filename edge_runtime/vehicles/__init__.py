@@ -65,7 +65,7 @@ def _checked(name: str, limits: Any) -> Limits:
             return False
         return -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
 
-    if isinstance(limits, dict) and all(map(is_limit, limits.values())):
+    if limits and isinstance(limits, dict) and all(map(is_limit, limits.values())):
         return limits
     form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
     raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")

@@ -135,7 +135,9 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         losses = imitate(model, env, arguments.seed)
     else:
         recordings = find_recordings([Path(place) for place in arguments.recordings])
-        taken_over = demonstrate(model, recordings, env.scenario)
+        with util.fitting(f"these recordings hold steps that are none of {env.scenario}"):
+            taken_over = demonstrate(model, recordings, env.scenario)
+            model.learn(0)  # It raises where shapes differ.
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert, without the episodes between them
         losses = (model.learn(config.updates_per_episode) for _ in range(config.episodes))

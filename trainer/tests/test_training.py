@@ -142,6 +142,9 @@ def test_a_checkpoint_of_other_observations_or_with_crafted_fields_is_said_to_fi
         (replay, "pictures", wide),
         (replay, "priorities", torch.full_like(replay["priorities"], math.nan)),
         (learner, "actor_optimiser", {**learner["actor_optimiser"], **moments}),
+        (learner, "updates", None),
+        (state, "steps", torch.zeros(2)),
+        (state, "best_validation", "no"),
     ):
         kept, place[name] = place[name], crafted
         save_torch(tmp_path / CHECKPOINT_FILE, state)

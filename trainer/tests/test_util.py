@@ -9,6 +9,7 @@ from trainer import util
 
 
 def test_a_second_training_in_a_directory_is_refused(capsys, tmp_path):
+    (tmp_path / f".{8 * '0a'}.tmp").touch()  # As `write_atomic` leaves it where it is killed
     with util.claimed(tmp_path):
         assert str(tmp_path) in refusal(capsys, "train", "--out", str(tmp_path), "--episodes", "1")
     assert list(tmp_path.iterdir()) == []

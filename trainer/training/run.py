@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from bridge.environments import finite
 from bridge.network import parse_spec
@@ -141,7 +143,8 @@ class Validation(Trials):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
-        self.best, self._best_actor = tuple(state["best_validation"]), state["best_actor"]
+        success, reward = map(float, state["best_validation"])
+        self.best, self._best_actor = (success, reward), state["best_actor"]
         if self._best_actor is None:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)
         else:
@@ -293,7 +296,8 @@ class TrainingRun:
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.episode, self.steps = state["episode"], state["steps"]
+        counts = [state["episode"], state["steps"], state["learning"]["learner"]["updates"]]
+        self.episode, self.steps, _ = msgspec.convert(counts, list[Annotated[int, Meta(ge=0)]])
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guide.load_state_dict(state)

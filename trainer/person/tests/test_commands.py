@@ -42,6 +42,7 @@ WRONG = [
     (HUMAN, (WIRE,), f"`python -m bridge view {WIRE}` shows one"),
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
+    (HUMAN, (MINE, "{tmp}/crafted"), "steps that are none of left_turn"),
     (TRAIN, ("--rerun", "window"), "neither spawn nor serve"),
     (TRAIN, ("--rerun", "spawn"), "no display"),
 ]
@@ -56,6 +57,8 @@ def test_a_mistake_is_one_line_and_status_2(
     (tmp_path / "file").write_text("not a recording")
     record(tmp_path / "policy", [recorded_step(1, 0)])
     record(tmp_path / "mine", [recorded_step(1, 0, control="human", human=True, first=True)])
+    crafted = recorded_step(1, 0, control="human", human=True, human_action=(0.1, 0.2))
+    record(tmp_path / "crafted", [crafted])
     before = sorted(tmp_path.iterdir())
     errors = refusal(capsys, *(word.format(tmp=tmp_path) for word in (*command, *more)))
     assert complaint in errors
