@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
     in_file: dict[str, Any] = {}
     if arguments.resume and own.is_file():
         in_file = settings_in(read_json(own, "run config"), str(own))
-    for name in {"scenario", "algorithm", "human"} - given.keys():
-        # A name of a module must be typed: no file imports one.
-        name_in_file(str(in_file.get(name)), f"{arguments.config or own} has", f"--{name}")
+        for name in {"scenario", "algorithm", "human"} - given.keys():
+            # A name of a module must be typed: no file imports one.
+            name_in_file(str(in_file.get(name)), f"{arguments.out} was trained with", f"--{name}")
     values = {**in_file, **given, **dict(map(parse_setting, arguments.set))}
     done = _begin(values.pop("preset", "ours"), values, arguments)
     return INTERRUPTED if done.interrupted else 0
