@@ -69,13 +69,21 @@ def judge(bench: Bench) -> int:
     kept = 0
     for rule, is_kept in RULES.items():
         try:
-            wrong = "" if is_kept(bench) else f"last report: {bench.last}"
+            wrong = "" if is_kept(bench) else in_words(bench.last)
         # A driver may raise anything, and the next rule is due.
         except (Exception, SystemExit) as error:
             wrong = f"{type(error).__name__}: {error}"
         print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
         kept += not wrong
     return kept
+
+
+def in_words(report: VehicleReport | None) -> str:
+    if report is None:
+        return "it has not reported yet"
+    told = {**report._asdict(), **report.action, "faults": "; ".join(report.faults), "action": None}
+    words = (f"{name} {value}" for name, value in told.items() if value is not None)
+    return f"last report: {', '.join(words)}"
 
 
 class Bench:
