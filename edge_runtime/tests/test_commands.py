@@ -205,7 +205,8 @@ def test_an_unknown_option_is_guessed_before_one_is_missed_and_help_breaks_no_na
         (["--max-minuts=3"], "--max-minuts; did you mean --max-minutes"),
         (["--quux"], "--quux"),
     ):
-        assert exit_status(parser.parse_args, words) == 2
+        with pytest.raises(SystemExit, match="2"):
+            parser.parse_args(words)
         assert capsys.readouterr().err == f"x: there is no option {said} (see x --help)\n"
     assert parser.format_help().split().count("--out-of-range") == 20
 
