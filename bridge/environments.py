@@ -90,6 +90,9 @@ class _OneLine(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         return self._do(self.env.step, np.array(action))  # It may write into its copy
 
+    def render(self) -> Any:
+        return self._do(self.env.render)
+
     def close(self) -> None:
         with contextlib.suppress(Exception):  # A fault here must not cost what was driven
             self.env.close()
@@ -251,10 +254,15 @@ def scene_of(environment: Environment) -> dict[str, Any] | None:
     return scene() if callable(scene) else None
 
 
+def draws(environment: Environment) -> bool:
+    """Return whether ``render()`` returns a picture."""
+    modes = environment.metadata.get("render_modes") or ()
+    return environment.render_mode == RENDERED and RENDERED in modes
+
+
 def picture_of(environment: Environment) -> bytes:
     """Return a JPEG of what ``render()`` shows; empty for an environment that does not draw."""
-    modes = environment.metadata.get("render_modes") or ()
-    if environment.render_mode != RENDERED or RENDERED not in modes:
+    if not draws(environment):
         return b""
     shown = io.BytesIO()
     Image.fromarray(np.asarray(environment.render())).save(shown, "JPEG")

@@ -230,7 +230,7 @@ def _add_fork_arguments(parser: Any) -> None:
     human = "you drive on: `python -m trainer drive --from`, which has more options"
     add("--human", metavar="web", help=human)
     record = "record the fork, as `bridge record` does; with --human a directory"
-    add("--record", metavar="G.mcap", help=record)
+    add("--record", metavar="G.mcap", type="path", help=record)
     add_options(parser, "--out")
 
 

@@ -28,10 +28,12 @@ from deploy.installer import release
 from deploy.installer.release import Manifest
 from edge_runtime import __version__, tls
 from edge_runtime.cli import command
-from edge_runtime.config import load_config
+from edge_runtime.config import BUILT_IN, load_config
+from edge_runtime.controller import shared_limits
 from edge_runtime.files import write_atomic
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy
 from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes, read_toml
+from edge_runtime.vehicles import vehicle_limits
 
 ROOT = Path(__file__).parents[1]
 NAME = "install.pyz"
@@ -107,7 +109,10 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
     tls.read_signing_key(given.key)
     policy = load_policy(given.policy, given.public_key)
     flags = {"policy": str(given.policy), "tls": given.tls and str(given.tls)}
-    vehicle_id = load_config(given.config, flags).vehicle_id
+    config = load_config(given.config, flags)
+    if config.vehicle in BUILT_IN or not given.wheels:  # A driver in a wheel is not installed here.
+        limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
+        shared_limits(policy.manifest.action, limits)
     contents = {
         NAME: build_installer(),
         release.POLICY: read_bytes(given.policy, "policy file", MAX_POLICY_MIB),
@@ -117,14 +122,14 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
         **{f"units/{path.name}": path.read_bytes() for path in (ROOT / "deploy/systemd").iterdir()},
     }
     if given.tls is not None:  # The party's three files, and none that may stand beside them.
-        tls.check_name(tls.load_tls(given.tls).name, tls.common_name(tls.EDGE, vehicle_id))
+        tls.check_name(tls.load_tls(given.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
         for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
             contents[f"{release.TLS}{name}"] = read_bytes(given.tls / name, "TLS file")
     for path in given.wheels:  # Without the tags, which make some names too long for a tar.
         package, version, *_ = path.name.split("-")
         contents[f"{release.WHEELS}{package}-{version}.whl"] = read_bytes(path, "wheel")
     # The version ends with a hash of all the rest, so it always means the same bytes.
-    draft = Manifest("", vehicle_id, policy.policy_id, *TARGETS[given.target])
+    draft = Manifest("", config.vehicle_id, policy.policy_id, *TARGETS[given.target])
     contents[release.MANIFEST] = json.dumps(draft._asdict()).encode()
     digest = hashlib.sha256(pack(contents)).hexdigest()
     manifest = draft._replace(version=f"{__version__}-{policy.policy_id[:8]}-{digest[:8]}")

@@ -6,13 +6,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import math
 import os
 import signal
 import sys
+import textwrap
 import threading
 import time
 from importlib import import_module
+from itertools import takewhile
 from typing import (
     Any,
     Callable,
@@ -45,6 +48,10 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         # Examples are copied into a shell.
         return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
+    def _split_lines(self, text: str, width: int) -> List[str]:
+        # A name that is broken at its hyphen cannot be copied.
+        return textwrap.wrap(text, width, break_on_hyphens=False)
+
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
         # By identity: 0 is a default worth showing, though it equals False.
         hidden = any(action.default is nothing for nothing in (None, False))
@@ -65,6 +72,16 @@ class ArgumentParser(argparse.ArgumentParser):
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(*args, **kwargs)
         self.register("type", "path", os.path.abspath)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse an unknown option, with a guess, before argparse asks for one that is missing."""
+        known, given = self._option_string_actions, sys.argv[1:] if args is None else list(args)
+        for word in takewhile("--".__ne__, () if self._subparsers else given):
+            name = word.partition("=")[0]
+            if name.startswith("--") and name not in known:
+                guesses = difflib.get_close_matches(name, known, 1)
+                self.error(f"there is no option {'; did you mean '.join([name, *guesses])}")
+        return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""

@@ -17,7 +17,7 @@ from trainer.environments import CONDITIONS
 def campaign(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     out = "report to write, as JSON; R.md and a picture are written beside it"
-    add("--out", required=True, metavar="R.json", help=out)
+    add("--out", required=True, metavar="R.json", type="path", help=out)
     add_scenario(parser)
     _add_common(parser, "SCENARIO")
     add("--runs", type=cli.whole_number(2), default=100, help="episodes per network")
@@ -43,7 +43,7 @@ def envelope(parser: argparse.ArgumentParser) -> None:
 def _add_common(parser: argparse.ArgumentParser, env: str) -> None:
     add, count = parser.add_argument, cli.not_negative
     policy = f"policy file (default: results/policies/{env}.onnx)"
-    add("--policy", metavar="P.onnx", help=policy)
+    add("--policy", metavar="P.onnx", type="path", help=policy)
     add_public_key(parser)
     add(
         "--condition", choices=CONDITIONS, default=NOMINAL, help="traffic and noise of the scenario"

@@ -185,8 +185,7 @@ class Adapted(bridge.Adapter):
         self.key_rate_per_s = float(bridge.offered(env, "key_rate_per_s", 5.0))
         own = bridge.offered(env, "expert")
         self.expert = own and (lambda: _ScaledExpert(self, own()))
-        shows = type(env.unwrapped).render is not gymnasium.Env.render
-        self.can_be_seen = shows or callable(bridge.offered(env, "scene"))
+        self.can_be_seen = bridge.draws(env) or callable(bridge.offered(env, "scene"))
         if env.spec is None or env.spec.max_episode_steps is None:
             bridge.say_once(f"{name} has no limit of its own: {MOST_STEPS} steps are taken")
             self.env = gymnasium.wrappers.TimeLimit(env, MOST_STEPS)

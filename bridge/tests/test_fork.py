@@ -162,5 +162,5 @@ def test_a_person_is_handed_to_the_trainer_with_all_that_was_said(monkeypatch):
     words = ["--at", "3s", "--episode", "1", "--human", "web", "--record", "rec"]
     bridge_status(["fork", str(LEFT_TURN), *words])
     command = ran.call_args.args[1]
-    where = ["--at", "3.0", "--human", "web", "--episode", "1", "--out", "rec"]
+    where = ["--at", "3.0", "--human", "web", "--episode", "1", "--out", os.path.abspath("rec")]
     assert command[1:] == ["-m", "trainer", "drive", "--from", str(LEFT_TURN), *where]

@@ -66,6 +66,8 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
     [
         *(('policy = "other.onnx"', ""), ('hold = "x"', ""), ("allow_unsigned = true", "")),
         *(("no toml", ""), ('connect = "tls/10.0.0.1:7447"', "")),  # without certificates
+        ('[vehicle]\ndriver = "hunter"\nhunter.speed = 3', ""),
+        ('[vehicle]\ndriver = "mock"\nmock.slew_per_s = -1.0', ""),
         *(('connect = "tls/10.0.0.1:7447"', name) for name in ("edge-other", "simulator-hunter01")),
     ],
 )
@@ -79,12 +81,15 @@ def test_settings_and_certificates_that_do_not_hold_are_refused(
 
 
 @pytest.mark.parametrize(
-    "wrong", ["policy unsigned.onnx", "public-key 0.2.pub", "key keys/policy.pub", "with {unfit}"]
-)
+    "wrong",
+    ["policy unsigned.onnx", "public-key 0.2.pub", "key keys/policy.pub", "with {unfit}",
+     "config tank.toml"],
+)  # fmt: skip
 def test_a_mistake_is_one_line_and_nothing_is_written(workshop, capsys, wrong, monkeypatch):
     monkeypatch.chdir(workshop.folder)
     shutil.copy(workshop.inputs(0.1).policy, "unsigned.onnx")
     workshop.inputs(0.2)
+    Path("tank.toml").write_text('vehicle = "tank"')
     unfit = shutil.copy(workshop.host, "host-1.0-cp38-cp38-manylinux_2_35_aarch64.whl")
     words = "bundle --target jetpack5 --policy 0.1.onnx --key keys/policy.key --public-key 0.1.pub"
     more = f"--out out --{wrong.format(unfit=unfit)}"

@@ -197,6 +197,20 @@ def test_numbers_within_and_beyond_their_limits(kind, taken, refused):
             kind(text)
 
 
+def test_an_unknown_option_is_guessed_before_one_is_missed_and_help_breaks_no_name(capsys):
+    parser = cli.ArgumentParser(prog="x")
+    parser.add_argument("--max-minutes", required=True, help="like " + "--out-of-range " * 20)
+    for words, said in (
+        (["--max-minutess", "3"], "--max-minutess; did you mean --max-minutes"),
+        (["--max-minuts=3"], "--max-minuts; did you mean --max-minutes"),
+        (["--quux"], "--quux"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            parser.parse_args(words)
+        assert capsys.readouterr().err == f"x: there is no option {said} (see x --help)\n"
+    assert parser.format_help().split().count("--out-of-range") == 20
+
+
 def test_a_policy_that_is_slow_here_may_not_drive(refuses, make_policy, monkeypatch):
     monkeypatch.setattr(commands, "quantiles_ms", lambda _: {"p50": 1.0, "p99": 143.0, "max": 150})
     refuses(["check", *make_policy().flags[1:]], "143 ms")

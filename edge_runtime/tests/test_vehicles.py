@@ -13,6 +13,7 @@ from hil_tests.testing.drives import Simulator
 from hil_tests.testing.messages import make_state
 
 import edge_runtime
+from edge_runtime.config import BUILT_IN
 from edge_runtime.controller import ActionLimit
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.rigs import CAR, BrokenVehicle, a_manifest
@@ -27,6 +28,8 @@ from edge_runtime.vehicles.mock import MockVehicle
 class Cart(MockVehicle):
     name = "cart"
     open = classmethod(Vehicle.open.__func__)  # no settings of the mock
+    limits_of = classmethod(Vehicle.limits_of.__func__)
+
     def __init__(self, wheels=4, port=""):
         super().__init__()
         self.wheels = wheels
@@ -90,7 +93,7 @@ WHOLE = msgspec.structs.asdict(CAR)
 )
 def test_what_is_no_driver_or_no_setting_of_it_is_one_line(name, settings, words):
     table = "cart" if ":" in name else name
-    for read in (make_vehicle, *([vehicle_limits] if name in ("hunter", "ros2") else [])):
+    for read in (make_vehicle, *([vehicle_limits] if name in BUILT_IN else [])):
         with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
             read(name, {table: settings}, a_manifest())
 

@@ -61,6 +61,10 @@ class MockVehicle(Vehicle):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
         return cls(parameters)
 
+    @classmethod
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
+        return cls.open(settings, manifest).limits  # It opens nothing.
+
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
         self._integrate(now_s)

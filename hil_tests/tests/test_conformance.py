@@ -112,6 +112,7 @@ def test_a_driver_that_breaks_a_rule_is_told_so(flaw, rule, monkeypatch, capsys,
     assert status == (1 if flaw else 0)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(RULES) + 1
+    assert not any("VehicleReport" in line or "[" in line for line in lines)  # Words, no reprs
     broken = [line for line in lines if line.startswith("broken")]
     assert any(rule in line for line in broken) if flaw else not broken, lines
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from bridge.fork import FORK
 from deploy.__main__ import main as deploy
 from deploy.bundle import build_installer
+from edge_runtime.cli import ArgumentParser
 from edge_runtime.reach import free_endpoint
-from hil_tests import doctor
+from hil_tests import commands, doctor
 from hil_tests.__main__ import main
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.commands import exit_status
@@ -93,6 +95,23 @@ def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path)
     # A busy machine's; and states that came before the runtime had seen the listener's certificate.
     assert set(episode["rejected"]) <= {"stale", "foreign_session", "certificate"}
     assert not opt.exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (FORK, "f.mcap --at 1 --policy p.onnx --record g.mcap --out f.json"),
+        (commands.campaign, "--policy p.onnx --out r.json"),
+        (commands.envelope, "--policy p.onnx --out r.json"),
+    ],
+)
+def test_paths_are_made_absolute_before_a_simulator_may_change_the_directory(command, words):
+    parser = ArgumentParser()
+    command.add_arguments(parser)
+    found = map(str, vars(parser.parse_args(words.split())).values())
+    paths = [Path(each) for each in found if Path(each).suffix in (".mcap", ".onnx", ".json")]
+    assert len(paths) == words.count(".")
+    assert all(path.is_absolute() for path in paths)
 
 
 @pytest.mark.parametrize(

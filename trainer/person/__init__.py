@@ -207,8 +207,10 @@ class Seat:
         self._wishes: set[Wish] = set()
         self._said = self._off
         self._tap: Reading | None = None
-        """The farthest of what took over since the last poll, by a button, a wheel or a pedal: a
-        tap shorter than a control period counts for one."""
+        """The farthest of what takes over since the last poll, by a button, a wheel or a pedal: a
+        tap shorter than a control period counts for one, also while a button is held."""
+        self._began = False  # A hold has begun since then
+        self._polled = rest  # The action that was said then
         self._hands_were_off = False
         self._heard_s = float("-inf")
 
@@ -247,7 +249,8 @@ class Seat:
             if not self._hands_were_off:
                 return False
             before, now = self._said, Reading(action, said.engaged, by_moving=said.by_moving)
-            if self._wants(now) and (self._tap is not None or not self._wants(before)):
+            if self._wants(now):
+                self._began |= not self._wants(before)
                 taps = (now, self._tap or now)
                 self._tap = max(taps, key=lambda tap: distance(tap.action, self._rest))
             self._said = now
@@ -257,9 +260,10 @@ class Seat:
         """Return what the driver does at ``now_s``; each wish once."""
         with self._lock:
             said = self._said if now_s - self._heard_s <= SILENCE_S else self._off
-            if said is not self._off and not self._wants(said) and self._tap is not None:
-                said = self._tap
-            self._tap = None
+            is_back = said.action == self._polled if self._wants(said) else self._began
+            tap, self._tap, self._began, self._polled = self._tap, None, False, said.action
+            if said is not self._off and tap is not None and is_back:
+                said = tap
             wishes, self._wishes = frozenset(self._wishes), set()
             return Reading(said.action, said.engaged, wishes, said.by_moving)
 
@@ -267,6 +271,6 @@ class Seat:
         return said.engaged or moved(said, self._rest)
 
     def _let_go(self) -> None:
-        self._said, self._tap = self._off, None
+        self._said, self._tap, self._began = self._off, None, False
         self._hands_were_off = False
         self._heard_s = float("-inf")

@@ -43,7 +43,8 @@ from trainer.person.session import Sitting, drive
 from trainer.person.tests.people import QUICK, Puppet
 from trainer.person.web import controls_of, encode_view
 from trainer.tests.odd import odd
-from trainer.tests.rover import CAMERA, ROVER, Rover
+from trainer.tests.rover import CAMERA, ROVER, Dark, Rover
+from trainer.util import load_torch
 
 
 @pytest.mark.parametrize("name", ["left_turn", "congestion", "examples.tasks:examples/Hill-v0"])
@@ -245,6 +246,19 @@ def test_what_a_simulator_does_to_directory_and_observations_is_found_out(
     assert capsys.readouterr().err.count("no network learns") == 1
 
 
+def test_a_validation_only_because_a_run_ended_is_forgotten_when_it_goes_on(tmp_path):
+    settings = {**SHORT, "evaluate_every_steps": 35}
+    asked: Any = {"algorithm": "per_td3", "settings": settings, "steps": 60, "out": tmp_path}
+    first = train(odd("Tells"), **asked, max_minutes=1e-9).metrics
+    assert [row["validation_success"] != "nan" for row in first] == [True]
+    rows = train(odd("Tells"), **asked, resume=True).metrics
+    due = [row["episode"] for row in rows if row["validation_success"] != "nan"]
+    assert "0" not in due
+    best = json.loads((tmp_path / "report.json").read_text())["validation"]["best_at_step"]
+    (row,) = (row for row in rows if row["total_steps"] == str(best))
+    assert int(row["episode"]) + 1 == load_torch(tmp_path / "best_actor.pt")["episode"]
+
+
 def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):
     def driven_at(scenario, policy):
         asked = {"recording": None, "at": None, "episode": None, "vehicle_id": None, "seed": 0}
@@ -274,7 +288,13 @@ def test_a_limit_of_steps_is_a_timeout_where_another_episode_tells():
     assert ({one.outcome for one in found.episodes}, found.success_rate) == ({"truncated"}, None)
 
 
+class Drawn(gymnasium.Wrapper[Any, Any, Any, Any]):
+    metadata, render_mode = Rover.metadata, "rgb_array"
+
+
 def test_what_a_wrapper_offers_is_found():
+    kinds: Any = Rover(), Drawn(Dark())  # The first was made to draw nothing
+    assert [Adapted(env, "any").can_be_seen for env in kinds] == [False, True]
     env = make_environment(odd("Offers"))
     assert (env.control_period_s, env.action_names, env.key_rate_per_s) == (0.2, ("pedal",), 2.0)
     assert (env.brake_action.tolist(), env.keys["w"].tolist()) == ([-1.0], [1.0])

@@ -70,13 +70,20 @@ NAMES = [f.name for f in fields(EpisodeMetrics)]
 
 
 class MetricsWriter:
-    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T."""
+    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T.
 
-    def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
+    ``undue``: it drops the last row's validation, too.
+    """
+
+    def __init__(
+        self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1, undue: bool = False
+    ) -> None:
         path, self._period_s = run_dir / METRICS_FILE, period_s
         self._rows = read_metrics(run_dir)[:from_episode]
         if len(self._rows) < from_episode:
             raise UserError(f"{path} lacks episodes before the checkpoint: {from_episode}")
+        for row in self._rows[-1:] if undue else ():
+            row.update({name: "nan" for name in NAMES if name.startswith("validation")})
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()

@@ -107,6 +107,7 @@ class Validation(Trials):
         self.best = (-1.0, -1.0)
         """Success and return of the best actor among the validations that were due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
+        self.undue = False  # The last episode was validated only because the run ended there
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Validate after ``episode`` episodes where that is due, or at the end of a run.
@@ -114,6 +115,7 @@ class Validation(Trials):
         A resumed run forgets a validation that was not ``due``: when a run was stopped must not
         decide which actor it ends with.
         """
+        self.undue = at_end and not due
         if due or (at_end and self.config.evaluate_every_steps):
             actor = getattr(self.learning.learner, self.config.kept_actor)
             driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
@@ -139,12 +141,14 @@ class Validation(Trials):
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best_validation": self.best, "best_actor": self._best_actor}
+        kept = {"best_validation": self.best, "best_actor": self._best_actor}
+        return {**kept, "undue": self.undue}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
         success, reward = map(float, state["best_validation"])
         self.best, self._best_actor = (success, reward), state["best_actor"]
+        self.undue = state["undue"]
         if self._best_actor is None:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)
         else:
@@ -238,7 +242,9 @@ class TrainingRun:
         if not self.over:  # Else another revision has trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
-        metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
+        metrics_writer = MetricsWriter(
+            self.run_dir, self.episode, self.env.control_period_s, self.validation.undue
+        )
         try:
             while not self.over:
                 before = self.steps

@@ -118,6 +118,14 @@ def test_a_tap_between_two_polls_counts_for_one_and_a_hold_ends_with_its_release
     assert not seat.poll(0.4).engaged
 
 
+def test_a_tap_of_the_trigger_while_its_button_is_held_counts_for_one(seat):
+    take_over(seat)
+    assert seat.poll(0.0).action == 0.8
+    for action, now_s in ((-1.0, 0.01), (0.8, 0.02)):
+        seat.hear(1, Input(0.0, action, engaged=True), now_s)
+    assert [seat.poll(0.1).action for _ in range(2)] == [-1.0, 0.8]
+
+
 PAGES = st.integers(1, 3)
 EVENTS = st.one_of(
     st.tuples(st.just("sit_down"), PAGES),
