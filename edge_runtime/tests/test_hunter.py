@@ -92,7 +92,7 @@ def test_what_is_at_rest(rig):
     rig.status, rig.obeys = REMOTE, False
     rig.step(6)
     assert is_at_rest()  # a person has it
-    rig.status = OK
+    rig.status = OK._replace(mode=7)
     rig.step(6)
     assert not is_at_rest()
     rig.core.bus_failed("bus-off", rig.now_s, fatal=True)
@@ -115,6 +115,9 @@ def test_a_status_from_before_confirms_nothing(rig, age_s):
         assert rig.core.state is VehicleState.ENABLING
     rig.tell(protocol.SYSTEM_STATUS, OK)
     assert rig.core.state is VehicleState.ENABLED
+    rig.core.enable(rig.now_s)
+    rig.tell(protocol.MOTION_STATUS, protocol.WheelMotion(2.0, 0.0))
+    assert rig.core.cause is Fault.LYING  # that waits for no status
 
 
 @pytest.mark.parametrize("ends", ["driving", "by the remote control"])
@@ -151,10 +154,10 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
          VehicleEvent.FAULT, "rear left motor: motor overtemperature"),
         (protocol.MOTION_COMMAND, protocol.WheelMotion(0.0, 0.0),
          VehicleEvent.FOREIGN, "somebody else sends 0x111"),
-        (protocol.MOTION_STATUS, protocol.WheelMotion(3.0, 0.0),
-         Fault.LYING, "the chassis reports 3.0 m/s"),
-        (protocol.MOTION_STATUS, protocol.WheelMotion(0.0, 1.0),
-         Fault.LYING, "a steering angle of 1.00 rad"),
+        (protocol.MOTION_STATUS, protocol.WheelMotion(2.0, 0.0),
+         Fault.LYING, "the chassis reports 2.0 m/s"),
+        (protocol.MOTION_STATUS, protocol.WheelMotion(0.0, 0.8),
+         Fault.LYING, "a steering angle of 0.80 rad"),
         (None, "bus-off", VehicleEvent.BUS, "the CAN bus fails: bus-off"),
     ],
 )  # fmt: skip
@@ -169,7 +172,8 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
 
 def test_no_more_steering_is_reported_than_the_wheels_reach():
     rig = HunterRig("congestion", scale=0.02)
-    rig.tell(protocol.MOTION_STATUS, protocol.WheelMotion(0.1, -0.7))
+    rig.tell(protocol.MOTION_STATUS, protocol.WheelMotion(0.1, -0.74))
+    assert rig.core.reports.lie() is None  # below 1.3 times the limit
     assert rig.report.action["steering"] == rig.core.similarity.limits()["steering"].high < 0.6
 
 
@@ -204,6 +208,12 @@ def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked(driving, mi
         if missing == "0x211":  # the status; not the motion
             motion = protocol.WheelMotion(driving.speed_mps or 0.1, 0.0)
             driving.tell(protocol.MOTION_STATUS, motion)
+    assert LOCK in driving.frames(-10)
+
+
+def test_the_brake_is_locked_where_it_rolls_on_and_complains_again_and_again(driving):
+    driving.status, driving.obeys = OK._replace(faults=0x0001), False
+    driving.step(70, PEDAL)
     assert LOCK in driving.frames(-10)
 
 

@@ -6,17 +6,20 @@ import threading
 import time
 from functools import partial
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, call
 
 import can
 import pytest
 from hil_tests.mock_hunter import MODELS, MockHunter, Orders, serve
 from hil_tests.processes import wait_until
 
+from edge_runtime import log
 from edge_runtime.tests.rigs import LEFT_TURN, PEDAL
 from edge_runtime.util import UserError
+from edge_runtime.vehicles import hunter, streamed
 from edge_runtime.vehicles.hunter import (
     DEFAULT_BUS,
+    MULTICAST_BUS,
     BusName,
     HunterSettings,
     HunterVehicle,
@@ -67,10 +70,11 @@ def vehicle(channel):
 
 def drive(heard, vehicle):
     def is_quick():
-        if any("no command" in fault for fault in vehicle.feedback(time.monotonic()).faults):
+        report = vehicle.feedback(time.monotonic())
+        if any("no command" in fault or "sends no" in fault for fault in report.faults):
             enable(vehicle)  # This process itself stood still for so long.
         vehicle.command(PEDAL, time.monotonic())
-        return last_speed_mps(heard) > 0.2
+        return last_speed_mps(heard) > 0.2 and report.speed_mps > 0.1
 
     wait_until(is_quick, "speed")
 
@@ -89,7 +93,6 @@ def test_it_enables_drives_brakes_and_parks(heard, vehicle):
     assert heard == []
     enable(vehicle)
     drive(heard, vehicle)
-    assert vehicle.feedback(time.monotonic()).speed_mps > 0.1
     wait_until(lambda: state_of(vehicle) is VehicleState.STOPPED, "its own stop")
     wait_until(lambda: last_speed_mps(heard) == 0.0, "a stand")
     enable(vehicle)
@@ -123,6 +126,7 @@ def test_foreign_frames_are_none_bus_off_stops_it_and_a_dead_bus_is_left(
     for kind in ("is_error_frame", "is_extended_id", "is_remote_frame", "is_fd"):
         foreign: Any = {"arbitration_id": 0x111, "is_extended_id": False, kind: True}
         vehicle._hear(can.Message(**foreign))
+    vehicle._note_bus("one frame")
     assert state_of(vehicle) is VehicleState.ENABLED
     vehicle._hear(can.Message(arbitration_id=0x40, is_error_frame=True))
     assert vehicle.feedback(time.monotonic()).faults == ["the CAN bus fails: bus-off"]
@@ -131,10 +135,31 @@ def test_foreign_frames_are_none_bus_off_stops_it_and_a_dead_bus_is_left(
     with monkeypatch.context() as patch:
         patch.setattr(vehicle._bus, "recv", down)
         wait_until(lambda: state_of(vehicle) is VehicleState.STOPPED, "its stop")
+        assert vehicle._listener.is_alive()
     monkeypatch.setattr(vehicle._bus, "send", down)
+    monkeypatch.setattr(log, "event", events := Mock())
     vehicle.close()  # raises nothing, and leaves the bus
+    assert events.mock_calls == [call("warning", "hunter_not_parked")]
     with pytest.raises(can.CanOperationError, match="closed"):
         vehicle._bus.recv(0.0)
+
+
+@pytest.mark.parametrize(
+    ("bus", "is_foreign"), [(DEFAULT_BUS, True), ("virtual:bus", True), (MULTICAST_BUS, False)]
+)
+def test_commands_of_others_stop_it_but_not_its_own_that_come_back(monkeypatch, bus, is_foreign):
+    monkeypatch.setattr(hunter, "open_bus", lambda _: can.Bus(interface="virtual", channel=bus))
+    monkeypatch.setattr(streamed, "STOP_TAKES_S", 0.0)
+    monkeypatch.setattr(streamed, "PERIOD_S", 9.0)
+    with contextlib.closing(HunterVehicle(HunterSettings(bus=bus), LEFT_TURN)) as vehicle:
+        vehicle.enable(time.monotonic())
+        assert vehicle._send_due()
+        vehicle._wake = Mock(wraps=vehicle._wake)
+        for _ in range(2):
+            vehicle._hear(can.Message(arbitration_id=0x111, is_extended_id=False))
+            assert vehicle._wake.set.call_count == is_foreign  # its zero does not wait
+        assert (state_of(vehicle) is VehicleState.STOPPED) == is_foreign
+        assert vehicle._listener.daemon
 
 
 def test_only_commands_are_sent(channel, vehicle):
@@ -148,6 +173,8 @@ ON_LOOPBACK = {"port": 7, "hop_limit": 0, "fd": False}
 BUSES = {
     "socketcan:can0": BusName("socketcan", "can0", {}),
     "slcan:/dev/ttyACM0": BusName("slcan", "/dev/ttyACM0", {"bitrate": 500_000}),
+    "slcan:tty:7": BusName("slcan", "tty:7", {"bitrate": 500_000}),
+    "virtual:tty:7": BusName("virtual", "tty:7", {}),
     "udp_multicast:239.1.2.3:7": BusName("udp_multicast", "239.1.2.3", ON_LOOPBACK),
     **dict.fromkeys(("can0", ":can0", "socketcan:", "udp_multicast:239.1.2.3")),
 }

@@ -6,11 +6,13 @@ import pytest
 from hil_tests.testing.policies import T
 
 from edge_runtime.controller import ActionLimit
+from edge_runtime.tests.rigs import SPEC
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.plausibility import (
     DEVIATES_S,
     FOLLOWS_S,
+    DriveWatch,
     Fault,
     FollowWatch,
     VehicleWatch,
@@ -43,10 +45,13 @@ def watched(asked=0.0, ticks=20, **reported):
         (0.6, {"pedal": 0.3}, {"commanded_speed_mps": 1.0}, None),  # the driver judges
         (0.0, {}, {"speed_mps": 9.0}, Fault.LYING),
         (0.0, {}, {"speed_mps": math.nan}, Fault.LYING),
+        (0.0, {}, {"speed_mps": 2.24}, None),  # 0.5 m/s, and 15 m/s2 for 0.05 s, from 1 m/s on
+        (0.0, {}, {"speed_mps": 2.26}, Fault.LYING),
         (0.0, {}, {"pedal": 1.1}, Fault.LYING),
         (0.0, {}, {"lamp": 1.0}, None),  # beyond its limits, an action is between -1 and 1
         (0.0, {"lamp": -1.0}, {}, None),
         (0.0, {}, {"lamp": -1.1}, Fault.LYING),
+        (0.0, {}, {"lamp": 1.1}, Fault.LYING),
     ],
 )
 def test_what_a_vehicle_may_report(asked, reported, newest, fault):
@@ -55,13 +60,14 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
     assert watch.fault(now_s + TICK_S) is fault
 
 
-def test_a_stuck_wheel_is_found_beside_a_pedal_that_the_driver_judges():
+@pytest.mark.parametrize("wheel", ["steering", "front"])
+def test_a_stuck_wheel_is_found_beside_a_pedal_that_the_driver_judges(wheel):
     watch = VehicleWatch(T, MockVehicle.limits)
     watch.begin(100.0)
     for tick in range(20):
         now_s = 100.0 + tick * TICK_S
-        watch.command({"pedal": 0.6, "steering": 0.5}, now_s)
-        action = {"pedal": 0.3, "steering": 0.0}
+        watch.command({"pedal": 0.6, wheel: 0.5}, now_s)
+        action = {"pedal": 0.3, wheel: 0.0}
         watch.report(VehicleReport(action, 1.0, False, [], commanded_speed_mps=1.0), now_s)
     assert watch.fault(now_s) is Fault.STUCK
 
@@ -192,3 +198,12 @@ def test_what_is_outside_of_all_that_a_healthy_actuator_can_do_is_stuck_after_a_
     for now_s, asked, measured, stuck in rows:
         measured = None if measured is None else sign * measured
         assert watch.is_stuck(sign * asked, measured, now_s) is stuck, now_s
+
+
+def test_a_wheel_may_stay_for_its_lag_and_for_the_age_of_what_is_heard():
+    """0.4 s, 46 ms in which 1 rad/s would bring it within tolerance, and 0.1 s of deviation."""
+    watch = DriveWatch(SPEC, silence_s=0.2)
+    for tick in range(160):
+        now_s = tick * 0.01
+        found = watch.stuck((1.0, 0.3 if now_s > 1.0 else 0.0), (1.0, 0.0), now_s)
+        assert bool(found) is (now_s > 1.555), now_s

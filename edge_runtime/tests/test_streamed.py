@@ -3,17 +3,19 @@
 import contextlib
 import math
 import time
+from unittest.mock import Mock, call
 
 import pytest
 from hil_tests.processes import wait_until
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from edge_runtime import log
 from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
 from edge_runtime.vehicles import streamed
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.plausibility import Fault, Finding
-from edge_runtime.vehicles.streamed import LEADS_TO, Speeds, VehicleState
+from edge_runtime.vehicles.streamed import LEADS_TO, Speeds, VehicleEvent, VehicleState
 
 
 @pytest.fixture(params=[HunterRig, Ros2Rig])
@@ -50,6 +52,11 @@ def test_two_periods_of_the_policy_hold_a_command_and_miss_feedback(
     rig.enabled().core.command(PEDAL, rig.now_s)
     assert rig.core.late_at_s == pytest.approx(rig.now_s + holds_s)
     assert rig.core._heard.silence_s == pytest.approx(silence_s)
+    while rig.now_s < (late_s := rig.core.late_at_s) - 1e-9:
+        rig.step()
+    for now_s, cause in ((late_s, None), (late_s + 0.001, VehicleEvent.COMMAND_LATE)):
+        rig.core.tick(now_s)
+        assert rig.core.cause is cause
 
 
 def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig):
@@ -98,7 +105,9 @@ def test_a_wheel_at_a_wrong_angle_is_found_for_small_actions_and_for_large(
 def test_a_wheel_need_not_turn_where_it_stands_nor_where_it_is_to_stand(rig, speed_mps, pedal):
     rig.jammed_rad = 0.5
     rig.enabled().obeys, rig.speed_mps = False, speed_mps
-    rig.step(100, {"pedal": pedal})
+    rig.step(10, {"pedal": pedal})
+    assert rig.report.action["pedal"] == 0.0  # a throttle that does not bite yet is no brake
+    rig.step(90, {"pedal": pedal})
     assert rig.core.cause is (Fault.STUCK if pedal > 0 else None)
 
 
@@ -129,6 +138,8 @@ def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
     assert rig.core.set_point.speed_mps == SPEC.max_speed_mps
     assert rig.report.scenario_speed_mps == pytest.approx(6.0)
     assert rig.report.action["pedal"] == pytest.approx(0.0, abs=0.01)
+    rig.core.brake(rig.now_s, latch=False)
+    assert rig.report.commanded_speed_mps == 0.0  # before the next tick
 
 
 def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(make):
@@ -276,7 +287,7 @@ class Sender(streamed.StreamedVehicle):
         return self.late_s if time.monotonic() < self.late_s else math.inf
 
     def _leave(self):
-        self.sent.append("left")
+        self.sent.append("too early" if self._stream.is_alive() else "left")
 
 
 def test_it_sends_fifty_times_a_second_and_after_a_pause_once_for_all_missed_periods():
@@ -284,6 +295,7 @@ def test_it_sends_fifty_times_a_second_and_after_a_pause_once_for_all_missed_per
         wait_until(lambda: len(vehicle.sent) > 21, "0.4 s of sending")
         # A machine that pauses loses periods; nothing may make it send more often than asked.
         assert vehicle.sent[21] - vehicle.sent[1] > 0.33
+        assert vehicle._stream.daemon  # one that hangs in a bus must not keep the process
     assert vehicle.sent[-1] == "left"
 
 
@@ -297,6 +309,31 @@ def test_a_stop_a_late_command_and_a_sending_that_was_held_up_do_not_wait_for_th
         assert vehicle.sent[1] >= late_s
         vehicle.brake(0.0)
         wait_until(lambda: len(vehicle.sent) == 3, "one more, for the brake", 0.3)
+        wait_until(lambda: len(vehicle.sent) == 4, "the next")
+        assert vehicle.sent[3] - vehicle.sent[0] < 1.1  # when it was due without the two
     with contextlib.closing(Sender(pause_s=0.7)) as vehicle:
         wait_until(lambda: len(vehicle.sent) >= 2, "the next")
         assert vehicle.sent[1] - vehicle.sent[0] < 1.1  # its period would have come after 1.2 s
+
+
+def test_each_new_state_is_logged_once_and_a_brake_latches(monkeypatch):
+    monkeypatch.setattr(log, "event", events := Mock())
+    with contextlib.closing(Sender()) as vehicle:
+        vehicle.enable(0.0)
+        vehicle.brake(0.0)
+        for vehicle._core.words in ("why", "why", ""):
+            vehicle.feedback(0.0)
+        vehicle._core.state = VehicleState.DISABLED
+    once = [call("warning", vehicle.name, state="stopped", why="why")]
+    assert events.mock_calls == [*once, call("info", vehicle.name, state="stopped", why="")]
+
+
+@pytest.mark.parametrize(("most_s", "stands_s"), [(60.0, 0.2), (0.2, math.inf)])
+def test_the_end_waits_for_a_stand_and_the_stream_but_not_for_ever(monkeypatch, most_s, stands_s):
+    monkeypatch.setattr(streamed, "STOP_TAKES_S", most_s)
+    began_s, vehicle = time.monotonic(), Sender()
+    monkeypatch.setattr(vehicle._core, "is_at_rest", lambda now_s: now_s >= began_s + stands_s)
+    vehicle.close()
+    assert 0.2 <= time.monotonic() - began_s < 30.0
+    vehicle.close()
+    assert (vehicle.sent.count("left"), vehicle.sent[-1]) == (1, "left")
