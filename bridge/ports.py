@@ -311,20 +311,21 @@ def _add_router_arguments(parser: Any) -> None:
     vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
     add_options(parser, "--tls")
     add_options(parser, "--listen", action="append", help=listen)
+    add_options(parser, "--connect", default=None, help="endpoint of another router to join")
     add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
 
 
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
-    listens = arguments.listen or [DEFAULT_ENDPOINT]
-    tls, rules = tls_for(arguments.tls, *listens), None
+    listens, connect = arguments.listen or [DEFAULT_ENDPOINT], arguments.connect
+    tls, rules = tls_for(arguments.tls, *listens, *[connect] * bool(connect)), None
     if tls is not None:
         access.check_name(tls.name, access.ROUTER)
         rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     with (
         contextlib.suppress(KeyboardInterrupt),
         cli.sigterm_as_interrupt(),
-        closing(open_session(listen=listens, mode="router", tls=tls, access=rules)),
+        closing(open_session(listens, connect, "router", tls, rules)),
     ):
         print(f"ready {','.join(listens)}", flush=True)
         wait_to_be_told(tls)

@@ -38,7 +38,6 @@ RIDE_S = 0.5  # Of the rows with ride-through
 _INSIDE = "hil_tests.faults.inside"
 _STOPPED = re.compile(r"\bmode\b.*\bnow\W+safe_stop\b(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) .*motion=(\w+)")
-_NO_SCOUTING = {"scouting": {"multicast": {"enabled": False}}}
 _STEADY_PERIODS, _STEADY_COMMANDS = 3.5, 3
 _REARM_EVERY_S = 2.0
 _HEALTH_S = 0.6  # Longer than a period of the health message
@@ -135,11 +134,8 @@ class Rig:
         return self._start(*record, "--vehicle-id", VEHICLE_ID, ready="recording"), path
 
     def start_router(self) -> Process:
-        ends = {"listen": self.edge_endpoint, "connect": self._hub}
-        settings = {way: {"endpoints": [endpoint]} for way, endpoint in ends.items()}
-        path = self._directory / "router.json5"
-        path.write_text(json.dumps({"mode": "router", **settings, **_NO_SCOUTING}))
-        return self._start("bridge", "router", "--config", str(path))
+        ends = ("--listen", self.edge_endpoint, "--connect", self._hub)
+        return self._start("bridge", "router", *ends)
 
     def switch(self, name: str, word: str | None) -> None:
         """Write a word into one of the files that the faulty ends look at; None removes it."""
