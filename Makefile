@@ -34,10 +34,10 @@ pictures: $(STAMP)  ## the pictures of docs that need no screen
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
 
-# Tests often wait for processes, so that two cores serve three workers. A test's networks are small:
+# Tests often wait for processes, so that two cores serve four workers. A test's networks are small:
 # where each process computes with all cores, threads only wait for each other.
 test: $(STAMP)  ## with real processes and real Zenoh sessions; all but Ray's and the board's
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
