@@ -1,7 +1,6 @@
 """Both scenarios through an edge runtime and in process; the recorded drive of the last release."""
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -24,16 +23,16 @@ NONE, LATE = "none", "100ms"
 BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s"
 
 
-def simulate_undisturbed(folder, endpoint, env, options):
-    """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle."""
+def simulate_undisturbed(folder, scenario, policy, options):
+    """Drive anew, both ends, where the machine itself stood still for over 2 T in the middle."""
     for attempt in range(4):
-        out = folder / f"report-{attempt}.json"
-        words = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out), *options]
-        assert run_cli(bridge, words) == 0
+        endpoint, out = free_endpoint(), folder / f"report-{attempt}.json"
+        words = ["simulate", "--env", scenario, "--listen", endpoint, "--out", str(out), *options]
+        with start_edge(endpoint, policy):
+            assert run_cli(bridge, words) == 0
         report = read(out)
         if not report["wall_clock_stalls"]:
             return report
-        time.sleep(1.0)  # A new session is taken over from a silent one only.
     raise AssertionError(f"disturbed {attempt + 1} times: {report['safe_stop_events']}")
 
 
@@ -51,12 +50,11 @@ def _in_the_root(monkeypatch):
 )
 def test_lock_step_is_the_drive_in_process_to_the_bit(tmp_path, scenario, condition, spec, runs):
     """What is trained behind a network is what drives behind it."""
-    policy, endpoint = POLICY.with_name(f"{scenario}.onnx"), free_endpoint()
+    policy = POLICY.with_name(f"{scenario}.onnx")
     env, driver = make_environment(scenario, condition), OnnxDriver(policy)
     wanted = drive_episodes(env, driver, range(runs), condition, latency=parse_spec(spec))
     options = ("--episodes", str(runs), "--condition", condition, "--latency", spec)
-    with start_edge(endpoint, policy):
-        report = simulate_undisturbed(tmp_path, endpoint, scenario, options)
+    report = simulate_undisturbed(tmp_path, scenario, policy, options)
     assert (report["scenario"], report["condition"]) == (scenario, condition)
     assert set(report) >= set(CONTRACT_KEYS.split())
     assert spec != NONE or (report["rejected"], report["missed_ticks"]) == ({}, 0)
