@@ -1,22 +1,53 @@
-"""Two environments of other packages with an end and a goal, for the experiment on guidance.
+"""Environments of other packages with an end and a goal, for the experiment on guidance.
 
 In a clone: ``python -m trainer train --scenario examples.tasks:examples/Hill-v0 --human
 examples.tasks:HillExpert --out runs/hill``
 """
 
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
+from highway_env.envs.common.observation import OccupancyGridObservation
+from highway_env.road.lane import CircularLane, StraightLane
+
+
+def mark_road(grid: OccupancyGridObservation, layer: int, distance_m: float = 100.0) -> None:
+    """Mark the cells of a grid in which there is road; as highway-env, in a tenth of the time."""
+    me, spacing, places = grid.observer_vehicle, np.amin(grid.grid_step), []
+    for lane in grid.env.road.network.lanes_list():
+        at, _ = lane.local_coordinates(me.position)
+        along = np.arange(at - distance_m, at + distance_m, spacing).clip(0, lane.length)
+        if type(lane) is StraightLane:
+            places.append(lane.start + along[:, None] * lane.direction)
+        elif type(lane) is CircularLane:
+            angle = lane.direction * along / lane.radius + lane.start_phase
+            around = np.stack([np.cos(angle), np.sin(angle)], 1)
+            places.append(lane.center + lane.radius * around)
+        else:
+            places.append(np.array([lane.position(each, 0) for each in along]))
+    seen = np.concatenate(places) - me.position
+    if grid.align_to_vehicle_axes:
+        cos, sin = np.cos(me.heading), np.sin(me.heading)
+        seen = seen @ np.array([[cos, -sin], [sin, cos]])
+    cells = np.floor((seen - grid.grid_size[:, 0]) / grid.grid_step).astype(int)
+    cells = cells[((cells >= 0) & (cells < grid.grid.shape[-2:])).all(1)]
+    grid.grid[layer, cells[:, 0], cells[:, 1]] = 1
 
 
 class Racetrack(gymnasium.Wrapper[Any, Any, Any, Any]):
     """highway-env's racetrack-v0; the goal is half a minute on the road without a crash."""
 
     def __init__(self, **options: Any) -> None:
-        import highway_env  # noqa: F401 (registers it)
-
         super().__init__(gymnasium.make("racetrack-v0", **options))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode."""
+        begun = self.env.reset(seed=seed, options=options)
+        car: Any = self.env.unwrapped  # Its observation is made anew in each episode.
+        car.observation_type.fill_road_layer_by_lanes = partial(mark_road, car.observation_type)
+        return begun
 
     def step(self, action: Any) -> Any:
         """Drive for one control period and report success."""
@@ -64,5 +95,47 @@ class HillExpert:
         return "wasted" if self.against > self.PATIENCE else None
 
 
+class Lander(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Gymnasium's LunarLanderContinuous-v3; the goal is to come to rest on the ground."""
+
+    LANDED = 100.0  # The reward of the step in which it does
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(gymnasium.make("LunarLanderContinuous-v3", **options))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode."""
+        seen, info = self.env.reset(seed=seed, options=options)
+        self.unwrapped.seen = seen
+        return seen, info
+
+    def step(self, action: Any) -> Any:
+        """Drive for one control period and report success."""
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self.unwrapped.seen = seen
+        landed = terminated and reward == self.LANDED
+        return seen, reward, terminated, truncated, {**info, "is_success": landed}
+
+
+class LanderExpert:
+    """Gymnasium's own heuristic, which takes over from a policy that does something else."""
+
+    STRICT = 0.5  # Difference of an action, in [-1, 1]
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def act(self) -> np.ndarray:
+        """Return the main engine's and the side engines' throttle, each in [-1, 1]."""
+        from gymnasium.envs.box2d.lunar_lander import heuristic
+
+        return np.clip(heuristic(self.env, self.env.seen), -1.0, 1.0)
+
+    def wants_control(self, policy_action: np.ndarray) -> str | None:
+        """Return why it takes over, or None."""
+        return "off" if np.abs(policy_action - self.act()).max() > self.STRICT else None
+
+
 gymnasium.register("examples/Racetrack-v0", Racetrack, max_episode_steps=150)
 gymnasium.register("examples/Hill-v0", Hill, max_episode_steps=200)
+gymnasium.register("examples/Lander-v0", Lander, max_episode_steps=600)
