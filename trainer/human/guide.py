@@ -169,14 +169,22 @@ class Attention:
 
 
 class PoorHands:
-    """Makes a share of a human's actions wrong: ``biased``, always the same, or drawn each time."""
+    """Makes a share of a human's actions wrong: ``biased``, always the same, or drawn each time.
 
-    def __init__(self, share: float, biased: float | None, random: np.random.Generator) -> None:
-        self.share, self.biased, self.random = share, biased, random
+    ``whole``: a share of the take-overs instead, each from its beginning to its end.
+    """
 
-    def spoil(self, action: Action) -> Action:
-        """Return the action, or a wrong one in its place."""
-        if self.random.random() >= self.share:
+    def __init__(
+        self, share: float, biased: float | None, random: np.random.Generator, whole: bool = False
+    ) -> None:
+        self.share, self.biased, self.random, self.whole = share, biased, random, whole
+        self._wrong = False
+
+    def spoil(self, action: Action, first: bool) -> Action:
+        """Return the action, or a wrong one in its place; ``first``: of a take-over."""
+        if first or not self.whole:
+            self._wrong = self.random.random() < self.share
+        if not self._wrong:
             return action
         if self.biased is not None:
             return np.full(action.shape, self.biased, np.float32)
@@ -242,7 +250,7 @@ class HumanGuide(Guide):
             self._reason = trigger
         assert self._reason is not None
         action = self.driver.act(observation)
-        action = self.hands.spoil(action) if self.hands else action
+        action = self.hands.spoil(action, before is None) if self.hands else action
         return Intervention(action, self._reason, first=before is None)
 
     def state_dict(self) -> dict[str, Any]:

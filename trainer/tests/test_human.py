@@ -108,7 +108,7 @@ def test_the_robot_asks_where_its_doubt_is_high_once_it_knows_what_that_is():
 def test_poor_hands_replace_their_share_of_the_actions(biased):
     """By random actions, or by the same wrong one."""
     hands = PoorHands(1 / 3, biased, np.random.default_rng(0))
-    done = np.array([hands.spoil(BRAKE)[0] for _ in range(600)])
+    done = np.array([hands.spoil(BRAKE, first=False)[0] for _ in range(600)])
     poor = done[done != BRAKE]
     assert len(poor) == pytest.approx(200, abs=40)
     if biased is None:
@@ -116,3 +116,12 @@ def test_poor_hands_replace_their_share_of_the_actions(biased):
         assert np.std(poor) == pytest.approx(3**-0.5, abs=0.08)  # uniform over the whole range
     else:
         assert set(poor) == {biased}
+
+
+def test_a_wrong_take_over_is_wrong_from_its_beginning_to_its_end():
+    hands = PoorHands(1 / 3, 1.0, np.random.default_rng(0), whole=True)
+    takeovers = np.array(
+        [[hands.spoil(BRAKE, step == 0)[0] for step in range(5)] for _ in range(300)]
+    )
+    assert (takeovers == takeovers[:, :1]).all()
+    assert (takeovers[:, 0] == 1.0).sum() == pytest.approx(100, abs=30)
