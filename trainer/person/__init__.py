@@ -20,9 +20,10 @@ from trainer.human.guide import BY_PERSON, Intervention
 
 Amount = float | tuple[float, ...]
 """An action in [-1, 1]: one number, or a tuple of them where the environment has several."""
-Wish = Literal["pause", "restart", "discard", "quit"]
+Wish = Literal["pause", "restart", "discard", "quit", "succeeded", "failed"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard`` also
-marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting."""
+marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting; ``succeeded`` and
+``failed`` are the person's word on an episode of which the environment says neither."""
 WISHES: tuple[Wish, ...] = get_args(Wish)
 Control = Literal["policy", "human", "returning"]
 """What decides the applied action; ``returning``: the person has let go, and the action is on its

@@ -100,11 +100,11 @@ class Recorder:
         else:
             self.write(step)
 
-    def end_episode(self, discarded: bool) -> None:
-        """Keep the last step of an episode; a second call does nothing."""
+    def end_episode(self, outcome: str | None = None) -> None:
+        """Keep the last step of an episode; ``outcome`` None: as the step says. Then do nothing."""
         step, self._last = self._last, None
         if step is not None:
-            outcome = DISCARDED if discarded else step.outcome
+            outcome = step.outcome if outcome is None else outcome
             self.write(msgspec.structs.replace(step, outcome=outcome))
 
     def write(self, step: RecordedStep) -> None:
@@ -118,7 +118,7 @@ class Recorder:
         """Write the index and close the file; a sitting without steps leaves none behind."""
         if self._file.closed:
             return
-        self.end_episode(discarded=False)
+        self.end_episode()
         with self._file:
             self._mcap.finish()
         if self.index == 0:

@@ -30,7 +30,7 @@ from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics
-from trainer.training.run import Parts, TrainingRun, Trials, Validation, make_vehicle
+from trainer.training.run import Parts, Score, TrainingRun, Trials, Validation, behind_network
 from trainer.util import begin_process
 
 SCRIPTED = (
@@ -42,14 +42,14 @@ SCRIPTED = (
 
 @contextmanager
 def training_with_person(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any
 ) -> Iterator[tuple[TrainingRun, Sitting]]:
     """Open a run with a person as its guide; a resumed one stores what was recorded since."""
     check_settings(config)
     with ExitStack() as stack:
         person = stack.enter_context(closing(web.open_cockpit(arguments)))
         make_directory(run_dir)
-        env, delayed = make_vehicle(config)
+        delayed = behind_network(config, env)
         sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
@@ -160,14 +160,17 @@ class PersonValidation(Validation):
                 print(f"no validation beside the drive: {error}", file=sys.stderr)
             else:
                 self.take(drives.result(), actor, metrics, then)
-                self._alone = f", the policy alone succeeds in {metrics.validation_success:.0%}"
+                said = f"has a return of {metrics.validation_reward:.1f}"
+                if not math.isnan(metrics.validation_success):
+                    said = f"succeeds in {metrics.validation_success:.0%}"
+                self._alone = f", the policy alone {said}"
         if due and metrics.updates and self._begun is None:
             actor = copy.deepcopy(getattr(self.learning.learner, self.config.kept_actor)).cpu()
             # Not as tensors: torch would share their memory with the process.
             weights = {name: value.numpy() for name, value in actor.state_dict().items()}
             # A process that was killed: stderr has said so.
             with suppress(BrokenExecutor), _without_script():
-                answer = self._process.submit(_validate, self.config, weights)
+                answer = self._process.submit(_validate, self.config, weights, self.best)
                 self._begun = actor, episode, answer
 
 
@@ -190,10 +193,12 @@ def _start_validating() -> None:
 _trials = cache(Trials)  # Of the one config
 
 
-def _validate(config: RunConfig, weights: dict[str, NDArray[Any]]) -> list[EpisodeResult]:
+def _validate(
+    config: RunConfig, weights: dict[str, NDArray[Any]], best: Score
+) -> list[EpisodeResult]:
     """Drive the validation of an actor, in a process beside the person."""
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)
     actor.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-    return trials.drive(TogetherDriver(actor.eval().act))
+    return trials.drive(TogetherDriver(actor.eval().act), best)

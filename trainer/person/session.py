@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
-from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
+from bridge.outcomes import DISCARDED, FAILED, GOAL, RESTARTED, STOPPED, TRUNCATED, UNKNOWN, UNTOLD
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError
@@ -37,6 +37,7 @@ from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
 
+JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
 
 
@@ -101,6 +102,7 @@ class Sitting(Guide):
         self.applied: Amount = self._rest
         self._control: Control = "human" if self.alone else "policy"
         self._restart = self._discard = False
+        self._judged = ""  # The person's word on how the episode ended
 
     def begin(self, seed: int, observation: Observation, info: dict[str, Any]) -> None:
         """Start an episode as soon as the person is there; GuideGone where the person quits."""
@@ -174,15 +176,19 @@ class Sitting(Guide):
 
     def end_episode(self, outcome: str) -> str:
         """Show how the episode ended, which the person may still discard; return how it ended."""
+        open_to_say = outcome in (UNKNOWN, TRUNCATED)
+        rest_s = JUDGE_S if open_to_say else REST_S
         # Counted in periods: on a machine that stands still, too, the person is asked.
-        for _ in range(math.ceil(REST_S / self.env.control_period_s)):
-            if self.stop:
+        for _ in range(math.ceil(rest_s / self.env.control_period_s)):
+            if self.stop or (self._judged and open_to_say):
                 break
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
             if self._discard:  # Written at once: no kill shall take that back.
-                self.recorder.end_episode(discarded=True)
-        self.recorder.end_episode(self._discard)
+                self.recorder.end_episode(DISCARDED)
+        if outcome in UNTOLD:
+            outcome = self._judged or outcome
         outcome = DISCARDED if self._discard else outcome
+        self.recorder.end_episode(outcome)
         self.outcomes[outcome] += 1
         self.episode += 1
         return outcome
@@ -223,7 +229,8 @@ class Sitting(Guide):
         """Close the cockpit and the recording; a second call does nothing."""
         self.closed = True
         self.person.close()
-        self.recorder.end_episode(self._discard)
+        if self._discard:
+            self.recorder.end_episode(DISCARDED)
         self.recorder.close()
 
     def state_dict(self) -> dict[str, Any]:
@@ -260,6 +267,8 @@ class Sitting(Guide):
         self._restart |= "restart" in wishes
         self._discard |= "discard" in wishes
         self._paused ^= "pause" in wishes
+        for wish, outcome in (("succeeded", GOAL), ("failed", FAILED)):
+            self._judged = outcome if wish in wishes else self._judged
 
     def _idle(self, message: str) -> None:
         """Let a control period pass in which nothing moves."""

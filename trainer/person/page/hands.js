@@ -4,7 +4,9 @@
 // ``Controls`` of trainer/person/web.py. An action is one number, or a list of several.
 const FIRST_S = 0.1; // what a press is worth at once
 const HOLD = "space";
-const WISHES = { KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit" };
+const WISHES = {
+  KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit", KeyY: "succeeded", KeyN: "failed",
+};
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 const keyOf = (code) => code.replace(/^(Arrow|Key|Digit)/, "").toLowerCase();

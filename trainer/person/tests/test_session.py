@@ -3,12 +3,20 @@ from itertools import pairwise, repeat
 import numpy as np
 import pytest
 
-from bridge.outcomes import DISCARDED, RESTARTED, STOPPED
+from bridge.outcomes import COLLISION, DISCARDED, FAILED, GOAL, RESTARTED, STOPPED, TRUNCATED
 from trainer.evaluation import constant_driver
 from trainer.person import MAX_SLEW
 from trainer.person.recording import read_episodes, read_steps
 from trainer.person.session import drive
-from trainer.person.tests.people import LET_GO, QUIT, Puppet, hold, make_sitting, wish
+from trainer.person.tests.people import (
+    LET_GO,
+    QUIT,
+    Puppet,
+    hold,
+    make_sitting,
+    recorded_step,
+    wish,
+)
 
 
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):
@@ -68,6 +76,17 @@ def test_an_episode_begun_anew_or_thrown_away_ends_and_is_marked(tmp_path, wishe
     discarded = wished == "discard"
     assert kept == ([1] if discarded else [0, 1])
     assert ("1 discarded" in sitting.summary()) == discarded
+
+
+@pytest.mark.parametrize(("word", "told"), [("succeeded", GOAL), ("failed", FAILED)])
+def test_the_persons_word_counts_where_the_environment_has_none(tmp_path, word, told):
+    for ended, outcome in ((TRUNCATED, told), (COLLISION, COLLISION)):
+        sitting = make_sitting(tmp_path / ended, Puppet([LET_GO, wish(word)]))
+        sitting.begin(1, *sitting.env.reset(seed=1))
+        sitting.recorder._last = recorded_step(1, 0, terminated=True, outcome=ended)
+        assert sitting.end_episode(ended) == outcome
+        sitting.close()
+        assert [step.outcome for step in read_steps(sitting.recorder.path)] == [outcome]
 
 
 def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):
