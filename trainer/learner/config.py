@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from edge_runtime.util import UserError
-from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, SHARE, check_ranges
+from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, PERIOD_S, SHARE, check_ranges
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Algorithm:
     drawn from as often as its share of all transitions."""
     advantage_weight: float = 1.0
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
+    weighted_cloning: bool = False
+    """An imitated action counts the less, the more the critic prefers the policy's own."""
     q_term: bool = True  # The actor climbs the critic (eq. 23, first term)
     rewarded: bool = True
     """The environment's reward counts. Without it only take-overs count, and every one does, even
@@ -82,6 +84,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_q_advantage_only": replace(PHIL, human_td_weight=0.0),
     "phil_advantage_0.1": replace(PHIL, advantage_weight=0.1),
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
+    "phil_weighted": replace(PHIL, weighted_cloning=True),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
     "phil_without_shaping": replace(PHIL, penalty=False),
     # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning,
@@ -168,7 +171,8 @@ class LearnerConfig:
     """Share of both learning rates at the end of the run, to which they fall linearly (the paper:
     1). With rates that stay high, the late policy swings about what it learned."""
     gamma: float = 0.95
-    """Discount factor of one control period (table A5)."""
+    """Discount factor of one control period (table A5). Default where T is below 0.1 s: that factor
+    in 0.1 s."""
     return_steps: int = 8
     """Rewards that a target sums up before it bootstraps (n of n-step returns; Hessel et al.,
     2018); the paper has 1. Goal and failure are 30 to 70 steps away, and one-step targets hardly
@@ -184,11 +188,17 @@ class LearnerConfig:
     exploration_initial: float = 0.1
     """Standard deviation of the exploration noise at first (table A5: 1). With 0.3 the congestion
     is not learned: the noise alone makes the car crash, a return of several steps measures the
-    noise instead of the action, and a human takes over because of the noise."""
+    noise instead of the action, and a human takes over because of the noise. Default of a row
+    without a human where no picture is seen: 0.6, falling to 0.3."""
+    exploration_searching: float = 0.0
+    """Standard deviation until an episode first succeeds, where the environment says which do, or
+    until ``exploration_share`` is over; 0: as later. Default of a row without a human where no
+    picture is seen: 1."""
     exploration_correlation: float = 0.9
     """Correlation of the noise in two successive steps (the paper: 0). A critic cannot see what a
     tenth of a second of steering does, but it sees a second of it: lasting noise shows what an
-    action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al., 2016)."""
+    action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al., 2016). Default where T
+    is below 0.1 s: that correlation over 0.1 s."""
     exploration_final: float = 0.05
     """Least standard deviation of the exploration noise (table A5)."""
     exploration_share: float = 0.5
@@ -273,6 +283,24 @@ RANGES = {
     (0, 20): ("picture_shift",),
 }  # fmt: skip
 """Ranges of these numbers; all others are at least 0."""
+
+UNGUIDED_NUMBERS = {
+    "exploration_searching": 1.0, "exploration_initial": 0.6, "exploration_final": 0.3,
+}  # fmt: skip
+"""Without a human only noise finds what pays, and where numbers are seen it does little harm."""
+
+
+def task_settings(row: Algorithm, numbers: bool, period_s: float) -> dict[str, float]:
+    """Return the hyper-parameters that a task asks for, in place of the common ones.
+
+    ``numbers``: no entry of its observation is a picture. ``period_s`` is T: discounting and noise
+    last as long, in seconds, as at 0.1 s; a longer period keeps the common ones.
+    """
+    shorter, usual = min(period_s / PERIOD_S, 1.0), LearnerConfig()
+    names = ("gamma", "exploration_correlation")
+    lasting = {name: getattr(usual, name) ** shorter for name in names}
+    return lasting | (UNGUIDED_NUMBERS if numbers and not row.guided else {})
+
 
 PRINTED_LEARNER = LearnerConfig(
     exploration_initial=1.0,

@@ -133,9 +133,23 @@ def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:
     return _masked_mean(-values, ~human) if split else -values.mean()
 
 
-def behaviour_cloning_loss(actions: Tensor, human_actions: Tensor, human: Tensor) -> Tensor:
-    """Return the mean squared distance to the human's actions: eq. 23's second term, unweighted."""
-    return _masked_mean((human_actions - actions).square().sum(dim=1), human)
+def behaviour_cloning_loss(
+    actions: Tensor, human_actions: Tensor, human: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    """Return the mean squared distance to the human's actions: eq. 23's second term, unweighted.
+
+    ``weights`` [n]: what each sample counts, in mean about 1.
+    """
+    distances = (human_actions - actions).square().sum(dim=1)
+    return _masked_mean(distances if weights is None else weights * distances, human)
+
+
+def cloning_weights(human_value: Tensor, policy_value: Tensor) -> Tensor:
+    """Return 2 sigmoid(Q'(s, a) - Q'(s, pi(s))): a human action that the critic doubts counts less.
+
+    Not in the paper.
+    """
+    return 2.0 * torch.sigmoid(human_value - policy_value)
 
 
 def preference_loss(actions: Tensor, preferred: Tensor, overruled: Tensor, beta: float) -> Tensor:

@@ -50,12 +50,20 @@ HIDDEN = (256, 128, 64)
 FRAMES_SPACE = Box(0, 255, (2, *FRAME), np.uint8)
 """The paper's observation: frames [t-1, t]."""
 UNBOUNDED = 1e6  # A bound beyond this does not scale a number
+LEAST_SPREAD = 0.02  # Of half of a number's range
+MOST_SPREADS = 10.0  # A number further from its mean counts as that far
 SMALL_SIDE = 8  # A picture is halved until its sides are no longer than this
 
 
 def is_picture(dtype: Any, shape: tuple[int, ...]) -> bool:
     """Whether an entry of an observation is a picture: uint8, with rows and columns."""
     return dtype == np.uint8 and len(shape) in (2, 3)
+
+
+def sees_picture(space: Space[Any]) -> bool:
+    """Whether an entry of an observation is a picture."""
+    entries = space.values() if isinstance(space, Dict) else [space]
+    return any(is_picture(entry.dtype, entry.shape or ()) for entry in entries)
 
 
 def channels_last(shape: tuple[int, ...]) -> bool:
@@ -90,50 +98,85 @@ class Trunk(nn.Module):
         return trunk_features(frames, first.weight, first.bias, second.weight, second.bias)
 
 
-class Convolutions(nn.Module):
-    """3x3 convolutions that halve a picture of any size until it is small.
-
-    Maps uint8 [batch, rows, columns], or with channels, to [batch, features].
-    """
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        super().__init__()
-        self.last = channels_last(shape)
-        channels, *sides = np.roll(shape, 1) if self.last else (1, *shape)[-3:]
-        layers: list[nn.Module] = []
-        for filters in chain((16,), repeat(32)):
-            layers += [nn.Conv2d(int(channels), filters, 3, 2, 1), nn.ReLU()]
-            channels, sides = filters, [(side + 1) // 2 for side in sides]
-            if max(sides) <= SMALL_SIDE:
-                break
-        self.layers = nn.Sequential(*layers, nn.Flatten())
-        self.features = int(channels * sides[0] * sides[1])
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        if pictures.dim() == 3:
-            pictures = pictures.unsqueeze(1)
-        if self.last:
-            pictures = pictures.permute(0, 3, 1, 2)
-        return self.layers(pictures.float() / 255.0)
-
-
 class Numbers(nn.Module):
-    """Numbers [batch, ...] of any type to [batch, features], each from its bounds to [-1, 1]."""
+    """Numbers [batch, ...] of any type to [batch, features], each scaled to about [-1, 1].
+
+    At first by its bounds; `fit` scales it by what was seen. The ``channels`` of a grid have a
+    scale each, otherwise every number has one.
+    """
 
     middle: Tensor
     reach: Tensor
 
-    def __init__(self, space: Box) -> None:
+    def __init__(self, space: Box, channels: int | None = None) -> None:
         super().__init__()
-        low, high = (ends.astype(np.float64).reshape(-1) for ends in (space.low, space.high))
+        rows = (space.low, space.high)
+        low, high = (ends.astype(np.float64).reshape(channels or ends.size, -1) for ends in rows)
+        self.channels, self.features = len(low), low.size
+        low, high = low.min(1), high.max(1)
         bounded = (low > -UNBOUNDED) & (high < UNBOUNDED) & (low < high)
         low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-        self.features = len(low)
+        self.least = torch.from_numpy(LEAST_SPREAD * (high - low) / 2).float()
+        """Least spread of each number; a smaller one would make noise of it."""
         self.register_buffer("middle", torch.from_numpy((low + high) / 2).float())
         self.register_buffer("reach", torch.from_numpy((high - low) / 2).float())
 
+    def fit(self, numbers: Tensor) -> None:
+        """Scale by the mean and standard deviation of numbers [n, ...]; constants stay."""
+        seen = self._by_channel(numbers).double()
+        spread, mean = torch.std_mean(seen, (0, 2))
+        spread, varies = torch.maximum(spread.float(), self.least), spread > 0.0
+        self.middle.copy_(torch.where(varies, mean.float(), self.middle.cpu()))
+        self.reach.copy_(torch.where(varies, spread, self.reach.cpu()))
+
     def forward(self, numbers: Tensor) -> Tensor:
-        return (numbers.reshape(-1, self.features).float() - self.middle) / self.reach
+        seen = self._by_channel(numbers).float()
+        scaled = (seen - self.middle[:, None]) / self.reach[:, None]
+        return scaled.clamp(-MOST_SPREADS, MOST_SPREADS).flatten(1)
+
+    def _by_channel(self, numbers: Tensor) -> Tensor:
+        return numbers.reshape(-1, self.channels, self.features // self.channels)
+
+
+class Convolutions(nn.Module):
+    """3x3 convolutions that halve a picture of any size, or a grid of numbers, until it is small.
+
+    Maps [batch, rows, columns], or with channels first or last, to [batch, features].
+    """
+
+    def __init__(self, space: Box) -> None:
+        super().__init__()
+        self.last = channels_last(space.shape)
+        shape = np.roll(space.shape, 1) if self.last else (1, *space.shape)[-3:]
+        self.shape = tuple(int(side) for side in shape)
+        channels, *sides = self.shape
+        self.numbers: Numbers | None = None
+        if not is_picture(space.dtype, space.shape):
+            low, high = (
+                self._channels_first(torch.from_numpy(e[None]))[0].numpy()
+                for e in (space.low, space.high)
+            )
+            self.numbers = Numbers(Box(low, high, dtype=space.dtype.type), channels)
+        layers: list[nn.Module] = []
+        for filters in chain((16,), repeat(32)):
+            layers += [nn.Conv2d(channels, filters, 3, 2, 1), nn.ReLU()]
+            channels, sides = filters, [(side + 1) // 2 for side in sides]
+            if max(sides) <= SMALL_SIDE:
+                break
+        self.layers = nn.Sequential(*layers, nn.Flatten())
+        self.features = channels * sides[0] * sides[1]
+
+    def fit(self, grids: Tensor) -> None:
+        if self.numbers is not None:
+            self.numbers.fit(self._channels_first(grids))
+
+    def forward(self, seen: Tensor) -> Tensor:
+        seen = self._channels_first(seen)
+        scaled = seen.float() / 255.0 if self.numbers is None else self.numbers(seen)
+        return self.layers(scaled.reshape(-1, *self.shape))
+
+    def _channels_first(self, seen: Tensor) -> Tensor:
+        return seen.permute(0, 3, 1, 2) if self.last else seen.reshape(-1, *self.shape)
 
 
 class Entries(nn.Module):
@@ -154,9 +197,22 @@ def make_trunk(space: Space[Any], frames: int) -> Any:
     if isinstance(space, Dict):
         return Entries([make_trunk(part, frames) for part in space.values()])
     assert isinstance(space, Box)
-    if not is_picture(space.dtype, space.shape):
-        return Numbers(space)
-    return Trunk(frames) if space.shape == FRAMES_SPACE.shape else Convolutions(space.shape)
+    if is_picture(space.dtype, space.shape) and space.shape == FRAMES_SPACE.shape:
+        return Trunk(frames)
+    if is_picture(space.dtype, space.shape) or len(space.shape) == 3:
+        return Convolutions(space)
+    return Numbers(space)
+
+
+def fit_numbers(network: nn.Module, observations: NDArray[Any]) -> None:
+    """Scale the numbers that a network sees by their spread in observations [n, ...]."""
+    seen = tensors(observations)
+    for picture in (part for part in network.modules() if isinstance(part, Picture)):
+        trunk = picture.trunk
+        parts = trunk.parts if isinstance(trunk, Entries) else [trunk]
+        for part, entry in zip(parts, seen, strict=True):
+            if not isinstance(part, Trunk):
+                part.fit(entry)
 
 
 class Picture(nn.Module):

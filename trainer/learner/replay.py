@@ -116,6 +116,9 @@ class ReplayBuffer:
     ) -> None:
         self.capacity, self.alpha, self.human_share = capacity, alpha, human_share
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
+        self.reward_scale = 1.0
+        """What a reward is multiplied by when it is drawn."""
+        self._largest_return, self._episode_rewards = 0.0, list[float]()
         self.added = self._frames_added = 0  # Since the run began
         self._oldest = 0  # Running number of the oldest transition that is not forgotten
         self._stacked, self._frame_slots = layout.stacked, int(capacity * FRAMES_PER_TRANSITION) + 3
@@ -164,6 +167,7 @@ class ReplayBuffer:
     def end_episode(self) -> None:
         """Let the next transition begin an episode: it does not follow the one before."""
         self._current = None
+        self._largest_return, self._episode_rewards = self.largest_return, []
 
     def add(self, transition: Transition) -> None:
         """Store a transition with the highest priority in its buffer (algorithm 1)."""
@@ -183,6 +187,7 @@ class ReplayBuffer:
         overruled = transition.overruled
         self._actions[slot] = transition.action
         self._rewards[slot] = transition.reward
+        self._episode_rewards.append(transition.reward)
         self._terminals[slot] = transition.terminal
         self._human[slot] = transition.human
         self._overruled[slot] = transition.action if overruled is None else overruled
@@ -203,6 +208,23 @@ class ReplayBuffer:
         if not np.array_equal(frames[0], frames[1]):
             newer = self._add_picture(frames[1])
         return older, newer
+
+    def observations(self, most: int) -> NDArray[Any]:
+        """Return at most so many observations [n, ...], evenly from all that are not forgotten."""
+        return self._frames(self.alive[:: -(-len(self) // most)], 0)
+
+    @property
+    def largest_return(self) -> float:
+        """Largest absolute discounted sum of rewards, unscaled, up to an episode's latest step."""
+        return max(self._largest_return, self._ended_return())
+
+    def _ended_return(self) -> float:
+        """Largest such sum of the episode that is under way."""
+        after, largest = 0.0, 0.0
+        for reward in reversed(self._episode_rewards):
+            after = reward + self.gamma * after
+            largest = max(largest, abs(after))
+        return largest
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
         """Draw a minibatch by priority."""
@@ -242,6 +264,8 @@ class ReplayBuffer:
             "added": self.added,
             "frames_added": self._frames_added,
             "oldest": self._oldest,
+            "reward_scale": self.reward_scale,
+            "largest_return": self.largest_return,
             "frame_ids": self._frame_ids[: self._used],
             # Bytes: a checkpoint holds no structured arrays.
             "pictures": self._pictures[: self._frames_added].view(np.uint8),
@@ -253,6 +277,7 @@ class ReplayBuffer:
         """Take up what ``state_dict`` gave; the next transition begins an episode."""
         self.added, self._oldest = state["added"], state["oldest"]
         self._frames_added = state["frames_added"]
+        self.reward_scale, self._largest_return = state["reward_scale"], state["largest_return"]
         self._frame_ids[: self._used] = state["frame_ids"]
         self._pictures[: self._frames_added].view(np.uint8)[:] = state["pictures"]
         self._current = None
@@ -293,7 +318,8 @@ class ReplayBuffer:
         overruled action that is penalised it ends without a bootstrap: the human's action there,
         and its result, say nothing of the policy's actions before.
         """
-        sums: NDArray[np.floating] = self._rewards[indices]
+        scale = np.float32(self.reward_scale)
+        sums: NDArray[np.floating] = scale * self._rewards[indices]
         lasts = indices
         terminals: NDArray[np.float32] = self._terminals[indices]
         spans = np.ones(len(indices), np.int64)
@@ -310,7 +336,7 @@ class ReplayBuffer:
                 terminals = np.where(overruled, np.float32(1.0), terminals)
                 going &= ~overruled
             lasts = np.where(going, following, lasts)
-            sums = sums + going * (discount * self._rewards[following])
+            sums = sums + going * (discount * (scale * self._rewards[following]))
             terminals = np.where(going, self._terminals[lasts], terminals)
             spans += going
         return sums.astype(np.float32), lasts, terminals, spans

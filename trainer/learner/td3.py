@@ -97,6 +97,18 @@ class TD3Learner:
         one, other = (critic.value(critic.picture(*seen), actions) for critic in self.critics.pair)
         return float((one - other).abs())
 
+    def fit_numbers(self, observations: NDArray[Any]) -> None:
+        """Scale the numbers that all networks see by their spread in observations [n, ...]."""
+        for name in NETWORKS:
+            networks.fit_numbers(getattr(self, name), observations)
+
+    @torch.no_grad()
+    def rescale_values(self, factor: float) -> None:
+        """Multiply what the critics answer, after the unit of the rewards has changed."""
+        for critic in (*self.critics.pair, *self.target_critics.pair):
+            critic.head.output.weight.mul_(factor)
+            critic.head.output.bias.mul_(factor)
+
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """Take one step of algorithm 1 on a minibatch; ``beta`` is eq. 15's exponent."""
         c = self.config
@@ -114,8 +126,11 @@ class TD3Learner:
         critic_loss, errors, value = self._critic_loss(batch, pictures, actions, targets, beta)
         score = self.actor.head(own_picture)
         own_actions = torch.tanh(score)
-        policy, cloning = self._actor_losses(pictures[0].detach(), own_actions, actions, human)
-        priorities = self._priorities(errors, seen, actions, human, own_actions.detach())
+        judged = self._judge(seen, actions, human, own_actions.detach())
+        policy, cloning = self._actor_losses(
+            pictures[0].detach(), own_actions, actions, human, judged
+        )
+        priorities = self._priorities(errors, judged, human)
         if self.algorithm.foresight and batch.foreseen is not None:
             policy = policy + self._preference_loss(batch.foreseen)
 
@@ -241,7 +256,12 @@ class TD3Learner:
         return loss, errors, mean
 
     def _actor_losses(
-        self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor
+        self,
+        picture: Tensor,
+        own_actions: Tensor,
+        actions: Tensor,
+        human: Tensor,
+        judged: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor]:
         """Return eq. 23's two terms, unweighted; without cloning the first has all samples."""
         row, nothing = self.algorithm, torch.zeros((), device=self.device)
@@ -251,7 +271,8 @@ class TD3Learner:
             policy = equations.policy_loss(values, human, self.config.split_loss and cloned)
         if not cloned:
             return policy, nothing
-        return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
+        weights = equations.cloning_weights(*judged) if row.weighted_cloning else None
+        return policy, equations.behaviour_cloning_loss(own_actions, actions, human, weights)
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
         """Prefer the human's action in the states to which the overruled one would have led."""
@@ -263,28 +284,25 @@ class TD3Learner:
         return equations.preference_loss(actions, preferred, overruled, self.config.preference_beta)
 
     @torch.no_grad()
-    def _priorities(
-        self,
-        errors: Tensor,
-        seen: list[Tensor],
-        actions: Tensor,
-        human: Tensor,
-        own_actions: Tensor,
-    ) -> Tensor:
-        """Return eq. 21's priorities; the target critic evaluates only the human's samples."""
-        c, row = self.config, self.algorithm
-        advantage = torch.zeros_like(errors)
+    def _judge(
+        self, seen: list[Tensor], actions: Tensor, human: Tensor, own_actions: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return Q'(s, a) and Q'(s, pi(s)), [n] each, of the human's samples; 0 of the others."""
+        row, values = self.algorithm, torch.zeros((2, len(human)), device=self.device)
         looked_at = human.nonzero()[:, 0]
-        if row.advantage_weight and len(looked_at):
+        if (row.advantage_weight or row.weighted_cloning) and len(looked_at):
             critic = self.target_critics.first
             # Copies picture by picture; [looked_at] copies byte by byte, 25 times as slow.
             with self._precision():
                 picture = critic.picture(*(entry.index_select(0, looked_at) for entry in seen))
-            advantage[looked_at] = equations.q_advantage(
-                critic.value(picture, actions[looked_at]),
-                critic.value(picture, own_actions[looked_at]),
-                c.advantage_bound,
-            )
+            for value, chosen in zip(values, (actions, own_actions), strict=True):
+                value[looked_at] = critic.value(picture, chosen[looked_at])
+        return values[0], values[1]
+
+    def _priorities(self, errors: Tensor, judged: tuple[Tensor, Tensor], human: Tensor) -> Tensor:
+        """Return eq. 21's priorities."""
+        c, row = self.config, self.algorithm
+        advantage = equations.q_advantage(*judged, c.advantage_bound)
         scheme = row.td_weight, row.human_td_weight, row.advantage_weight
         return equations.priority(errors, advantage, human, c.priority_offset, *scheme)
 

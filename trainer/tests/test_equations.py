@@ -61,6 +61,11 @@ TARGETS, VALUES = t(1.0, 3.0, 2.0, 1.0), t(1.0, 10.0, 3.0, 20.0)
         (eq.policy_loss, (VALUES, HUMAN, False), -8.5),
         (eq.behaviour_cloning_loss, (t(0, 0.5, 0, -1)[:, None], t(9, 1, 9, 1)[:, None], HUMAN),
          (0.25 + 4.0) / 2),
+        (eq.behaviour_cloning_loss,
+         (t(0, 0.5, 0, -1)[:, None], t(9, 1, 9, 1)[:, None], HUMAN, t(0, 2, 0, 1)),
+         (2 * 0.25 + 4.0) / 2),
+        # What the critic finds as good counts as before; at odds of 3 to 1, half more.
+        (eq.cloning_weights, (t(1, math.log(3.0)), t(1, 0)), [1.0, 1.5]),
     ],
 )  # fmt: skip
 def test_by_hand(equation, given, wanted):

@@ -108,8 +108,14 @@ class ReferenceLearner:
         own_actions, cloned, cloning = torch.tanh(scores), row.behaviour_cloning, torch.zeros(())
         own_values = q(first, frames, own_actions)
         policy = equations.policy_loss(own_values, human, c.split_loss and cloned) * row.q_term
+        with torch.no_grad():
+            judge = self.target_critics.first
+            judged = q(judge, frames, actions), q(judge, frames, own_actions)
         if cloned:
-            cloning = equations.behaviour_cloning_loss(own_actions, actions, human)
+            weights = 2.0 / (1.0 + torch.exp(judged[1] - judged[0]))
+            cloning = equations.behaviour_cloning_loss(
+                own_actions, actions, human, weights if row.weighted_cloning else None
+            )
         if row.foresight and batch.foreseen is not None:
             names = ("next_frames", "actions", "overruled")
             ahead, better, worse = (torch.from_numpy(getattr(batch.foreseen, n)) for n in names)
@@ -122,10 +128,7 @@ class ReferenceLearner:
         actor_loss = actor_loss + c.saturation_weight * scores.square().mean()
 
         with torch.no_grad():
-            judge = self.target_critics.first
-            advantage = equations.q_advantage(
-                q(judge, frames, actions), q(judge, frames, own_actions), c.advantage_bound
-            )
+            advantage = equations.q_advantage(*judged, c.advantage_bound)
             scheme = row.td_weight, row.human_td_weight, row.advantage_weight
             priorities = equations.priority(errors, advantage, human, c.priority_offset, *scheme)
 

@@ -26,10 +26,14 @@ from trainer.learner import equations
 from trainer.learner.config import HUMANS_ACTION, find_algorithm
 from trainer.learner.replay import Action, Batch, Observation, ReplayBuffer, Transition
 from trainer.learner.td3 import NETWORKS, Losses, TD3Learner, charges_overruled
+from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
 from trainer.util import Purpose, random_stream
 
 LOSSES = Losses._fields[:4]  # What is averaged over an episode
+MOST_TO_FIT = 4096  # Observations by whose spread numbers are scaled
+USUAL_RETURN, USUAL_FACTOR = 10.0, 3.0
+"""Returns of about +-10 stay as they are: within that factor."""
 NICENESS = 10  # Of what learns beside a person, with torch's own threads: the loop goes first
 
 
@@ -69,6 +73,9 @@ class LearningThread:
         # First of all in this thread, so that the kernel's OpenMP threads inherit it.
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
         self._begun: tuple[list[Batch], Future[tuple[list[Losses], float]]] | None = None
+        self._scenario = config.scenario
+        self._fitted = False
+        """Whether observations and rewards are scaled by what the warm-up has seen."""
         self._forget_losses()
 
     @property
@@ -107,9 +114,27 @@ class LearningThread:
 
     def begin(self, beta: float) -> None:
         """Start an update, or several, on what is stored; ``beta`` is eq. 15's exponent."""
+        if not self._fitted:
+            self.learner.fit_numbers(self.replay.observations(MOST_TO_FIT))
+            self._scale_rewards()
+            self._fitted = True
         size, updates = self.config.batch_size, self.algorithm.updates_per_step
         batches = [self.replay.sample(size, self._random) for _ in range(updates)]
         self._begun = batches, self._thread.submit(self._update, batches, beta)
+
+    def _scale_rewards(self) -> None:
+        """Bring the largest return to the range for which the losses' weights were chosen.
+
+        That is our scenarios' own. Small ones grow only before the first update: later the first
+        success may be a large one.
+        """
+        if self._scenario in SCENARIOS:
+            return
+        scaled = self.replay.reward_scale * self.replay.largest_return
+        small = 0.0 < scaled < USUAL_RETURN / USUAL_FACTOR and not self._fitted
+        if small or scaled > USUAL_RETURN * USUAL_FACTOR:
+            self.learner.rescale_values(USUAL_RETURN / scaled)
+            self.replay.reward_scale *= USUAL_RETURN / scaled
 
     def finish(self) -> float:
         """Wait for the update that was begun, if one was; return the seconds waited.
@@ -147,6 +172,8 @@ class LearningThread:
         }
         self._forget_losses()
         self.release(keep)
+        if self._fitted:
+            self._scale_rewards()
         return learned
 
     def release(self, keep: bool = True) -> None:
@@ -166,12 +193,14 @@ class LearningThread:
             for name, value in self.replay.state_dict().items()
         }
         drawing = self._random.bit_generator.state
-        return {"learner": self.learner.state_dict(), "replay": replay, "drawing": drawing}
+        return {"learner": self.learner.state_dict(), "replay": replay, "drawing": drawing,
+                "fitted": self._fitted}  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
+        self._fitted = state["fitted"]
 
     def close(self) -> None:
         self._thread.shutdown()
