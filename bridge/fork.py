@@ -90,6 +90,18 @@ class RecordedEpisode:
 
 def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
     """Read an episode; ``number`` None: the only one."""
+    drives = read_episodes(path, vehicle_id, number)
+    number = 0 if number is None and len(drives) == 1 else number
+    if number is None or number >= len(drives):
+        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
+        raise UserError(f"{path} holds {which}")
+    return drives[number]
+
+
+def read_episodes(
+    path: Path, vehicle_id: str | None = None, number: int | None = None
+) -> list[RecordedEpisode]:
+    """Read all episodes, with the messages of all, or of that ``number`` only."""
     recording = Recording(path)
     vehicle_id = choose_vehicle(recording, vehicle_id)
     drives: dict[tuple[str, int], RecordedEpisode] = {}
@@ -107,11 +119,7 @@ def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> Reco
                 kept: dict[int, Any] = drive.states if is_state else drive.commands
                 kept.setdefault(message.step, message)
     recording.say_trouble()
-    number = 0 if number is None and len(drives) == 1 else number
-    if number is None or number >= len(drives):
-        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
-        raise UserError(f"{path} holds {which}")
-    return list(drives.values())[number]
+    return list(drives.values())
 
 
 class ForkedEnvironment(gymnasium.Wrapper[Any, Any, Any, Any]):

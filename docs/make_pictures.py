@@ -16,7 +16,7 @@ from edge_runtime.util import read_json
 from hil_tests.campaign import draw_axes
 from trainer.environments import make_environment
 from trainer.evaluation import load_driver
-from trainer.training.metrics import write_figure
+from trainer.training.curves import write_figure
 from trainer.util import kept
 
 FOLDER = Path(__file__).parent

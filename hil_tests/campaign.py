@@ -30,7 +30,7 @@ from edge_runtime.util import UserError
 from hil_tests.envelope import Drivers
 from hil_tests.faults.rows import Row
 from hil_tests.faults.run import ROWS, run_faults
-from trainer.training.metrics import write_figure
+from trainer.training.curves import write_figure
 from trainer.util import cores, kept
 
 Found = Mapping[str, Any]  # A part of a report's JSON

@@ -52,7 +52,12 @@ def train(parser: argparse.ArgumentParser) -> None:
     rows += "MODULE:ROW (trainer/README.md explains the names)"
     add("--algorithm", default=DEFAULTS.algorithm, metavar="NAME", help=rows)
     add_seed(what)
+    several = "train a run for each seed, such as 1-5, side by side, in RUN_DIR/seed_N"
+    add("--seeds", type=seeds, metavar="FIRST-LAST", help=several)
     add_fields(what, DEFAULTS, *EXTENT)
+    judge = "who says whether an episode succeeded, where the environment does not: it takes the "
+    judge += "last observation, its info and the return, and returns True, False or None"
+    add("--success", default=DEFAULTS.success, metavar="MODULE:FUNCTION", help=judge)
     start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
     change = "change a setting; may be repeated; --set alone lists all settings with their "
@@ -70,6 +75,11 @@ def train(parser: argparse.ArgumentParser) -> None:
     known = "who takes over from the policy: the environment's scripted expert, your own expert as "
     known += "MODULE:CLASS, a model trained by `trainer human`, or you, in the browser (web)"
     guide.add_argument("--human", default=DEFAULTS.human, metavar=whose, help=known)
+    shown = "drives to learn from before the first step: a person's recordings, F.mcap of bridge "
+    shown += "record, or a LeRobot data set"
+    guide.add_argument(
+        "--demonstrations", default=DEFAULTS.demonstrations, metavar="PATH", help=shown
+    )
     add_person(parser)
     how = parser.add_argument_group("the run")
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
@@ -85,6 +95,15 @@ def train(parser: argparse.ArgumentParser) -> None:
         if action.dest in TYPED:  # Only what is typed wins over a run's own config.
             action.help = f"{action.help} (default: {action.default})"
             action.default = argparse.SUPPRESS
+
+
+def seeds(text: str) -> range:
+    """Read ``1-5`` or a single number."""
+    first, _, last = text.partition("-")
+    found = range(int(first), int(last or first) + 1)
+    if not found:
+        raise ValueError(text)
+    return found
 
 
 class _Set(argparse.Action):
@@ -229,12 +248,15 @@ def experiment(parser: argparse.ArgumentParser) -> None:
 
 
 @command(
-    "trainer.training.metrics:run",
-    "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
+    "trainer.training.curves:run",
+    "python -m trainer plot runs/phil_1 runs/phil_2 runs/hi_1 runs/hi_2 --out curves.png",
 )
 def plot(parser: argparse.ArgumentParser) -> None:
-    runs = "directory of a training run; with several, the mean is drawn over thin single curves"
+    runs = "directory of a training run, or of several; runs of one algorithm are drawn as their "
+    runs += "mean, with its 95 %% interval"
     parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
+    over = "draw over environment steps, or over the seconds that the human has driven"
+    parser.add_argument("--x", choices=["steps", "human_s"], default="steps", help=over)
     out = f"picture to write (default: RUN_DIR/{CURVE_FILE})"
     parser.add_argument("--out", metavar="F.png", help=out)
 

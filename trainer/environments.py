@@ -36,6 +36,10 @@ MOST_STEPS = 1000  # Of an episode whose environment has no limit of its own
 BEARABLE = 1e4  # Largest number in an observation; the layers of a network take some units
 
 
+Judge = Callable[[Any, Mapping[str, Any], float], bool | None]
+"""Takes the last observation, its info and the episode's return; None: not known."""
+
+
 class Condition(NamedTuple):
     """The scene and the command noise of test episodes."""
 
@@ -59,13 +63,14 @@ def make_environment(
     condition: str = "nominal",
     printed_reward: bool = False,
     period_s: float | None = None,
+    success: str = "",
 ) -> Any:
     """Make the environment of a scenario's word, a gymnasium id or ``module:id``.
 
     The two scenarios come as they are, in the scene of a test condition; any other environment is
     `Adapted`. With ``printed_reward`` a scenario pays what eq. 31 or 32 says, without its own
     weight. A step lasts ``period_s`` where given, else what the environment says, else 0.1 s, which
-    a line says.
+    a line says. ``success`` is ``module:function`` that judges the episodes of one that does not.
 
     Raises UserError for no such environment, or one that cannot be driven here.
     """
@@ -73,7 +78,10 @@ def make_environment(
     if name not in SCENARIOS:
         if printed_reward:
             raise UserError(f"printed_reward is the paper's, and {name} is none of its scenarios")
-        return Adapted(bridge.make_environment(name, scene), name, period_s)
+        judge = load_named(success, "function") if success else None
+        return Adapted(bridge.make_environment(name, scene), name, period_s, judge)
+    if success:
+        raise UserError(f"{name} itself says whether an episode succeeded")
     scenario: Any = gymnasium.make(SCENARIOS[name], scene=scene).unwrapped
     if printed_reward:
         scenario.config = scenario.config.with_printed_reward()
@@ -137,11 +145,19 @@ def expert_of(env: Any, human: str = "expert") -> Expert:
         if env.expert is None:
             raise UserError(f"{env.scenario} offers no expert(); name one as module:Class")
         return env.expert()
+    made = load_named(human, "expert")
     try:
-        own = EntryPoint(human, human, "").load()(env.unwrapped)
-    except Exception as error:  # A module may raise anything when it is imported
+        return _ScaledExpert(env, made(env.unwrapped))
+    except Exception as error:  # It may raise anything
         raise UserError(f"no expert {human!r}: {type(error).__name__}: {error}") from error
-    return _ScaledExpert(env, own)
+
+
+def load_named(place: str, what: str) -> Any:
+    """Import ``module:name``; UserError where that fails."""
+    try:
+        return EntryPoint(place, place, "").load()
+    except Exception as error:  # A module may raise anything when it is imported
+        raise UserError(f"no {what} {place!r}: {type(error).__name__}: {error}") from error
 
 
 def outer(action_range: tuple[Any, Any], action: Any) -> NDArray[np.float32]:
@@ -161,17 +177,22 @@ class Adapted(bridge.Adapter):
     """Any environment in the form of the two scenarios.
 
     It has Box or flat Dict observations, and a Box of actions with finite bounds. ``name`` is the
-    name by which it was made. Raises UserError for what `bridge.environments.describe` refuses.
+    name by which it was made; ``judge`` says at an episode's end whether it succeeded. Raises
+    UserError for what `bridge.environments.describe` refuses.
     """
 
     goal_m = float("nan")
     biased_action = 1.0
 
     def __init__(
-        self, env: gymnasium.Env[Any, Any], name: str, period_s: float | None = None
+        self,
+        env: gymnasium.Env[Any, Any],
+        name: str,
+        period_s: float | None = None,
+        judge: Judge | None = None,
     ) -> None:
         super().__init__(env, bridge.describe(env, period_s, PERIOD_S))
-        self.scenario, self.unwrapped = name, env.unwrapped
+        self.scenario, self.unwrapped, self.judge = name, env.unwrapped, judge
         self.observation_space = env.observation_space
         self.control_period_s = self.task.control_period_s
         self.action_names = tuple(row.name for row in self.task.action)
@@ -194,7 +215,7 @@ class Adapted(bridge.Adapter):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Begin an episode."""
-        self._last_action = self.rest_action
+        self._last_action, self._return = self.rest_action, 0.0
         observation, info = self.env.reset(seed=seed, options=options)
         return self._seen(observation), _known(info)
 
@@ -203,10 +224,12 @@ class Adapted(bridge.Adapter):
         self._last_action = np.asarray(action, np.float32)
         own = outer(self.action_range, action).reshape(self._space.shape)
         seen, reward, terminated, truncated, info = self.env.step(own.astype(self._space.dtype))
-        info = _known(info)
+        info, reward = _known(info), bridge.finite("reward", reward)
+        self._return += reward
         if terminated or truncated:
+            if self.judge:
+                info["is_success"] = self.judge(seen, info, self._return)
             info["outcome"] = outcome_of(info, only_truncated=not terminated)
-        reward = bridge.finite("reward", reward)
         return self._seen(seen), reward, bool(terminated), bool(truncated), info
 
     def close(self) -> None:

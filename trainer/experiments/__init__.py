@@ -141,6 +141,7 @@ class Study:
     evaluate_every_steps: int = 500
     """Environment steps between two validations; the best validated actor is tested."""
     evaluation_runs: int = 50  # Drives of a validation
+    confirmation_factor: int = 0  # Times as many before an actor is kept; 0: none
     test_runs: int = 250
     """Test drives in each scene, with the seeds 0, 1, ...: the paper's 50 first, then others."""
     checkpoint_every: int = 5
@@ -194,6 +195,8 @@ class Study:
             return values
         tuned = TUNED.get(unit.algorithm, {}) if unit.setting in HUMANS else {}
         own = ALGORITHMS[unit.algorithm].settings
+        factor = here.confirmation_factor
+        confirmed = {"confirmation_factor": factor} if factor else {}  # Records without it are kept
         return {
             **values,
             "seed": unit.seed,
@@ -201,6 +204,7 @@ class Study:
             "steps": here.steps[unit.scenario],
             "evaluate_every_steps": here.evaluate_every_steps,
             "evaluation_runs": here.evaluation_runs,
+            **confirmed,
             **setting.get("run", {}),
             "learner": {**own, **tuned, **here.learner, **setting.get("learner", {})},
         }

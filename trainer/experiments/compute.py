@@ -227,7 +227,7 @@ def run_config(job: Job) -> RunConfig:
         values["human"] = str(job.human_model.parent)
     return replace(
         start,
-        **values,
+        **{"confirmation_factor": 0, **values},
         episodes=UNLIMITED_EPISODES,
         checkpoint_every=job.store.study.checkpoint_every,
         threads=1,

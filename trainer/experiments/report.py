@@ -53,7 +53,7 @@ from trainer.experiments.records import (
 )
 from trainer.learner.config import ALGORITHMS
 from trainer.training.config import PRESETS, flat
-from trainer.training.metrics import DOTS_PER_INCH
+from trainer.training.curves import DOTS_PER_INCH
 
 Cell = Callable[[pd.DataFrame], str]
 PHIL = "phil_td3"

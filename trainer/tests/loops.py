@@ -25,7 +25,13 @@ LEARNER = LearnerConfig(
     batch_size=BATCH, replay_capacity=100, warmup_steps=1, exploration_initial=0.0,
     exploration_final=0.0, intervention_penalty=-7.0,
 )  # fmt: skip
-CONFIG = RunConfig(episodes=1, evaluate_every_steps=0, checkpoint_every=1000, learner=LEARNER)
+CONFIG = RunConfig(
+    episodes=1,
+    evaluate_every_steps=0,
+    confirmation_factor=0,
+    checkpoint_every=1000,
+    learner=LEARNER,
+)
 
 
 def frames(step: int) -> np.ndarray:

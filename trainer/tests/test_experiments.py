@@ -169,7 +169,7 @@ class TestUnit:
         assert learned.human_s == pytest.approx(learned.human_steps / 30)
         page = report.write_page(store, found).read_text()
         assert (store.results / "guidance.png").stat().st_size > 1000
-        assert "| IA-TD3 | hill | 1 | never |" in page
+        assert "| IA-TD3 | hill | 1 |" in page
 
 
 def test_a_failure_is_one_units_and_one_line(store, capfd):

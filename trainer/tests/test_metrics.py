@@ -1,13 +1,11 @@
 import csv
-import math
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
+from bridge.outcomes import success_estimate
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import refusal
-from trainer.__main__ import main
 from trainer.training.metrics import (
     NAMES,
     EpisodeMetrics,
@@ -79,7 +77,12 @@ def test_anything_else_is_refused_in_a_line_that_names_it(content, capsys, tmp_p
 
 def test_a_run_is_summed_up():
     names = ("total_steps", "updates", "outcome", "validation_success", "validation_reward")
-    same = {"human_steps": "3", "interventions": "1"}
+    same = {
+        "human_steps": "3",
+        "interventions": "1",
+        "confirmed_success": "nan",
+        "confirmed_reward": "nan",
+    }
     rows = [dict(zip(names, values.split(), strict=True)) | same for values in (
         "20 0 collision nan nan", "90 50 goal 0.5 1", "150 110 timeout 0.9 2",
         "210 170 collision 0.9 1", "280 240 goal 0.8 1",
@@ -93,18 +96,10 @@ def test_a_run_is_summed_up():
                           "failures": {"collision": 1, "timeout": 1}}, "0.98": None},
     }  # fmt: skip
     assert totals([], 0.1) == {}
-
-
-def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):
-    dirs = [str(tmp_path / name) for name in ("one", "two")]
-    for directory, episodes in zip(dirs, (30, 12), strict=True):
-        writer = MetricsWriter(Path(directory))
-        for episode in range(episodes):
-            validated = 0.5 if episode % 5 == 4 else math.nan
-            writer.add(EpisodeMetrics(episode, steps=9, validation_success=validated))
-        writer.close()
-    assert "--out F.png" in refusal(capsys, "plot", *dirs)
-    out = tmp_path / "curves.png"
-    assert main(["plot", *dirs, "--out", str(out)]) == 0
-    with Image.open(out) as picture:
-        assert picture.size == (1100, 660)
+    # The last is the best in validation, the second is kept.
+    seconds = ("nan nan", "0.25 1", "0.75 0", "0.5 9", "nan nan")
+    rows = [each | dict(zip(("confirmed_success", "confirmed_reward"), second.split(), strict=True))
+            for each, second in zip(rows, seconds, strict=True)]  # fmt: skip
+    found = totals(rows, 0.1, confirming=40)["validation"]
+    assert found["best_at_step"] == 150
+    assert found["confirmed"] == success_estimate(30, 40)._asdict()

@@ -33,7 +33,7 @@ from trainer.tests.loops import (
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
-from trainer.training.run import Validation
+from trainer.training.run import Trials, Validation
 from trainer.util import load_torch
 
 
@@ -223,17 +223,51 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurr
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
+def drives(successes: int, failures: int) -> list[Any]:
+    outcomes = ["goal"] * successes + ["timeout"] * failures
+    return [SimpleNamespace(outcome=each, reward=0.0, distance_m=0.0) for each in outcomes]
+
+
+def take_drives(validation, results, episode: int, due: bool = True) -> EpisodeMetrics:
+    actor: Any = SimpleNamespace(state_dict=lambda: {"number": torch.tensor(episode)})
+    validation.take(results, actor, metrics := EpisodeMetrics(episode), episode, due)
+    return metrics
+
+
+def test_an_actor_that_was_lucky_in_validation_does_not_replace_a_better_one(tmp_path):
+    config = replace(CONFIG, evaluation_runs=2, confirmation_factor=2)
+    validation = Validation(config, tmp_path, cast(Any, None))
+    kept = []
+    judged = [((1, 1), (3, 1)), ((2, 0), (2, 2)), ((1, 1), (4, 0))]
+    for episode, (first, second) in enumerate(judged):
+        metrics = take_drives(validation, [*drives(*first), *drives(*second)], episode)
+        assert metrics.validation_success == first[0] / 2
+        assert metrics.confirmed_success == second[0] / 4
+        kept.append(load_torch(tmp_path / BEST_FILE)["episode"])
+    assert kept == [0, 0, 2]
+
+
+def test_only_an_actor_no_worse_than_the_kept_one_drives_the_second_set():
+    config = replace(CONFIG, evaluation_runs=2, confirmation_factor=3)
+    trials: Any = Trials(config)
+    driven: list[int] = []
+
+    def drive(driver, seeds):
+        driven.extend(seeds)
+        return drives(1, len(seeds) - 1)
+
+    trials._drive = drive
+    for best, count in (((0.5, 0.0), 8), ((0.51, 0.0), 2)):
+        driven.clear()
+        assert len(trials.drive(None, best)) == len({*driven}) == count
+
+
 @given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=12), st.data())
 def test_when_a_run_was_stopped_does_not_decide_which_actor_it_ends_with(scores, data):
     """Each episode: the success that a validation finds, and whether a validation is due."""
 
     def judge(validation, episode, score, due):
-        ends = [
-            SimpleNamespace(outcome="goal" if n < score else "timeout", reward=0.0, distance_m=0.0)
-            for n in range(3)
-        ]
-        actor: Any = SimpleNamespace(state_dict=lambda: {"number": torch.tensor(episode)})
-        validation.take(ends, actor, EpisodeMetrics(episode), episode, due)
+        take_drives(validation, drives(score, 3 - score), episode, due)
 
     with tempfile.TemporaryDirectory() as folder:
         kept = {}

@@ -33,7 +33,7 @@ from trainer.util import load_torch, save_torch
 
 # Learning, the slowest part, begins late, and still before what a test looks at.
 SMALL = LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=170, exploration_initial=1.0)
-TINY = RunConfig(seed=3, episodes=4, evaluation_runs=2, checkpoint_every=1, learner=SMALL)
+TINY = RunConfig(seed=3, episodes=4, evaluation_runs=1, checkpoint_every=1, learner=SMALL)
 TINY = replace(TINY, evaluate_every_steps=190)  # after two and four episodes
 
 
@@ -207,9 +207,9 @@ def test_what_is_kept_is_the_averaged_network_that_was_validated(tmp_path):
     judged: list[Any] = []
     drive, pictures = run.validation.drive, np.zeros((1, 2, 45, 80), np.uint8)
 
-    def spy(driver):
+    def spy(driver, best):
         judged.append(driver.act_together(pictures))
-        return drive(driver)
+        return drive(driver, best)
 
     run.validation.drive = spy
     run.train()

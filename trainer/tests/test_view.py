@@ -21,7 +21,7 @@ from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
 
 TINY = RunConfig(
-    seed=3, episodes=1, evaluate_every_steps=1, evaluation_runs=1, threads=1,
+    seed=3, episodes=1, evaluate_every_steps=1, evaluation_runs=1, confirmation_factor=1, threads=1,
     learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=60),
 )  # fmt: skip
 

@@ -1,22 +1,26 @@
 """The command ``train``, and the same in Python: whether a run may begin or go on, and its end."""
 
 import argparse
+import io
 import math
 import os
 import re
+import signal
 import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack, closing, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
+from multiprocessing import active_children, get_context
 from os import PathLike
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from bridge.outcomes import GOAL
+from bridge.outcomes import GOAL, Estimate
 from bridge.report import ProgressBar
 from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
@@ -37,8 +41,18 @@ from trainer.training.config import (
     parse_setting,
     settings_in,
 )
-from trainer.training.metrics import EpisodeMetrics, read_metrics, totals, write_learning_curve
-from trainer.training.run import TrainingRun
+from trainer.training.curves import write_learning_curve
+from trainer.training.metrics import (
+    REPORT_FILE,
+    EpisodeMetrics,
+    read_metrics,
+)
+from trainer.training.run import TrainingRun, environment_of, make_parts
+
+FINDS_NOTHING = (
+    "every episode has had the same return so far: there is nothing to learn from. A human, or more"
+    " noise (--set exploration_initial=1 --set exploration_final=0.5), may find what pays"
+)
 
 
 @dataclass(frozen=True)
@@ -59,17 +73,61 @@ class Run:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.seeds is None:
+        return INTERRUPTED if _run(arguments).interrupted else 0
+    if arguments.rerun or vars(arguments).get("human") in HUMANS:
+        raise UserError("--seeds goes with neither a person nor --rerun")
+    ends = list(_run_seeds(arguments))
+    return INTERRUPTED if any(ends) else 0
+
+
+def _run_seeds(arguments: argparse.Namespace) -> Iterator[bool]:
+    """Train a run of one thread for each seed, side by side; yield which were interrupted."""
+    jobs = []
+    for seed in arguments.seeds:
+        out = Path(arguments.out) / f"seed_{seed}"
+        begun = arguments.resume and (out / CONFIG_FILE).is_file()
+        own = {"seed": seed, "out": str(out), "resume": begun}
+        jobs.append(argparse.Namespace(**{"threads": 1, **vars(arguments), **own}))
+    pool = ProcessPoolExecutor(
+        util.cores(), get_context("spawn"), util.begin_process, (0,), max_tasks_per_child=1
+    )
+    with pool, ProgressBar("seeds", len(jobs)) as bar:
+        work = [pool.submit(_run_quietly, job) for job in jobs]
+
+        def quit_all() -> bool:
+            for each in work:
+                each.cancel()
+            for process in active_children():  # Each ends its run after the episode.
+                os.kill(process.pid or 0, signal.SIGINT)
+            return True
+
+        with quit_on_signals(quit_all):
+            for each in as_completed(work):
+                said, interrupted = ("", True) if each.cancelled() else each.result()
+                bar.advance({})
+                print(said, end="")
+                yield interrupted
+
+
+def _run_quietly(arguments: argparse.Namespace) -> tuple[str, bool]:
+    """Return what a run prints at its end, and whether it was interrupted."""
+    with redirect_stdout(io.StringIO()) as said, redirect_stderr(io.StringIO()):
+        interrupted = _run(arguments).interrupted
+    return said.getvalue(), interrupted
+
+
+def _run(arguments: argparse.Namespace) -> Run:
     given = {name: value for name, value in vars(arguments).items() if name in TYPED}
     own = Path(arguments.out) / CONFIG_FILE
     in_file: dict[str, Any] = {}
     if arguments.resume and own.is_file():
         in_file = settings_in(read_json(own, "run config"), str(own))
-        for name in {"scenario", "algorithm", "human"} - given.keys():
+        for name in {"scenario", "algorithm", "human", "success"} - given.keys():
             # A name of a module must be typed: no file imports one.
             name_in_file(str(in_file.get(name)), f"{arguments.out} was trained with", f"--{name}")
     values = {**in_file, **given, **dict(map(parse_setting, arguments.set))}
-    done = _begin(values.pop("preset", "ours"), values, arguments)
-    return INTERRUPTED if done.interrupted else 0
+    return _begin(values.pop("preset", "ours"), values, arguments)
 
 
 def train(
@@ -87,6 +145,8 @@ def train(
     device: str = DEFAULTS.device,
     threads: int = DEFAULTS.threads,
     max_minutes: float | None = None,
+    demonstrations: str = DEFAULTS.demonstrations,
+    success: str = DEFAULTS.success,
     resume: bool = False,
     rerun: str | None = None,
     host: str = "127.0.0.1",
@@ -116,6 +176,8 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
     values["human"] = PERSON if human in HUMANS else located(human)
+    if demonstrations := values.get("demonstrations"):
+        values["demonstrations"] = os.path.abspath(demonstrations)
     values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
     config = make_config(preset, values)
     util.check_device(config.device)
@@ -123,9 +185,14 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     person = argparse.Namespace(
         human=human, scenario=config.scenario, host=how.host, port=how.port, speed=how.speed
     )
-    with util.claimed(run_dir), util.limited_threads(config.threads):
+    with (
+        util.claimed(run_dir),
+        util.limited_threads(config.threads),
+        closing(environment_of(config)) as env,
+    ):
+        config = make_config(preset, values, env)
         person.resume = check_directory(run_dir, config, how.resume)
-        return _train(person, config, run_dir, how.rerun, util.deadline_s(how.max_minutes))
+        return _train(person, config, run_dir, env, how.rerun, util.deadline_s(how.max_minutes))
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -135,7 +202,12 @@ def _new_directory(config: RunConfig) -> Path:
 
 
 def _train(
-    person: argparse.Namespace, config: RunConfig, run_dir: Path, rerun: str | None, end_s: float
+    person: argparse.Namespace,
+    config: RunConfig,
+    run_dir: Path,
+    env: Any,
+    rerun: str | None,
+    end_s: float,
 ) -> Run:
     sink = None if rerun is None else check_sink(rerun)
     with ExitStack() as stack:
@@ -143,11 +215,12 @@ def _train(
         if person.human in HUMANS:
             from trainer.person.run import training_with_person
 
-            began = training_with_person(person, config, run_dir)
+            began = training_with_person(person, config, run_dir, env)
             training, sitting = stack.enter_context(began)
             quit_training = sitting.quit
         else:
-            training = TrainingRun(config, run_dir, person.resume)
+            parts = make_parts(config, run_dir, env)
+            training = TrainingRun(config, run_dir, person.resume, parts)
             quit_training = partial(_quit, training)
         extent = config.episodes, training.episode
         if config.steps:
@@ -161,12 +234,20 @@ def _train(
         # Entered last: the first signal is ours, and the second the viewer's.
         stack.enter_context(quit_on_signals(quit_training))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)
+        explored = training.progress >= config.learner.exploration_share
         figures = {"validation": "-"}
 
         def on_episode(metrics: EpisodeMetrics) -> None:
+            nonlocal explored
             recent.append(metrics)
+            if not explored and training.progress >= config.learner.exploration_share:
+                explored = True
+                if len({row["episode_return"] for row in read_metrics(run_dir)}) == 1:
+                    print(f"\n{FINDS_NOTHING}", file=sys.stderr)
             if not math.isnan(metrics.validation_success):
                 figures["validation"] = f"{metrics.validation_success:.2f}"
+            elif not math.isnan(metrics.validation_reward):
+                figures["validation"] = f"return {metrics.validation_reward:.1f}"
             figures["return"] = f"{fmean(m.episode_return for m in recent):.1f}"
             figures["success"] = f"{fmean(m.outcome == GOAL for m in recent):.2f}"
             bar.advance(figures, metrics.steps if config.steps else 1)
@@ -176,7 +257,7 @@ def _train(
         training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    print(f"{_summary(run_dir, training.env.control_period_s)}: {run_dir}")
+    print(f"{_summary(read_json(run_dir / REPORT_FILE, 'report'))}: {run_dir}")
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
@@ -192,13 +273,15 @@ def _quit(training: TrainingRun) -> bool:
     return True
 
 
-def _summary(run_dir: Path, period_s: float) -> str:
-    found = totals(read_metrics(run_dir), period_s)
+def _summary(found: Mapping[str, Any]) -> str:
     if not found:
         return "no episodes"
     amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
     human = f"{counted(found['takeovers'], 'take-over')} with {found['human_s']:.0f} s"
-    return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
+    said = [*amounts, human, counted(sum(found["failures"].values()), "failure")]
+    if confirmed := found["validation"].get("confirmed"):
+        said.append(f"kept actor {Estimate(**confirmed).as_share()} %")
+    return ", ".join(said)
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> bool:

@@ -9,7 +9,12 @@ from typing import Any
 from bridge.network import parse_spec
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
-from trainer.learner.config import PRINTED_LEARNER, LearnerConfig, find_algorithm
+from trainer.learner.config import (
+    PRINTED_LEARNER,
+    LearnerConfig,
+    find_algorithm,
+    task_settings,
+)
 from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
@@ -24,12 +29,16 @@ RANGES = {
 """What these numbers may be; all others are at least 0."""
 CURVE_FILE = "learning_curve.png"
 EXTENT = ("episodes", "steps")  # How long a run is: it may go on for longer
-OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
+OPTIONS = (
+    "scenario", "algorithm", "seed", "human", "latency", "device", "threads", "demonstrations",
+    "success",
+)  # fmt: skip
 """What an option of its own decides; all else is changed by ``--set``."""
 TYPED = (*OPTIONS, *EXTENT, "preset")
 CONFIG_FILE = "config.json"  # A run's settings in its directory, with the source's revision
-RANDOM, BIASED = GUIDANCE = ("random", "biased")
-"""How a human of poor guidance is wrong: each time another way, or always the same."""
+RANDOM, BIASED, TAKEOVERS = GUIDANCE = ("random", "biased", "takeovers")
+"""How a human of poor guidance is wrong: each time another way, always the same, or the same in
+whole take-overs."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +72,11 @@ class RunConfig:
     """Whether the target actor is validated, kept and exported, instead of the actor that learns.
     It is a running average of that one (Polyak and Juditsky, 1992), which swings."""
     poor_guidance_share: float = 0.0
-    """Share of the human's actions replaced by wrong ones (section VII-E: one third)."""
+    """Share of the human's actions, or take-overs, replaced by wrong ones (section VII-E: one
+    third)."""
     poor_guidance: str = RANDOM
-    """The wrong actions: ``random`` (the paper's), or ``biased``, always the same one."""
+    """The wrong actions: ``random`` (the paper's), ``biased``, always the same one, or
+    ``takeovers``, that one from a take-over's beginning to its end."""
     period_s: float = 0.0
     """Control period, s; 0: the environment's own."""
     printed_reward: bool = False
@@ -75,6 +86,9 @@ class RunConfig:
     """Environment steps between two validations; 0: no validation."""
     evaluation_runs: int = 30
     """Episodes of a validation."""
+    confirmation_factor: int = 2
+    """Times as many episodes as a validation has, other ones, an actor drives before it is kept; 0:
+    none. The best of many validations overestimates its actor."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
     latency: str = "none"
@@ -84,6 +98,10 @@ class RunConfig:
     threads: int = 0
     """Processor threads of the learner; 0: PyTorch's default. Another number sums in another order,
     and gives other weights."""
+    demonstrations: str = ""
+    """Path of drives that fill the replay before the first step; empty: none."""
+    success: str = ""
+    """``module:function`` that says whether an episode succeeded; empty: the environment does."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
     def __post_init__(self) -> None:
@@ -99,6 +117,11 @@ class RunConfig:
         if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
+
+    @property
+    def confirmation_runs(self) -> int:
+        """Episodes that an actor drives before it is kept."""
+        return self.confirmation_factor * self.evaluation_runs
 
     @property
     def kept_actor(self) -> str:
@@ -128,8 +151,9 @@ SETTINGS: dict[str, Any] = {
 EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
-def make_config(preset: str, values: Mapping[str, Any]) -> RunConfig:
-    """Make a config of a preset, its algorithm's own settings, and ``values`` over both, by name.
+def make_config(preset: str, values: Mapping[str, Any], env: Any = None) -> RunConfig:
+    """Make a config of a preset, what the environment asks for, the algorithm's own settings, and
+    ``values`` over all, by name.
 
     Raises UserError: no such preset or algorithm, or a value out of range.
     """
@@ -138,8 +162,13 @@ def make_config(preset: str, values: Mapping[str, Any]) -> RunConfig:
     start, values = PRESETS[preset], dict(values)
     values["latency"] = str(parse_spec(values.get("latency", start.latency)))
     algorithm = values.get("algorithm", start.algorithm)
+    row, asked = find_algorithm(algorithm), {}
+    if env is not None and preset == "ours":
+        from trainer.learner.networks import sees_picture  # torch takes two seconds to load
+
+        asked = task_settings(row, not sees_picture(env.observation_space), env.control_period_s)
     try:
-        learner = replace(start.learner, **find_algorithm(algorithm).settings)
+        learner = replace(start.learner, **{**asked, **row.settings})
     except TypeError as error:  # The row is a plug-in's.
         raise UserError(f"settings of {algorithm}: {error}") from None
     own = {name: values.pop(name) for name in tuple(values) if hasattr(learner, name)}

@@ -1,8 +1,8 @@
 """A run's metrics: its episodes as rows of CSV and of TensorBoard, and what they amount to."""
 
-import argparse
 import csv
 import io
+import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -10,14 +10,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.outcomes import GOAL, failed, settled
+from bridge.outcomes import GOAL, Estimate, failed, settled, success_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.training.config import CURVE_FILE
 from trainer.util import fitting
 
 NAN = float("nan")
@@ -60,10 +57,15 @@ class EpisodeMetrics:
     waiting_s: float = 0.0
     """How long the loop waited for an update after the environment's step was done."""
     validation_success: float = NAN
-    """Success rate on the validation seeds (nan: no validation after this episode)."""
+    """Success rate on the validation seeds (nan: no validation after this episode, or nothing tells
+    whether a drive succeeded)."""
     validation_distance_m: float = NAN
     validation_reward: float = NAN
-    """Mean return of the validation; at equal success rates it decides which actor is kept."""
+    """Mean return of the validation (nan: none); at equal success rates it decides which actor is
+    kept."""
+    confirmed_success: float = NAN
+    """Success rate on the second set of seeds (nan: no better than the kept actor before that)."""
+    confirmed_reward: float = NAN
 
 
 NAMES = [f.name for f in fields(EpisodeMetrics)]
@@ -83,7 +85,7 @@ class MetricsWriter:
         if len(self._rows) < from_episode:
             raise UserError(f"{path} lacks episodes before the checkpoint: {from_episode}")
         for row in self._rows[-1:] if undue else ():
-            row.update({name: "nan" for name in NAMES if name.startswith("validation")})
+            row.update({n: "nan" for n in NAMES if n.startswith(("validation", "confirmed"))})
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
@@ -142,7 +144,7 @@ def _number(name: str, text: str) -> float:
 
 
 def was_validated(row: Mapping[str, str]) -> bool:
-    return row["validation_success"] != "nan"
+    return row["validation_reward"] != "nan"
 
 
 def is_reached(level: float, success: float) -> bool:
@@ -163,25 +165,41 @@ def spent(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]:
     }
 
 
-def totals(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]:
+def _scores(rows: Sequence[Mapping[str, str]], kind: str) -> list[tuple[float, float, int]]:
+    """Return the success, return and row number of each validation, or each confirmed one."""
+    success, reward = (f"{kind}_{name}" for name in ("success", "reward"))
+    scores = [(float(row[success]), float(row[reward]), n) for n, row in enumerate(rows)]
+    # Unknown successes are all alike.
+    return [(0.0 if math.isnan(s) else s, r, n) for s, r, n in scores if not math.isnan(r)]
+
+
+def totals(
+    rows: Sequence[Mapping[str, str]], period_s: float, confirming: int = 0
+) -> dict[str, Any]:
     """Sum up what a run cost and what it reached, from its rows; empty without rows.
 
     ``failures``: training episodes, with the human's help, that missed the goal, by outcome.
-    ``validation``: best and last success rate, and the environment steps before the best.
+    ``validation``: best and last success rate, None where it is unknown, and the environment steps
+    before the best; in the second set, of ``confirming`` drives, the kept actor's rate with its
+    interval.
     ``until``: what was spent until the policy alone first reached each of ``LEARNED``, or None.
     """
     if not rows:
         return {}
-    measured = [
-        (float(row["validation_success"]), float(row["validation_reward"]), number)
-        for number, row in enumerate(rows)
-        if was_validated(row)
-    ]
-    validation = {}
+    measured = _scores(rows, "validation")
+    validation: dict[str, Any] = {}
     if measured:
-        best, _, number = max(measured)  # As `Validation` keeps it: of equal ones the last.
-        at_step = int(rows[number]["total_steps"])
-        validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
+        kept = max(_scores(rows, "confirmed") or measured)  # Of equal ones the last
+        share, _, number = kept
+        known = rows[number]["validation_success"] != "nan" or None
+        validation = {
+            "best": known and float(rows[number]["validation_success"]),
+            "best_at_step": int(rows[number]["total_steps"]),
+            "last": known and measured[-1][0],
+        }
+        if confirming and known:
+            estimate = success_estimate(round(share * confirming), confirming)
+            validation["confirmed"] = dict(zip(Estimate._fields, estimate, strict=True))
     until = {}
     for level in LEARNED:
         there = [number for success, _, number in measured if is_reached(level, success)]
@@ -193,68 +211,3 @@ def totals(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]
         "validation": validation,
         "until": until,
     }
-
-
-DOTS_PER_INCH = 110
-WINDOW = 20  # Episodes of the moving average
-PANELS = {
-    "episode_return": "return (without shaping)",
-    "distance_m": "surviving distance, m",
-    "success": "success",
-    "human_share": "share of steps driven by the human",
-}
-
-
-def run(arguments: argparse.Namespace) -> int:
-    if arguments.out is None and len(arguments.run_dirs) > 1:
-        raise UserError("several runs go into one picture: --out F.png")
-    print(write_learning_curve(*map(Path, arguments.run_dirs), out=arguments.out))
-    return 0
-
-
-def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
-    """Draw return, surviving distance, success and human share over the episodes as a PNG.
-
-    Each of several runs is a thin line; the thick one is their mean, up to the end of the shortest.
-    ``out`` is by default in the first run's directory. UserError: a run has no metrics yet.
-    """
-    path = run_dirs[0] / CURVE_FILE if out is None else Path(out)
-    runs = [_curves(run_dir) for run_dir in run_dirs]
-    shortest = min(map(len, runs))
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    panels = dict(zip(PANELS, figure.subplots(2, 2, sharex=True).flat, strict=True))
-    for name, panel in panels.items():
-        means = pd.concat([run[name].rolling(WINDOW, min_periods=1).mean() for run in runs], axis=1)
-        if len(runs) == 1:
-            panel.plot(runs[0][name], ".", markersize=3, color="0.75")
-        else:
-            panel.plot(means, color="C0", alpha=0.25, linewidth=1)
-        label = f"mean of {len(runs)} runs and {WINDOW} episodes"
-        panel.plot(means[:shortest].mean(axis=1), color="C0", label=label)
-        panel.set_title(PANELS[name])
-        panel.set_xlabel("episode")
-        panel.grid(alpha=0.3)
-    # Where all runs were validated
-    validated = pd.concat([run["validation_success"] for run in runs], axis=1).dropna()
-    label = "policy alone, validation"
-    panels["success"].plot(validated.mean(axis=1), "o-", color="C1", label=label)
-    panels["success"].legend()
-    write_figure(figure, path)
-    return path
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH)
-    write_atomic(path, buffer.getvalue())
-
-
-def _curves(run_dir: Path) -> pd.DataFrame:
-    """Return a run's metrics as numbers, an episode a row, counted from 1."""
-    rows = pd.DataFrame(read_metrics(run_dir))
-    if rows.empty:
-        raise UserError(f"{run_dir} holds no metrics to draw")
-    curves = rows.drop(columns="outcome").astype(float)
-    curves["success"] = (rows.outcome == GOAL).astype(float)
-    curves["human_share"] = curves.human_steps / curves.steps
-    return curves.set_index(curves.episode + 1)

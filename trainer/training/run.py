@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from bridge.environments import finite
 from bridge.network import parse_spec
-from bridge.outcomes import DISCARDED, GOAL
+from bridge.outcomes import DISCARDED, GOAL, UNTOLD
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
 from trainer import util
@@ -54,7 +54,8 @@ from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.scenarios import SCENARIOS
-from trainer.training.config import BIASED, CONFIG_FILE, RunConfig
+from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
+from trainer.training.demonstrations import read_demonstrations
 from trainer.training.learning import LearningThread, diverged
 from trainer.training.metrics import (
     REPORT_FILE,
@@ -66,6 +67,30 @@ from trainer.training.metrics import (
 from trainer.util import Purpose, episode_seed, save_torch
 
 
+def environment_of(config: RunConfig) -> Any:
+    """Make a run's environment."""
+    return make_environment(
+        config.scenario,
+        printed_reward=config.printed_reward,
+        period_s=config.period_s,
+        success=config.success,
+    )
+
+
+Score = tuple[float, float]
+"""Share of successes and mean return; the second decides where the first is equal."""
+
+
+def is_told(drives: Sequence[EpisodeResult]) -> bool:
+    """Whether any drive tells whether it succeeded."""
+    return not UNTOLD.issuperset(drive.outcome for drive in drives)
+
+
+def score(drives: Sequence[EpisodeResult]) -> Score:
+    success = float(np.mean([drive.outcome == GOAL for drive in drives]))
+    return success, float(np.mean([drive.reward for drive in drives]))
+
+
 class Trials:
     """The validation's episodes: a policy drives them without help, over the run's network.
 
@@ -74,38 +99,49 @@ class Trials:
 
     def __init__(self, config: RunConfig, env: Any = None) -> None:
         self.config, self.network, self._env = config, parse_spec(config.latency), env
-        self._seeds = [
+        count = config.evaluation_runs
+        seeds = [
             episode_seed(config.seed, Purpose.VALIDATION, run)
-            for run in range(config.evaluation_runs)
+            for run in range(count * (1 + config.confirmation_factor))
         ]
+        self._seeds, self._confirming = seeds[:count], seeds[count:]
 
     @cached_property
     def envs(self) -> list[Any]:
         """Environments driven at once: one a seed for our scenarios, else a single one."""
         c = self.config
-        make = partial(
-            make_environment, c.scenario, printed_reward=c.printed_reward, period_s=c.period_s
-        )
-        return [make() for _ in self._seeds] if c.scenario in SCENARIOS else [self._env or make()]
+        if c.scenario in SCENARIOS:
+            return [environment_of(c) for _ in self._seeds]
+        return [self._env or environment_of(c)]
 
-    def drive(self, driver: TogetherDriver, more: Sequence[int] = ()) -> list[EpisodeResult]:
-        """Drive the validation seeds, then ``more`` seeds."""
-        seeds = [*self._seeds, *more]
+    def drive(self, driver: TogetherDriver, best: Score) -> list[EpisodeResult]:
+        """Drive a validation; after one no worse than ``best`` the second set of drives, too."""
+        drives = self._drive(driver, self._seeds)
+        if self._confirming and score(drives) >= best:
+            drives += self._drive(driver, self._confirming)
+        return drives
+
+    def _drive(self, driver: TogetherDriver, seeds: Sequence[int]) -> list[EpisodeResult]:
         if self.network == NO_NETWORK:
             return drive_together(self.envs, driver.act_together, seeds)
         return drive_episodes(self.envs[0], driver, seeds, latency=self.network)
 
 
 class Validation(Trials):
-    """Drives the policy as it stands, and keeps the best actor so far."""
+    """Drives the policy as it stands, and keeps the best actor so far.
+
+    The best of many validations overestimates its actor. So an actor that does no worse than the
+    kept one drives a second, larger set of episodes, and replaces that one if it does no worse
+    there.
+    """
 
     def __init__(
         self, config: RunConfig, run_dir: Path, learning: LearningThread, env: Any = None
     ) -> None:
         super().__init__(config, env)
         self.run_dir, self.learning = run_dir, learning
-        self.best = (-1.0, -1.0)
-        """Success and return of the best actor among the validations that were due."""
+        self.best = self.confirmed = (-1.0, -math.inf)
+        """The kept actor's scores in both sets, as of the validations that were due."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
         self.undue = False  # The last episode was validated only because the run ended there
 
@@ -119,7 +155,7 @@ class Validation(Trials):
         if due or (at_end and self.config.evaluate_every_steps):
             actor = getattr(self.learning.learner, self.config.kept_actor)
             driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
-            self.take(self.drive(driver), actor, metrics, episode, due)
+            self.take(self.drive(driver, self.best), actor, metrics, episode, due)
 
     def take(
         self,
@@ -130,25 +166,32 @@ class Validation(Trials):
         due: bool = True,
     ) -> None:
         """Enter an actor's drives into ``metrics``, and keep the actor if it is the best."""
-        success = float(np.mean([result.outcome == GOAL for result in results]))
-        reward = float(np.mean([result.reward for result in results]))
-        metrics.validation_success, metrics.validation_reward = success, reward
+        count = self.config.evaluation_runs
+        results, confirming = results[:count], results[count:]
+        found = success, metrics.validation_reward = score(results)
+        metrics.validation_success = success if is_told(results) else math.nan
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        if (success, reward) >= self.best:
+        confirmed = found
+        if confirming:
+            confirmed = metrics.confirmed_success, metrics.confirmed_reward = score(confirming)
+        elif self.config.confirmation_factor:
+            return
+        if found >= self.best and confirmed >= self.confirmed:
             state = {**self.config.label(episode), "actor": actor.state_dict()}
             save_torch(self.run_dir / BEST_FILE, state)
             if due:
-                self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+                self.best, self.confirmed = found, confirmed
+                self._best_actor = copy.deepcopy(state)
 
     def state_dict(self) -> dict[str, Any]:
-        kept = {"best_validation": self.best, "best_actor": self._best_actor}
-        return {**kept, "undue": self.undue}
+        scores = {"best_validation": self.best, "best_confirmed": self.confirmed}
+        return {**scores, "best_actor": self._best_actor, "undue": self.undue}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
-        success, reward = map(float, state["best_validation"])
-        self.best, self._best_actor = (success, reward), state["best_actor"]
-        self.undue = state["undue"]
+        scores = (map(float, state[f"best_{name}"]) for name in ("validation", "confirmed"))
+        self.best, self.confirmed = ((success, reward) for success, reward in scores)
+        self._best_actor, self.undue = state["best_actor"], state["undue"]
         if self._best_actor is None:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)
         else:
@@ -173,23 +216,19 @@ class Parts:
     recorders: list[Record] = field(default_factory=list)
 
 
-def make_parts(config: RunConfig, run_dir: Path) -> Parts:
+def make_parts(config: RunConfig, run_dir: Path, env: Any) -> Parts:
     """Make the parts of a run with a scripted human, a human model, or nobody as its guide."""
-    env, delayed = make_vehicle(config)
-    learning = LearningThread(config, env)
+    delayed, learning = behind_network(config, env), LearningThread(config, env)
     guide, validation = make_guide(config, env), Validation(config, run_dir, learning, env)
     return Parts(env, delayed, delayed or env, guide, learning, validation)
 
 
-def make_vehicle(config: RunConfig) -> tuple[Any, DelayedVehicle | None]:
-    """Make a run's environment, and the same behind the run's network, if it has one."""
-    env = make_environment(
-        config.scenario, printed_reward=config.printed_reward, period_s=config.period_s
-    )
+def behind_network(config: RunConfig, env: Any) -> DelayedVehicle | None:
+    """Return a run's environment behind the run's network, if it has one."""
     if find_algorithm(config.algorithm).foresight:
         check_foresight(env)
     network = parse_spec(config.latency)
-    return env, None if network == NO_NETWORK else DelayedVehicle(env, network)
+    return None if network == NO_NETWORK else DelayedVehicle(env, network)
 
 
 def make_guide(config: RunConfig, env: Any) -> Guide:
@@ -205,8 +244,9 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
         late_steps = config.late_from_s / period_s, config.late_to_s / period_s
         attention = Attention(late_steps, config.missed_share, random)
     if config.poor_guidance_share:
-        biased = env.biased_action if config.poor_guidance == BIASED else None
-        hands = PoorHands(config.poor_guidance_share, biased, random)
+        biased = None if config.poor_guidance == RANDOM else env.biased_action
+        whole = config.poor_guidance == TAKEOVERS
+        hands = PoorHands(config.poor_guidance_share, biased, random, whole)
     asking = Asking(row.asks) if row.asks else None
     return HumanGuide(driver, expert, steps_held(period_s), attention, asking, hands, random)
 
@@ -219,7 +259,7 @@ class TrainingRun:
     ) -> None:
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        parts = parts or make_parts(config, run_dir)
+        parts = parts or make_parts(config, run_dir, environment_of(config))
         self.env, self.delayed, self.vehicle = parts.env, parts.delayed, parts.vehicle
         self.guide, self.learning, self.validation = parts.guide, parts.learning, parts.validation
         self.recorders = parts.recorders
@@ -228,10 +268,17 @@ class TrainingRun:
         self.episode = self.steps = 0
         """Episodes driven, and environment steps in those that were not discarded."""
         self.quitting = False  # The episode under way is to be the last of this call
+        self.found = False
+        """Whether an episode has succeeded, in training or validation, or success is unknown."""
         if resume:
             path = run_dir / CHECKPOINT_FILE
             with util.fitting(f"{path} does not fit this run"):
                 self._restore(util.load_torch(path))
+        elif config.demonstrations:
+            for episode in read_demonstrations(Path(config.demonstrations), self.env):
+                for transition in episode:
+                    self.learning.add(transition)
+                self.learning.release()
 
     def train(
         self,
@@ -251,7 +298,10 @@ class TrainingRun:
                 metrics = self.advance()
                 late = self.guide.stop or time.monotonic() > deadline_s
                 at_end = self.over or late
-                self.validation.after(metrics, self.episode, self._due(before), at_end)
+                due = self._due(before)
+                self.validation.after(metrics, self.episode, due, at_end)
+                self.found |= metrics.outcome == GOAL or metrics.outcome in UNTOLD
+                self.found |= due and metrics.validation_success > 0.0
                 metrics_writer.add(metrics)
                 # Read once, so that every end has its checkpoint. Quitting adds no validation that
                 # is not due: a resumed run then has had the same ones.
@@ -266,8 +316,8 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-            self.env.close()
-            report = totals(read_metrics(self.run_dir), self.env.control_period_s)
+            rows, drives = read_metrics(self.run_dir), self.config.confirmation_runs
+            report = totals(rows, self.env.control_period_s, drives)
             write_json(self.run_dir / REPORT_FILE, report)
 
     def advance(self) -> EpisodeMetrics:
@@ -297,6 +347,7 @@ class TrainingRun:
             "steps": self.steps,
             "kept_actor": self.config.kept_actor,
             "exploration": self.exploration.bit_generator.state,
+            "found": self.found,
             **self.validation.state_dict(),
         }
         util.save_torch(self.run_dir / CHECKPOINT_FILE, state)
@@ -306,6 +357,7 @@ class TrainingRun:
         self.episode, self.steps, _ = msgspec.convert(counts, list[Annotated[int, Meta(ge=0)]])
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
+        self.found = state["found"]
         self.guide.load_state_dict(state)
         self.validation.load_state_dict(state)
 
@@ -396,6 +448,8 @@ class TrainingRun:
     def _exploration_std(self) -> float:
         c = self.config.learner
         left = max(0.0, 1.0 - self.progress / c.exploration_share)
+        if left and not self.found and c.exploration_searching:
+            return c.exploration_searching
         return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
     def _beta(self) -> float:

@@ -1,0 +1,85 @@
+"""Runs of several seeds, and their curves: one line with a band for each algorithm."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from hil_tests.testing.commands import call, refusal
+from trainer.training import curves
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter, read_metrics
+
+TRAIN = ("train", "--scenario", "Pendulum-v1", "--algorithm", "per_td3", "--steps", 200)
+
+
+def good(observation: Any, info: Any, total_return: float) -> bool | None:
+    """Whether the pendulum hung about upright; a test's word."""
+    assert observation.shape == (3,)
+    return total_return > -1e9
+
+
+def run_of(directory: Path, algorithm: str, episodes: int, returns: float, known: bool) -> Path:
+    writer = MetricsWriter(directory)
+    for episode in range(episodes):
+        due = episode % 5 == 4
+        writer.add(
+            EpisodeMetrics(
+                episode, steps=9, total_steps=9 * episode + 9, episode_return=returns,
+                validation_success=0.5 if due and known else math.nan,
+                validation_reward=returns if due else math.nan,
+            )
+        )  # fmt: skip
+    writer.close()
+    (directory / "config.json").write_text(json.dumps({"algorithm": algorithm}))
+    return directory
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were drawn."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(curves, "write_figure", lambda figure, path: figures.append(figure))
+    return figures
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_each_algorithm_is_a_line_named_with_a_band_up_to_the_shortest_run(tmp_path, drawn, known):
+    for number, (episodes, returns) in enumerate([(30, 1.0), (12, 3.0)]):
+        run_of(tmp_path / f"several/seed_{number}", "phil_td3", episodes, returns, known)
+    one = run_of(tmp_path / "one", "hi_td3", 20, 5.0, known)
+    curves.write_learning_curve(tmp_path / "several", one, out="f.png")
+    panels = {panel.get_title(): panel for panel in drawn[0].axes}
+    assert ("success of the policy alone, in validation" in panels) == known
+    panel = panels["return in training (without shaping)"]
+    several, alone = panel.get_lines()
+    assert (several.get_label(), alone.get_label()) == ("phil_td3, 2 runs", "hi_td3")
+    assert several.get_xdata()[-1] == 12 * 9
+    assert several.get_ydata() == pytest.approx(np.full(curves.POINTS, 2.0))
+    assert len(panel.collections) == 1
+    assert set(alone.get_ydata()) == {5.0}
+
+
+def test_several_seeds_are_trained_side_by_side_and_drawn(tmp_path, capsys):
+    few = ("--set", "evaluation_runs=2", "--set", "evaluate_every_steps=100")
+    judged = (*few, "--success", f"{__name__}:good")
+    status, out, _ = call(capsys, *TRAIN, "--seeds", "1-2", *judged, "--out", tmp_path)
+    assert (status, len(out.splitlines())) == (0, 2)
+    for seed in (1, 2):
+        (row,) = read_metrics(tmp_path / f"seed_{seed}")
+        assert (row["outcome"], row["validation_success"]) == ("goal", "1.0")
+    assert "holds a run" in refusal(capsys, *TRAIN, "--seeds", "1-2", *judged, "--out", tmp_path)
+    assert "--out F.png" in refusal(capsys, "plot", tmp_path / "seed_1", tmp_path / "seed_2")
+    picture = tmp_path / "curves.png"
+    assert call(capsys, "plot", tmp_path, "--x", "human_s", "--out", picture)[0] == 0
+    with Image.open(picture) as image:
+        assert image.size == (1100, 660)
+
+
+def test_a_scenario_takes_no_other_judge(tmp_path, capsys):
+    options = ("train", "--success", f"{__name__}:good", "--out", tmp_path / "run")
+    assert "itself says" in refusal(capsys, *options)

@@ -1,0 +1,72 @@
+"""Drives that fill the replay before the first step: sittings, recordings and data sets."""
+
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.__main__ import main as bridge
+from bridge.fork import read_episodes
+from edge_runtime.util import UserError
+from hil_tests.testing.commands import refusal
+from trainer.environments import make_environment
+from trainer.person.tests.people import record, recorded_step
+from trainer.training.config import RunConfig
+from trainer.training.demonstrations import read_demonstrations
+from trainer.training.run import TrainingRun
+
+DRIVE = Path(__file__).parents[2] / "hil_tests/recordings/left_turn.mcap"
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return read_episodes(DRIVE)[0]
+
+
+def seen(drive: Any, step: int) -> Any:
+    (data,) = drive.states[step].observation.values()
+    return np.frombuffer(data, np.uint8).reshape(2, 45, 80)
+
+
+def test_a_recording_is_driven_again(drive):
+    (episode, *_) = read_demonstrations(DRIVE, make_environment("left_turn"))
+    assert len(episode) == drive.steps
+    for step, transition in enumerate(islice(episode, 20)):
+        assert (transition.observation == seen(drive, step)).all()
+        assert transition.action == pytest.approx(drive.applied[step][0], abs=1e-6)
+        assert transition.human
+    assert episode[-1].terminal or episode[-1].truncated
+
+
+def test_a_recording_of_another_task_is_refused():
+    with pytest.raises(UserError):
+        next(read_demonstrations(DRIVE, make_environment("congestion")))
+
+
+def test_a_data_set_gives_back_what_was_exported(drive, tmp_path):
+    out = tmp_path / "set"
+    assert bridge(["export", str(DRIVE), "--format", "lerobot", "--out", str(out)]) == 0
+    (episode, *_) = read_demonstrations(out, make_environment("left_turn"))
+    for step, transition in enumerate(islice(episode, 1, 20), 1):
+        wanted = seen(drive, step)
+        assert transition.action == pytest.approx(drive.commands[step].action, abs=1e-6)
+        # The video is not exact.
+        assert np.abs(transition.observation.astype(int) - wanted).mean() < 3.0
+        assert (transition.next_observation[0] == transition.observation[1]).all()
+
+
+def test_sittings_fill_the_replay_before_the_first_step(tmp_path):
+    steps = [recorded_step(1, n, step=n, human=n > 1, terminated=n == 3) for n in range(4)]
+    record(tmp_path / "sittings", steps)
+    config = RunConfig(demonstrations=str(tmp_path / "sittings"))
+    run = TrainingRun(config, tmp_path / "run")
+    assert run.learning.added == 4
+    assert run.learning.replay.human_count == 2
+    run.learning.close()
+
+
+def test_an_empty_place_is_refused(tmp_path, capsys):
+    options = ["train", "--out", str(tmp_path / "run"), "--demonstrations", str(tmp_path)]
+    assert "no recording" in refusal(capsys, *options)

@@ -1,0 +1,112 @@
+"""``python -m trainer plot``: learning curves of runs, a line and a band for each algorithm."""
+
+import argparse
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bridge.outcomes import mean_estimate
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, read_json
+from trainer.training.config import CONFIG_FILE, CURVE_FILE
+from trainer.training.metrics import METRICS_FILE, read_metrics
+
+DOTS_PER_INCH = 110
+WINDOW = 20  # Episodes of the moving average
+POINTS = 100  # At which the runs of an algorithm are averaged
+AXES = {"steps": "environment steps", "human_s": "seconds driven by the human"}
+"""Columns that curves are drawn over, the words of ``--x``: ``total_steps`` and so on."""
+SUCCESS, RETURN = "validation_success", "validation_reward"
+PANELS = {
+    "episode_return": "return in training (without shaping)",
+    "distance_m": "surviving distance in training, m",
+    SUCCESS: "success of the policy alone, in validation",
+    RETURN: "return of the policy alone, in validation",
+    "human_share": "share of steps driven by the human",
+}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.out is None and len(arguments.run_dirs) > 1:
+        raise UserError("several runs go into one picture: --out F.png")
+    dirs = list(map(Path, arguments.run_dirs))
+    print(write_learning_curve(*dirs, out=arguments.out, x=arguments.x))
+    return 0
+
+
+def write_learning_curve(*dirs: Path, out: str | None = None, x: str = "steps") -> Path:
+    """Draw return, surviving distance, validation and the human's share as a PNG.
+
+    Runs of one algorithm are one line, their mean, in its 95 % interval, as far as all of them go.
+    A directory may be a run, or hold runs. Where nothing tells whether an episode succeeded,
+    validation's return is drawn. ``out`` is by default in the first directory. UserError: a run has
+    no metrics yet.
+    """
+    groups: dict[str, list[pd.DataFrame]] = {}
+    for run_dir in (found for each in dirs for found in _runs_in(each)):
+        groups.setdefault(_name(run_dir), []).append(_curves(run_dir))
+    runs = [run for group in groups.values() for run in group]
+    left_out = RETURN if any(run[SUCCESS].notna().any() for run in runs) else SUCCESS
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    panels = (name for name in PANELS if name != left_out)
+    for panel, name in zip(figure.subplots(2, 2, sharex=True).flat, panels, strict=True):
+        for number, (label, group) in enumerate(groups.items()):
+            _draw(panel, label, f"C{number}", [run.set_index(f"total_{x}")[name] for run in group])
+        panel.set_title(PANELS[name])
+        panel.set_xlabel(AXES[x])
+        panel.grid(alpha=0.3)
+    panel.legend()
+    path = dirs[0] / CURVE_FILE if out is None else Path(out)
+    write_figure(figure, path)
+    return path
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH)
+    write_atomic(path, buffer.getvalue())
+
+
+def _runs_in(directory: Path) -> Sequence[Path]:
+    if (directory / METRICS_FILE).exists():
+        return [directory]
+    return sorted(path.parent for path in directory.glob(f"*/{METRICS_FILE}")) or [directory]
+
+
+def _name(run_dir: Path) -> str:
+    path = run_dir / CONFIG_FILE
+    return str(read_json(path, "run config")["algorithm"]) if path.exists() else run_dir.name
+
+
+def _curves(run_dir: Path) -> pd.DataFrame:
+    """Return a run's metrics as numbers, an episode a row; validation's are smoothed by nothing."""
+    rows = pd.DataFrame(read_metrics(run_dir))
+    if rows.empty:
+        raise UserError(f"{run_dir} holds no metrics to draw")
+    curves = rows.drop(columns="outcome").astype(float)
+    curves["human_share"] = curves.human_steps / curves.steps
+    smooth = [name for name in PANELS if name not in (SUCCESS, RETURN)]
+    curves[smooth] = curves[smooth].rolling(WINDOW, min_periods=1).mean()
+    return curves
+
+
+def _draw(panel: Any, label: str, color: str, runs: list[pd.Series]) -> None:
+    """Draw the mean of runs, each a column over its own steps."""
+    runs = [run.dropna() for run in runs]
+    runs = [run for run in runs if len(run)]
+    if not runs:
+        return
+    if len(runs) == 1:
+        panel.plot(runs[0], color=color, label=label)
+        return
+    begin, end = max(run.index[0] for run in runs), min(run.index[-1] for run in runs)
+    at = np.linspace(begin, max(begin, end), POINTS)
+    values = np.array([np.interp(at, run.index, run) for run in runs])
+    mean, low, high, _ = np.array([mean_estimate(column) for column in values.T]).T
+    panel.plot(at, mean, color=color, label=f"{label}, {len(runs)} runs")
+    panel.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)

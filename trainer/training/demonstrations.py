@@ -1,0 +1,130 @@
+"""``train --demonstrations``: drives that fill the replay before the first step.
+
+A person's sittings hold transitions. Of a recording of the wire the actions are driven again, in
+the run's environment. A LeRobot data set holds observations and actions; its pictures are one a
+frame, and a stack is made of the frames before.
+"""
+
+from collections.abc import Iterator
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge import fork
+from bridge.environments import NOMINAL
+from bridge.messages import is_picture
+from bridge.recording import Recording
+from edge_runtime.util import UserError
+from trainer.environments import inner, task_of
+from trainer.learner.replay import Transition
+from trainer.person import vector
+from trainer.person.recording import TOPIC, RecordedStep, find_recordings, read_episodes, read_steps
+
+Episode = list[Transition]
+REWARD = "next.reward"  # Column of a data set; ours have none
+
+
+def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
+    """Yield the episodes of sittings, recordings (a file, or a directory of them) or a data set.
+
+    Raises UserError: nothing of that kind, or of another task.
+    """
+    if (place / "meta/info.json").is_file():
+        yield from _from_dataset(place, env)
+        return
+    paths = sorted(place.glob("*.mcap")) if place.is_dir() else [place]
+    for path in paths or find_recordings([place]):
+        channel = next((channel for channel, _ in Recording(path).messages()), None)
+        if channel is not None and channel.topic == TOPIC:
+            yield from (_from_sitting(steps, env) for steps in read_episodes(read_steps(path)))
+        else:
+            yield from (_driven_again(drive, env) for drive in fork.read_episodes(path))
+
+
+def _from_sitting(steps: list[RecordedStep], env: Any) -> Episode:
+    if steps[0].scenario != env.scenario:
+        raise UserError(f"a demonstration is of {steps[0].scenario}, not of {env.scenario}")
+    return [
+        Transition(
+            step.observation, vector(step.action), step.reward, step.next_observation,
+            step.terminated, step.truncated, step.human,
+            None if step.policy_action is None else vector(step.policy_action),
+        )
+        for step in steps
+    ]  # fmt: skip
+
+
+def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:
+    """Take the recorded actions from the recorded seed; what comes of them is what is learned."""
+    about, wanted = (drive.task.text, drive.origin.condition), (task_of(env).text, NOMINAL)
+    if about != wanted:
+        raise UserError(f"{drive.path} is of {' in the scene '.join(about)}, not of {wanted[0]}")
+    options = {"standing": True} if drive.origin.standing else None
+    observation, _ = env.reset(seed=drive.origin.seed, options=options)
+    press_brake, episode = getattr(env, "press_brake", lambda pressed: None), Episode()
+    for step in range(drive.steps):
+        own, braked = drive.applied[step]
+        press_brake(braked)
+        action = inner(env.action_range, own)
+        seen, reward, terminated, truncated, _ = env.step(action)
+        episode.append(
+            Transition(observation, action, reward, seen, terminated, truncated, human=True)
+        )
+        observation = seen
+        if terminated or truncated:
+            break
+    press_brake(False)
+    return episode
+
+
+def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:
+    """Yield the episodes of a LeRobotDataset v3.0 with this task's features."""
+    try:
+        import av
+        from pyarrow.parquet import read_table
+    except ImportError:
+        raise UserError(
+            "a data set needs av and pyarrow: pip install 'phil-hil[lerobot]'"
+        ) from None
+
+    entries = task_of(env).observation
+    plain = [name for name, entry in entries.items() if not is_picture(entry)]
+    keys = {name: "observation.state" if len(plain) == 1 else f"observation.{name}"
+            for name in plain}  # fmt: skip
+    table = read_table(folder / "data").to_pydict()
+    if missing := {"action", "episode_index", *keys.values()} - table.keys():
+        raise UserError(f"{folder} lacks the features {', '.join(sorted(missing))}")
+    seen = np.zeros((len(table["action"]), *env.layout.shape), env.layout.dtype)
+    for name, entry in entries.items():
+        column = seen[name] if seen.dtype.names else seen
+        if name in keys:
+            column[...] = np.reshape(table[keys[name]], column.shape)
+            continue
+        videos = sorted((folder / f"videos/observation.images.{name}").rglob("*.mp4"))
+        colours = "rgb24" if entry.shape[-1] == 3 else "gray"
+        frames = [f.to_ndarray(format=colours) for v in videos for f in av.open(str(v)).decode()]
+        column[...] = _stacked(np.array(frames), column.shape, table["episode_index"])
+    actions = [inner(env.action_range, action) for action in table["action"]]
+    rewards = table.get(REWARD, np.zeros(len(seen)))
+    done = table.get("next.done", np.zeros(len(seen), bool))
+    for _, group in groupby(range(len(seen)), key=lambda row: table["episode_index"][row]):
+        rows = list(group)
+        yield [
+            Transition(seen[row], actions[row], float(rewards[row]), seen[after], False,
+                       bool(done[row]), human=True)
+            for row, after in pairwise(rows)
+        ]  # fmt: skip
+
+
+def _stacked(
+    frames: NDArray[np.uint8], shape: tuple[int, ...], episodes: list[int]
+) -> NDArray[np.uint8]:
+    """Return pictures of ``shape``, [n, ...]; a stack holds the newest last."""
+    if frames.ndim == len(shape):
+        return frames
+    row, begins = np.arange(len(frames)), np.searchsorted(episodes, episodes)
+    ages = range(shape[1] - 1, -1, -1)
+    return np.stack([frames[np.maximum(row - age, begins)] for age in ages], 1)
