@@ -72,7 +72,6 @@ def test_several_seeds_are_trained_side_by_side_and_drawn(tmp_path, capsys):
     for seed in (1, 2):
         (row,) = read_metrics(tmp_path / f"seed_{seed}")
         assert (row["outcome"], row["validation_success"]) == ("goal", "1.0")
-    assert "holds a run" in refusal(capsys, *TRAIN, "--seeds", "1-2", *judged, "--out", tmp_path)
     assert "--out F.png" in refusal(capsys, "plot", tmp_path / "seed_1", tmp_path / "seed_2")
     picture = tmp_path / "curves.png"
     assert call(capsys, "plot", tmp_path, "--x", "human_s", "--out", picture)[0] == 0
