@@ -102,7 +102,7 @@ def _draw(panel: Any, label: str, color: str, runs: list[pd.Series]) -> None:
     if not runs:
         return
     if len(runs) == 1:
-        panel.plot(runs[0], color=color, label=label)
+        panel.plot(runs[0], ".-", color=color, label=label)
         return
     begin, end = max(run.index[0] for run in runs), min(run.index[-1] for run in runs)
     at = np.linspace(begin, max(begin, end), POINTS)
