@@ -35,11 +35,16 @@ def outcome_of(info: Mapping[str, Any], only_truncated: bool = False) -> str:
     return GOAL if success else FAILED
 
 
+def is_told(outcomes: Iterable[str]) -> bool:
+    """Return whether any of the outcomes says something about success."""
+    return not UNTOLD.issuperset(outcomes)
+
+
 def settled(outcomes: Iterable[str]) -> list[str]:
     """Return the outcomes, with TIMEOUT for TRUNCATED if any episode reports how it ended."""
     outcomes = list(outcomes)
-    is_told = not UNTOLD.issuperset(outcomes)
-    return [TIMEOUT if is_told and each == TRUNCATED else each for each in outcomes]
+    told = is_told(outcomes)
+    return [TIMEOUT if told and each == TRUNCATED else each for each in outcomes]
 
 
 CONFIDENCE = 0.95

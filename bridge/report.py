@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bridge.environments import finite
 from bridge.inbound import BRAKE_PERIODS, NO_COMMAND, Decision
-from bridge.outcomes import COLLISION, GOAL, UNTOLD, settled
+from bridge.outcomes import COLLISION, GOAL, is_told, settled
 from edge_runtime.util import counted, printable
 
 ACCELERATIONS = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
@@ -69,7 +69,7 @@ def summarise(
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": outcomes[GOAL] / len(results) if outcomes.keys() - UNTOLD else None,
+        "success_rate": outcomes[GOAL] / len(results) if is_told(outcomes) else None,
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
             key: {"mean": of_known(values), "std": of_known(values, np.std)}

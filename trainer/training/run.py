@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from bridge.environments import finite
 from bridge.network import parse_spec
-from bridge.outcomes import DISCARDED, GOAL, UNTOLD
+from bridge.outcomes import DISCARDED, GOAL, is_told
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
 from trainer import util
@@ -79,11 +79,6 @@ def environment_of(config: RunConfig) -> Any:
 
 Score = tuple[float, float]
 """Share of successes and mean return; the second decides where the first is equal."""
-
-
-def is_told(drives: Sequence[EpisodeResult]) -> bool:
-    """Whether any drive tells whether it succeeded."""
-    return not UNTOLD.issuperset(drive.outcome for drive in drives)
 
 
 def score(drives: Sequence[EpisodeResult]) -> Score:
@@ -169,7 +164,9 @@ class Validation(Trials):
         count = self.config.evaluation_runs
         results, confirming = results[:count], results[count:]
         found = success, metrics.validation_reward = score(results)
-        metrics.validation_success = success if is_told(results) else math.nan
+        metrics.validation_success = (
+            success if is_told(result.outcome for result in results) else math.nan
+        )
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
         confirmed = found
         if confirming:
@@ -300,7 +297,7 @@ class TrainingRun:
                 at_end = self.over or late
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
-                self.found |= metrics.outcome == GOAL or metrics.outcome in UNTOLD
+                self.found |= metrics.outcome == GOAL or not is_told([metrics.outcome])
                 self.found |= due and metrics.validation_success > 0.0
                 metrics_writer.add(metrics)
                 # Read once, so that every end has its checkpoint. Quitting adds no validation that
