@@ -1,7 +1,7 @@
 """Write policy files; and ``python -m deploy policy``, which makes one of any ONNX model.
 
 The manifest comes from the environment: names, shapes and ranges of observations and actions, and
-the control period. The model then drives the environment for a while, in the board's own runtime.
+the control period. The model then answers the environment for a while, in the board's own runtime.
 """
 
 from __future__ import annotations
@@ -9,18 +9,20 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 import onnx
 
 from bridge.environments import Adapter, Environment, describe, known_stops, make_environment
 from edge_runtime import policy as edge
-from edge_runtime.cli import Subcommand, examples, positive_number
+from edge_runtime.cli import positive_number
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Task, check_task
 from edge_runtime.tls import read_signing_key
@@ -28,24 +30,47 @@ from edge_runtime.util import UserError, read_bytes
 
 REAL_OBSERVATIONS = 200
 FOREIGN = "foreign"  # The algorithm of a model that says nothing of its own
+TOLERANCE = 1e-5  # Of an action of about 1: two runtimes round differently
+BEARABLE = 100.0
+"""Most that the first layer of a network may get: of trained ones it is 0.5 to 5, and some 100
+where bytes are not scaled."""
+FIRST_LAYERS = ("Conv", "Gemm", "MatMul")
+Arrays = Mapping[str, np.ndarray]  # An observation, by entry
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+class Model(NamedTuple):
+    """A trained network that is to become a policy."""
+
+    data: bytes  # ONNX
+    algorithm: str = FOREIGN
+    act: Callable[[Arrays], np.ndarray] | None = None
+    """What its own library answers, in the environment's units."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
     change = "action.N.stop (a number, or null to hold the last action), slew_per_s, unit, meaning"
-    add("model", metavar="MODEL.onnx", type="path", help="the model, in one file")
+    model = "the model: ONNX in one file, or Stable-Baselines3's model.zip (SAC, TD3, PPO)"
+    add("model", metavar="MODEL", type="path", help=model)
     add("--env", metavar="ENV", required=True, help=env)
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")
     add("--key", metavar="KEY", type="path", help="the private key that signs it (deploy keys)")
     add("--set", metavar="KEY=VALUE", dest="changes", action="append", default=[], help=change)
     period = "control period in s (default: the environment's, else guessed from render_fps)"
     add("--period", metavar="SECONDS", type=positive_number, help=period)
-    algorithm = "the training's algorithm, for the manifest"
-    add("--algorithm", metavar="NAME", default=FOREIGN, help=algorithm)
+    pickled = "the VecNormalize that a model.zip was trained with, as the library saves it"
+    add("--normalise", metavar="VECNORMALIZE.pkl", type="path", help=pickled)
+    algorithm = f"the training's algorithm, for the manifest (default: the model's, or {FOREIGN})"
+    add("--algorithm", metavar="NAME", help=algorithm)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def read_onnx(arguments: argparse.Namespace, *_: Any) -> Model:
+    return Model(read_bytes(arguments.model, "model", edge.MAX_POLICY_MIB))
+
+
+def run(arguments: argparse.Namespace, read: Callable[..., Model] = read_onnx) -> int:
+    """Make a policy file of the model that ``read(arguments, environment, task)`` returns."""
     out, key = arguments.out, arguments.key
     check_writable(out)
     if key:
@@ -57,17 +82,18 @@ def _run(arguments: argparse.Namespace) -> int:
             if not any(change.startswith(place) for change in arguments.changes):
                 ask = f"give --set {place}VALUE, or --set {place}null to hold the last one"
                 raise UserError(f"the environment does not say how {row.name} stops safely; {ask}")
-        model = read_bytes(arguments.model, "model", edge.MAX_POLICY_MIB)
+        model = read(arguments, environment, task)
+        algorithm = arguments.algorithm or model.algorithm
         training = {"source": Path(arguments.model).name, "environment": arguments.env}
         try:
-            data = make_policy(model, task, arguments.algorithm, training)
+            data = make_policy(model.data, task, algorithm, training)
             policy = edge.open_policy(data, edge.UNSIGNED)
-            _try(policy, environment)
+            same = _try(policy, environment, model._replace(data=data))
         except UserError as error:
             raise UserError(f"{arguments.model} cannot be a policy: {error}") from None
     write_policy(data, Path(out), key)
     print(f"{out}: {'signed' if key else 'not signed'}, policy_id {policy.policy_id}")
-    print(f"it drives {task.text}")
+    print(f"{same}it drives {task.text}")
     return 0
 
 
@@ -128,24 +154,68 @@ def _rename(graph: onnx.GraphProto, old: str, new: str) -> None:
             names[:] = [swap.get(name, name) for name in names]
 
 
-def _try(policy: edge.Policy, environment: Environment) -> None:
-    """Ask the policy in REAL_OBSERVATIONS steps of random actions.
+def _try(policy: edge.Policy, environment: Environment, model: Model) -> str:
+    """Ask the policy in REAL_OBSERVATIONS steps of random actions; return how it compares.
 
-    Raises UserError for an action that the environment cannot take.
+    Raises UserError for an action that the environment cannot take, or that its own library does
+    not give. Warns where answers or observations are probably in other units.
     """
     environment.action_space.seed(0)
     adapter, over, seen = Adapter(environment, policy.manifest), True, None
+    answers, reaches, apart = [], [], [0.0]
+    reach_of = _first_layers(model.data)
     for step in range(REAL_OBSERVATIONS):
         if over:
             seen, _ = environment.reset(seed=step)
+        entries = policy.layout.arrays(adapter.pack(seen))
         try:
-            action = policy.act(policy.layout.arrays(adapter.pack(seen)))
+            action = policy.act(entries)
+            reaches.append(reach_of(entries))
         except Exception as error:  # onnxruntime's exceptions share no narrower base
             raise UserError(f"onnxruntime does not run it: {error}") from None
         edge.check_answer(action, policy.manifest, "a real observation")
+        answers.append(np.abs(action).max())
+        if model.act:
+            apart.append(np.abs(model.act(entries) - action).max())
         sampled = adapter.within(environment.action_space.sample())
         seen, _, terminated, truncated, _ = environment.step(sampled)
         over = terminated or truncated
+    widest = max(1.0, *(max(-row.low, row.high) for row in policy.manifest.action))
+    if max(apart) > TOLERANCE * widest:
+        raise UserError(f"its own library answers otherwise, by {max(apart):.1e}")
+    if not model.act and max(answers) <= 1.0 + TOLERANCE < widest:
+        warn("all its answers lie within -1 to 1, and the range is wider: does it scale them?")
+    if (reach := np.median(reaches)) > BEARABLE:
+        why = f"the first layer gets {reach:.0f}, and of a trained network about 1"
+        warn(f"{why}: does it normalise observations as its training did?")
+    return f"its own library answers the same, within {max(apart):.1e}\n" if model.act else ""
+
+
+def _first_layers(data: bytes) -> Callable[[Arrays], float]:
+    """Return what tells how far an ONNX model's first layers go, before their activation.
+
+    Of all units of an observation the 99th percentile; 0 where there is no such layer.
+    """
+    model, names, deep = onnx.load_from_string(data), list[str](), set[str]()
+    for node in model.graph.node:
+        is_deep, is_layer = not deep.isdisjoint(node.input), node.op_type in FIRST_LAYERS
+        names += node.output[:1] if is_layer and not is_deep else []
+        deep.update(node.output if is_layer or is_deep else [])
+    if not names:
+        return lambda entries: 0.0
+    del model.graph.output[:]
+    model.graph.output.extend(map(onnx.helper.make_empty_tensor_value_info, names))
+    network = edge.open_network(model.SerializeToString())
+
+    def reach_of(entries: Arrays) -> float:
+        found = network.run(names, {name: array[np.newaxis] for name, array in entries.items()})
+        return float(np.percentile(np.abs(np.concatenate([*map(np.ravel, found)])), 99))
+
+    return reach_of
+
+
+def warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
@@ -161,7 +231,3 @@ def write_policy(data: bytes, path: Path, key_file: Path | str | None) -> None:
         write_atomic(signature_path, key.sign(data))
     else:  # A signature of an older file beside it would only mislead.
         signature_path.unlink(missing_ok=True)
-
-
-EXAMPLE = "python -m deploy policy a.onnx --env Pendulum-v1 --set action.0.stop=0 --out b.onnx"
-POLICY = Subcommand(examples(EXAMPLE), _add_arguments, _run)

@@ -9,7 +9,7 @@ from edge_runtime.cli import program, run_cli
 COMMANDS = {
     "keys": ("deploy.certs:keys", "make a key pair that signs policies and bundles"),
     "certs": ("deploy.certs:certs", "make an authority and certificates for TLS"),
-    "policy": ("bridge.policy_file:POLICY", "make a policy file of any ONNX model"),
+    "policy": ("trainer.sb3:POLICY", "make a policy file of any ONNX model, or a model.zip"),
     "bundle": ("deploy.bundle:bundle", "make one signed archive for one board and vehicle"),
     "push": ("deploy.bundle:push", "bring a bundle to a board and install it"),
 }

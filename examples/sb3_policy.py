@@ -1,9 +1,10 @@
-"""Train a policy of Stable-Baselines3 and export it as the ONNX that `deploy policy` takes.
+"""Train a policy of Stable-Baselines3, and save what `deploy policy` takes.
 
-    python examples/sb3_policy.py Pendulum-v1 --steps 6000 --out td3.onnx
+    python examples/sb3_policy.py Pendulum-v1 --steps 6000 --out td3.zip
 
-The exported graph (`Exported`) holds all preprocessing of an observation, and scales the network's
--1 to 1 to the environment's own range.
+That is the library's own file. With `--out td3.onnx` it is an ONNX, as from any other library: its
+graph (`Exported`) holds all preprocessing of an observation, and scales the network's -1 to 1 to
+the environment's own range.
 """
 
 import argparse
@@ -90,4 +91,8 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", required=True)
     asked = parser.parse_args()
-    export(train(asked.environment, asked.algorithm, asked.steps, asked.seed), asked.out)
+    made = train(asked.environment, asked.algorithm, asked.steps, asked.seed)
+    if asked.out.endswith(".zip"):
+        made.save(asked.out)
+    else:
+        export(made, asked.out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
@@ -93,7 +93,7 @@ def export_policy(
     entries = entries_of(observations, next(iter(task.observation)))
     about = {"seed": label["seed"], "episodes": label["episode"], "config": training}
     about["source_revision"] = training.get("source_revision", "unknown")
-    model = make_policy(_to_onnx(network, entries), task, label["algorithm"], about)
+    model = make_policy(to_onnx(network, entries), task, label["algorithm"], about)
     difference = parity(network, model, entries)
     allowed = PARITY_TOLERANCE * max(1.0, float(network.reach.max()))
     if not difference < allowed:
@@ -116,6 +116,45 @@ class _InOwnUnits(torch.nn.Module):
     def forward(self, *entries: torch.Tensor) -> torch.Tensor:
         action = self.actor(*entries)
         return self.low + (action + 1.0) * self.reach if self.scaled else action
+
+
+class LibraryPolicy(torch.nn.Module):
+    """A policy of Stable-Baselines3 as its ``predict`` goes, behind a VecNormalize or None.
+
+    ``names``: of its observation's entries.
+    """
+
+    def __init__(self, policy: Any, normaliser: Any, names: Sequence[str]) -> None:
+        super().__init__()
+        self.policy, self.names, self._normaliser = policy, names, normaliser
+        self._spaces = getattr(policy.observation_space, "spaces", None)
+        ends = policy.action_space.low, policy.action_space.high
+        self._low, self._high = (torch.from_numpy(np.ravel(each)) for each in ends)
+
+    def act(self, entries: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """Return the library's own action for one observation, in the environment's units."""
+        seen: Any = {name: np.array(array[None]) for name, array in entries.items()}
+        seen = seen if self._spaces else seen[self.names[0]]
+        seen = self._normaliser.normalize_obs(seen) if self._normaliser else seen
+        return np.ravel(self.policy.predict(seen, deterministic=True)[0])
+
+    def forward(self, *entries: torch.Tensor) -> torch.Tensor:
+        seen: Any = dict(map(self._prepared, self.names, entries))
+        seen = seen if self._spaces else seen[self.names[0]]
+        action = self.policy._predict(seen, deterministic=True).reshape(-1, len(self._low))
+        if self.policy.squash_output:
+            return self._low + 0.5 * (action + 1.0) * (self._high - self._low)
+        return torch.clamp(action, self._low, self._high)
+
+    def _prepared(self, name: str, entry: torch.Tensor) -> tuple[str, torch.Tensor]:
+        by, space = self._normaliser, (self._spaces or {}).get(name, self.policy.observation_space)
+        rms = by.obs_rms if by and by.norm_obs else {}
+        if rms := rms.get(name) if isinstance(rms, dict) else rms:
+            std = torch.from_numpy(np.sqrt(rms.var + by.epsilon))
+            entry = (entry.double() - torch.from_numpy(rms.mean)) / std
+            entry = entry.clamp(-by.clip_obs, by.clip_obs).float()
+        is_turned = tuple(entry.shape[1:]) != space.shape  # Channels last, as pictures come
+        return name, entry.permute(0, 3, 1, 2) if is_turned else entry
 
 
 def real_observations(env: Any, count: int) -> NDArray[Any]:
@@ -144,7 +183,7 @@ def parity(network: torch.nn.Module, model: bytes, entries: Mapping[str, NDArray
     return float(np.abs(wanted - got).max())
 
 
-def _to_onnx(network: torch.nn.Module, entries: Mapping[str, NDArray[Any]]) -> bytes:
+def to_onnx(network: torch.nn.Module, entries: Mapping[str, NDArray[Any]]) -> bytes:
     examples = tuple(torch.zeros_like(torch.from_numpy(v[:1].copy())) for v in entries.values())
     buffer = BytesIO()
     with warnings.catch_warnings():

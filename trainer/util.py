@@ -85,12 +85,15 @@ def save_torch(path: Path, state: Any) -> None:
     write_atomic(path, buffer.getbuffer())
 
 
-def load_torch(path: Path) -> dict[str, Any]:
-    """Read what ``save_torch`` wrote, else UserError; only tensors and plain values are read."""
+def load_torch(path: Path, data: bytes | None = None) -> dict[str, Any]:
+    """Read what ``save_torch`` wrote, else UserError; only tensors and plain values are read.
+
+    ``data``: instead of the file's.
+    """
     import torch
 
     try:
-        with open_regular(path) as stream:
+        with open_regular(path) if data is None else io.BytesIO(data) as stream:
             # torch writes a checksum of each part, and checks none.
             if damaged := zipfile.ZipFile(stream).testzip():
                 raise ValueError(f"{damaged} is damaged")

@@ -80,3 +80,28 @@ def test_what_cannot_drive_is_one_line_and_leaves_no_file(tmp_path, capsys, grap
     assert status == 2
     assert match.replace("\\", "") in line
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("answer", "layer", "expected"),
+    [
+        ("Mul(cos, two)", "Identity(obs)", 0),
+        ("Mul(cos, one_f)", "Identity(obs)", 1),  # within -1 to 1 of -2 to 2
+        ("Mul(cos, two)", "Mul(obs, million)", 1),  # as of observations in other units
+        ("Mul(cos, one_f)", "Mul(obs, million)", 2),
+    ],
+)  # fmt: skip
+def test_answers_and_observations_in_other_units_are_warned_of(
+    tmp_path, capsys, answer, layer, expected
+):
+    hidden = f"big = {layer} wide = MatMul(big, weights) mean = ReduceMean<axes=[1]>(wide)"
+    nothing = "gone = Mul(mean, zero_f) torque = Add(whole, gone) out = Clip(torque, less, two)"
+    write_model(
+        tmp_path / "model.onnx",
+        f"{PENDULUM} <float[3, 4] weights = {{{', '.join(['1'] * 12)}}}, float zero_f = {{0}}, "
+        f"float one_f = {{1}}, float million = {{1000000}}, float less = {{-2}}> "
+        f"{{ cos = Slice(obs, zero, one, one) whole = {answer} {hidden} {nothing} }}",
+    )
+    status, _ = policy(tmp_path, *STOP)
+    assert status == 0
+    assert capsys.readouterr().err.count("warning:") == expected

@@ -1,0 +1,131 @@
+"""``python -m deploy policy``, which also takes the model.zip of Stable-Baselines3.
+
+The library pickles, and a pickle is a program. Here it may only make what `KNOWN` lists; all else
+becomes an object that does nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import io
+import json
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge import policy_file
+from bridge.environments import Environment
+from bridge.policy_file import Model
+from edge_runtime.cli import Subcommand, examples
+from edge_runtime.manifest import Task
+from edge_runtime.util import UserError, read_bytes
+from trainer.util import fitting, load_torch
+
+LIBRARY = "stable_baselines3"
+KNOWN = {
+    f"{LIBRARY}.sac.policies": "SACPolicy CnnPolicy MultiInputPolicy",
+    f"{LIBRARY}.td3.policies": "TD3Policy CnnPolicy MultiInputPolicy",
+    f"{LIBRARY}.common.policies":
+        "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy",
+    f"{LIBRARY}.common.torch_layers": "FlattenExtractor NatureCNN CombinedExtractor",
+    f"{LIBRARY}.common.vec_env.vec_normalize": "VecNormalize",
+    f"{LIBRARY}.common.running_mean_std": "RunningMeanStd",
+    "torch.nn.modules.activation": "ELU GELU LeakyReLU Mish ReLU SELU SiLU Sigmoid Softplus Tanh",
+    "gymnasium.spaces.box": "Box",
+    "gymnasium.spaces.dict": "Dict",
+    "numpy": "dtype ndarray",
+    "numpy._core.multiarray": "_reconstruct scalar",
+    "numpy._core.numeric": "_frombuffer",
+    "collections": "OrderedDict",
+}  # fmt: skip
+"""All that a pickle may name: module -> names."""
+MOST_MIB = 512
+OTHERWISE = "export an ONNX that holds all of it, as examples/sb3_policy.py does"
+
+
+class _Unknown:
+    def __init__(self, *_: Any) -> None: ...
+    def __setstate__(self, _: Any) -> None: ...
+
+
+class _Reader(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        module = module.replace("numpy.core", "numpy._core")  # As numpy 1 writes
+        if name in KNOWN.get(module, "").split():
+            return super().find_class(module, name)
+        return type(name, (_Unknown,), {"__module__": module})
+
+
+def _read(pickled: bytes) -> Any:
+    return _Reader(io.BytesIO(pickled)).load()
+
+
+def read_model(arguments: argparse.Namespace, environment: Environment, task: Task) -> Model:
+    """Convert a model.zip's deterministic policy, with its squash, scaling and normalisation.
+
+    Raises UserError for another file, for parts that are not the library's, and for a model of
+    other observations or actions than the environment's.
+    """
+    path, normaliser, done = Path(arguments.model), None, environment.action_space
+    what = f"model.zip of {LIBRARY} (SAC, TD3, PPO), or that library is not installed"
+    with fitting(f"{path} is no {what}"):
+        archive = zipfile.ZipFile(io.BytesIO(read_bytes(path, "model", MOST_MIB)))
+        weights = load_torch(path, archive.read("policy.pth"))
+        data = json.loads(archive.read("data"))
+        for name in ("policy_class", "policy_kwargs", "observation_space", "action_space"):
+            if packed := data[name].get(":serialized:"):
+                data[name] = _read(base64.b64decode(packed))
+        kind, options, is_ppo = data["policy_class"], data["policy_kwargs"], "gae_lambda" in data
+        options = {n: value for n, value in options.items() if not n.startswith("optimizer")}
+        for name, each in {"policy_class": kind, **options}.items():
+            if _Unknown in (type(each).__base__, getattr(each, "__base__", None)):
+                raise UserError(f"the {name} of {path} is not the library's: {OTHERWISE}")
+    if data["action_space"] != done:
+        raise UserError(f"{path} acts in {data['action_space']}, {task.task} in {done}")
+    if arguments.normalise:
+        normaliser = read_normaliser(arguments.normalise)
+    elif is_ppo and data["_last_original_obs"]:  # The others always have one.
+        raise UserError(f"{path} was trained behind a VecNormalize: add --normalise")
+
+    from trainer.policy_file import LibraryPolicy, to_onnx  # It loads torch
+
+    with fitting(f"{path} does not fit {task.task}: it observes {data['observation_space']}"):
+        data["observation_space"].seed(0)  # Its generator was not admitted.
+        options = {"use_sde": data["use_sde"], **options} if is_ppo else options
+        policy = kind(data["observation_space"], done, lambda _: 0.0, **options)
+        policy.load_state_dict(weights)
+        network = LibraryPolicy(policy.eval(), normaliser, [*task.observation])
+        empty = {n: np.zeros((1, *each.shape), each.dtype) for n, each in task.observation.items()}
+        algorithm = kind.__module__.split(".")[1].replace("common", "ppo")
+        return Model(to_onnx(network, empty), algorithm, network.act)
+
+
+def read_normaliser(file: str) -> Any:
+    """Read the library's VecNormalize; UserError for anything else."""
+    with fitting(f"{file} is no VecNormalize that {LIBRARY} has saved: {OTHERWISE}"):
+        made = _read(read_bytes(file, "normalisation"))
+        if not hasattr(made, "normalize_obs"):
+            raise TypeError(type(made))
+        return made
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.model.endswith(".zip"):
+        return policy_file.run(arguments, read_model)
+    if arguments.normalise:
+        raise UserError("--normalise is of a model.zip: ONNX holds its own normalisation")
+    return policy_file.run(arguments)
+
+
+POLICY = Subcommand(
+    examples(
+        "python -m deploy policy a.onnx --env Pendulum-v1 --set action.0.stop=0 --out b.onnx",
+        "python -m deploy policy td3.zip --env Pendulum-v1 --set action.0.stop=0 --out b.onnx",
+    ),
+    policy_file.add_arguments,
+    _run,
+)
