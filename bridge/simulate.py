@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from argparse import Namespace
 from collections import Counter
@@ -88,7 +89,11 @@ def run(asked: Namespace) -> int:
         found = _drive(asked, environment, port, clock, edge)
     write_json_out(asked.out, found)
     print(report.summary_line(found))
-    return 0
+    if found["interrupted"]:
+        print(
+            f"interrupted after {found['episodes']} of {asked.episodes} episodes", file=sys.stderr
+        )
+    return cli.INTERRUPTED if found["interrupted"] else 0
 
 
 def _drive(
@@ -106,19 +111,24 @@ def _drive(
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
         raise other_task(task)
-    results = []
-    with report.ProgressBar("episodes", asked.episodes) as bar:
-        for episode in range(asked.episodes):
-            if vehicle is not None:
-                vehicle.wait_for_standstill()
-            results.append(runner.run(episode, asked.seed + episode))
-            bar.advance({"last": results[-1].outcome})
+    results: list[EpisodeResult] = []
+    try:
+        with report.ProgressBar("episodes", asked.episodes) as bar:
+            for episode in range(asked.episodes):
+                if vehicle is not None:
+                    vehicle.wait_for_standstill()
+                results.append(runner.run(episode, asked.seed + episode))
+                bar.advance({"last": results[-1].outcome})
+    except KeyboardInterrupt:  # The report is of the episodes that were driven to their end.
+        if not results:
+            raise
     after, by_simulator = port.edge_status(), clock.rejected()
     by_edge = after.rejected_since(edge) if after else Counter[str]()
     facts = {
         "scenario": task.task,
         **how,
         "latency_spec": network,
+        "interrupted": len(results) < asked.episodes,
         "policy_ids": clock.check.policy_ids,
         "deadline_misses": runner.deadline_misses,
         "missed_ticks": clock.missed_ticks,

@@ -18,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 from bridge.network import LatencySpec, parse_spec
@@ -25,7 +26,7 @@ from bridge.outcomes import GOAL, TIMEOUT, TRUNCATED, UNKNOWN
 from bridge.report import EpisodeResult
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.util import UserError
+from edge_runtime.util import UserError, read_json
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, load_driver, located, trained_in
 from trainer.util import cores, die_with_parent, kept, set_threads
@@ -110,12 +111,16 @@ class SequentialTest:
 class Search:
     """Looks for edges, and keeps the verdict of every point that was tried.
 
-    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided.
+    ``drive`` is called with the next AT_ONCE seeds, from ``seed`` on, until a point is decided, and
+    ``keep`` after it.
     """
 
-    def __init__(self, drive: Drive, promise: float, seed: int = 0) -> None:
-        self._drive, self._promise, self._seed = drive, promise, seed
+    def __init__(
+        self, drive: Drive, promise: float, seed: int = 0, keep: Callable[[], None] = lambda: None
+    ) -> None:
+        self._drive, self._promise, self._seed, self._keep = drive, promise, seed, keep
         self.tried: dict[str, dict[str, Any]] = {}
+        self.edges: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
         """Drive a point until it is decided; return HOLDS, BREAKS or BETWEEN."""
@@ -128,6 +133,7 @@ class Search:
                     verdict = verdict or test.add(success)
             found = {"verdict": verdict, "drives": test.drives, "successes": test.successes}
             self.tried[str(spec)] = found
+            self._keep()
             print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
         return str(self.tried[str(spec)]["verdict"])
 
@@ -154,14 +160,14 @@ class Search:
 
 
 def find_edges(search: Search) -> dict[str, dict[str, Any]]:
-    """Return for each axis ``limit``, ``breaks_at`` and their networks; so for all together.
+    """Find for each axis ``limit``, ``breaks_at`` and their networks; so for all together.
 
     Together, the values are shares of the limits, with the jitter whose limit is smaller. Raises
     UserError where the promise is not kept without a network.
     """
     if search.verdict({}) != HOLDS:
         raise UserError("the promise is not kept even on a perfect network: lower --promise")
-    edges: dict[str, dict[str, Any]] = {}
+    edges = search.edges
 
     def find(name: str, full: Point, steps: int, step: float) -> None:
         found = search.edge(
@@ -179,25 +185,34 @@ def find_edges(search: Search) -> dict[str, dict[str, Any]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find an envelope, and write it."""
-    check_writable(arguments.out)
+    """Find an envelope; what is known is written after each network, and taken up again."""
+    out = arguments.out
+    check_writable(out)
     policy = arguments.policy or kept(f"results/policies/{arguments.env}.onnx")
     task = (policy, arguments.env, arguments.condition, arguments.public_key, arguments.jobs)
     with sigterm_as_interrupt(), Drivers(*task) as drivers:
+        about = {
+            "schema": 2, "policy_id": drivers.policy_id, "env": arguments.env,
+            "condition": arguments.condition, "promised_success": arguments.promise,
+            "confidence": CONFIDENCE, "seed": arguments.seed,
+        }  # fmt: skip
 
         def drive(spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
             return [result.outcome == GOAL for result in drivers.drive(spec, seeds)]
 
-        search = Search(drive, arguments.promise, arguments.seed)
-        found = {"edges": find_edges(search), "tried": search.tried}
-    report = {
-        "schema": 2, "policy_id": drivers.policy_id, "policy": policy, "env": arguments.env,
-        "condition": arguments.condition, "promised_success": arguments.promise,
-        "confidence": CONFIDENCE, "seed": arguments.seed, **found,
-        "command": f"python -m hil_tests {shlex.join(sys.argv[1:])}",
-    }  # fmt: skip
-    write_json_out(arguments.out, report)
-    for name, edge in found["edges"].items():
+        def keep(complete: bool = False) -> None:
+            found = {"complete": complete, "edges": search.edges, "tried": search.tried}
+            command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
+            write_json_out(out, {**about, "policy": policy, **found, "command": command})
+
+        search = Search(drive, arguments.promise, arguments.seed, keep)
+        begun = read_json(out, "envelope") if Path(out).exists() else {}
+        if begun.get("complete") is False and about.items() <= begun.items():
+            search.tried = begun["tried"]
+            print(f"goes on: {len(search.tried)} networks are known from {out}", file=sys.stderr)
+        find_edges(search)
+    keep(complete=True)
+    for name, edge in search.edges.items():
         print(f"{name} holds up to {edge['limit']:g}, breaks at {edge['breaks_at']}")
     return 0
 

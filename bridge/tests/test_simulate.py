@@ -24,7 +24,7 @@ from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
-from hil_tests.testing.drives import SLOW_TOY, TOY, make_policy, read, start_edge, start_simulate
+from hil_tests.testing.drives import TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import STEERING, write_policy, write_rover
 
@@ -48,19 +48,21 @@ def drove_as_in_process(report, policy):
         np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
 
 
-def test_an_interrupted_run_writes_no_report(tmp_path):
-    endpoint, out = free_endpoint(), tmp_path / "half.json"
-    policy = make_policy(tmp_path, "constant")
-    with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, SLOW_TOY) as run:
-        edge.wait_for_line("now=drive")
+def test_an_interrupted_run_reports_the_episodes_that_it_drove(tmp_path):
+    endpoint, out = free_endpoint(), tmp_path / "part.json"
+    policy, many = make_policy(tmp_path, "constant"), ("--episodes", "9999")
+    with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, TOY, *many) as run:
+        edge.wait_for_line("now=standby")
         run.send(signal.SIGTERM)
         assert run.wait(10) == 130
         time.sleep(0.5)
         # The final state came: at rest, not stopped because a link seems to be lost.
         assert edge.end() == 0
-    assert "now=standby" in edge.errors
     assert "now=safe_stop" not in edge.errors.split("now=standby")[-1]
-    assert list(tmp_path.glob("*half*")) == []
+    report = read(out)
+    assert report["interrupted"]
+    assert 1 <= report["episodes"] == len(report["per_episode"]) < 9999
+    assert all(row["outcome"] for row in report["per_episode"])
 
 
 def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):

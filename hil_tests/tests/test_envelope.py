@@ -1,10 +1,15 @@
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.network import parse_spec
+from bridge.outcomes import GOAL
 from edge_runtime.util import UserError
+from hil_tests import envelope
 from hil_tests.envelope import (
     AXES,
     BETWEEN,
@@ -17,6 +22,7 @@ from hil_tests.envelope import (
     find_edges,
     network,
 )  # fmt: skip
+from hil_tests.testing.commands import call
 
 LIMITS = {"delay_ms": 300.0, "jitter_ms": 25.0, "tail_jitter_ms": 60.0, "loss_percent": 12.0,
           "burst_messages": 2.5, "outage_s": 0.5}  # fmt: skip
@@ -98,6 +104,48 @@ def test_the_axes_are_searched_alone_and_together(jointly, share):
 def test_what_fails_without_a_network_has_no_envelope():
     with pytest.raises(UserError):
         find_edges(Search(lambda spec, seeds: [seed % 5 > 0 for seed in seeds], 0.95))
+
+
+class Drives:
+    """Drives of `lucky`, in this process; ^C comes before the one after ``most``."""
+
+    most, policy_id = 0, "id"
+
+    def __init__(self, *task):
+        self._left = Drives.most
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def drive(self, spec, seeds):
+        self._left -= 1
+        if self._left < 0:
+            raise KeyboardInterrupt
+        successes = lucky(lambda at: sum(at[name] / LIMITS[name] for name in at))(spec, seeds)
+        return [SimpleNamespace(outcome=GOAL if each else "collision") for each in successes]
+
+
+def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(envelope, "Drivers", Drives)
+    out, other = tmp_path / "found.json", tmp_path / "at_once.json"
+    Drives.most = 10**6
+    assert call(capsys, "envelope", "--out", other, package="hil_tests")[0] == 0
+    known = []
+    Drives.most = 100
+    while call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130:
+        part = json.loads(out.read_text())
+        assert not part["complete"]
+        known.append(len(part["tried"]))
+    assert len(known) > 1
+    assert known == sorted(set(known))
+    found, wanted = (json.loads(path.read_text()) for path in (out, other))
+    assert {**found, "command": ""} == {**wanted, "command": ""}
+    assert found["complete"]
+    Drives.most = 0  # A complete one is found anew.
+    assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
 
 
 def test_bursts_come_on_top_of_the_loss():

@@ -1,6 +1,7 @@
 """The DAgger human model of section V, which imitates the human's actions so far."""
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -13,6 +14,7 @@ from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
 from bridge.report import ProgressBar
+from edge_runtime.cli import INTERRUPTED, sigterm_as_interrupt
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import util
@@ -121,11 +123,11 @@ def run(arguments: argparse.Namespace) -> int:
     with claimed(directory):
         if (directory / MODEL_FILE).exists():
             raise UserError(f"{directory} holds a human model; choose another --out")
-        _train(arguments, config, directory)
-    return 0
+        return _train(arguments, config, directory)
 
 
-def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
+@sigterm_as_interrupt()
+def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> int:
     end_s = util.deadline_s(arguments.max_minutes)
     env = make_environment(arguments.scenario)
     about: dict[str, Any] = {"scenario": env.scenario, "seed": arguments.seed}
@@ -141,17 +143,25 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
         about |= {"recordings": [str(path) for path in recordings], "interventions": taken_over}
         # As many gradient steps as with the expert, without the episodes between them
         losses = (model.learn(config.updates_per_episode) for _ in range(config.episodes))
-    with ProgressBar("human model", config.episodes) as bar:
-        for loss in losses:
-            bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
-            if time.monotonic() > end_s:
-                break
-    # In proportion: part of the episodes have shown part of the examples, in part of the time.
-    model.refine(config.refining_updates * bar.done // config.episodes)
+    status = 0
+    try:
+        with ProgressBar("human model", config.episodes) as bar:
+            for loss in losses:
+                bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
+                if time.monotonic() > end_s:
+                    break
+        # In proportion: part of the episodes have shown part of the examples, in part of the time.
+        model.refine(config.refining_updates * bar.done // config.episodes)
+    except KeyboardInterrupt:
+        if not bar.done:
+            raise
+        status = INTERRUPTED
+        print(f"interrupted after {bar.done} of {config.episodes} episodes", file=sys.stderr)
     about |= {"config": asdict(config), "episodes": bar.done}
     model.save(directory, about)
     write_json(directory / "human.json", about | {"demonstrations": model.demonstrations})
     print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
+    return status
 
 
 def imitate(model: HumanModel, env: Any, seed: int) -> Iterator[float]:

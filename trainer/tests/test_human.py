@@ -1,3 +1,4 @@
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -5,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from hil_tests.testing.commands import call
 from trainer.environments import expert_of, make_environment
 from trainer.evaluation import constant_driver
 from trainer.human import HumanModelConfig
+from trainer.human import model as model_module
 from trainer.human.guide import ASKED, Asking, HumanGuide, PoorHands, steps_held
 from trainer.human.model import HumanModel, imitate, load_human_model
 from trainer.person.tests.people import BRAKE, FULL, drive
@@ -29,6 +32,23 @@ def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     assert about["demonstrations"] == models[0].demonstrations
     with torch.no_grad():
         assert actor(torch.from_numpy(frames)[None])[0].numpy() == models[0].act(frames)
+
+
+@pytest.mark.parametrize("driven", [0, 1])
+def test_an_interrupted_training_leaves_the_model_of_its_episodes(
+    driven, monkeypatch, capsys, tmp_path
+):
+    def interrupted(model, env, seed):
+        yield from itertools.islice(imitate(model, env, seed), driven)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(model_module, "imitate", interrupted)
+    words = ("human", "--episodes", "9", "--updates-per-episode", "2", "--out", tmp_path / "human")
+    assert call(capsys, *words)[0] == 130
+    assert (tmp_path / "human").exists() == bool(driven)
+    if driven:
+        _, about = load_human_model(tmp_path / "human", make_environment("left_turn"))
+        assert about["episodes"] == driven
 
 
 @pytest.mark.parametrize(
