@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from bridge.ports import add_options
 from bridge.recording import Recording, choose_vehicle, valid_messages
+from bridge.report import write_figure
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
 from edge_runtime.config import BUILT_IN, NONE, Config, add_trust, load_config
 from edge_runtime.controller import (
@@ -40,6 +43,7 @@ CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock w
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
+MOST_PANELS, LEAST_DRAWN = 8, 1e-9  # Of a picture: actions, and difference
 
 Key = tuple[str, int, int]  # Session, episode, step
 
@@ -50,6 +54,14 @@ class Exchange(NamedTuple):
     command: Command
     arrived_s: float  # When the state reached the runtime
     sent_s: float  # When the answer was sent
+
+
+class Drawn(NamedTuple):
+    """What a picture shows of a state's two answers."""
+
+    recorded: Sequence[float]
+    replayed: Sequence[float]
+    distance: float
 
 
 Row = tuple[State, Command | None, Order | None]
@@ -69,7 +81,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     apart = "largest difference of two equal actions, in the unit of the action"
     kind = not_negative_number
     add("--tolerance", metavar="X", type=kind, default=DEFAULT_TOLERANCE, help=apart)
-    add_options(parser, "--out")
+    out = "report to write, as JSON, and beside it a picture R.png of recorded and replayed actions"
+    add_options(parser, "--out", help=out)
 
 
 def run(arguments: Any) -> int:
@@ -77,15 +90,21 @@ def run(arguments: Any) -> int:
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
+    drawn: list[Drawn] = []
     report = {
         "recording": arguments.recording,
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), arguments.tolerance),
+        **compare(replay(drive, policy, config), arguments.tolerance, drawn),
     }
     if report["compared"] == 0:
         raise UserError(f"{arguments.recording} holds no state with an answer of its policy")
     write_json_out(arguments.out, report)
+    if arguments.out:
+        names = [row.name for row in policy.manifest.action]
+        write_figure(
+            draw(drawn, names, arguments.tolerance), Path(arguments.out).with_suffix(".png")
+        )
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
@@ -245,8 +264,10 @@ def _watchdog(controller: Controller, until_s: float) -> None:
         controller.tick(due_s + JUST_AFTER_S)
 
 
-def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
-    """Return the part of the report that says what differs.
+def compare(
+    rows: Iterable[Row], tolerance: float, drawn: list[Drawn] | None = None
+) -> dict[str, Any]:
+    """Return the part of the report that says what differs, and append each pair to ``drawn``.
 
     States without a recorded answer are counted, not compared. Two answers are equal where mode
     and reason are, and no action, planned ones included, is further apart than ``tolerance``.
@@ -259,6 +280,8 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
             continue
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
         distances.append(distance := _distance(recorded, order))
+        if drawn is not None:
+            drawn.append(Drawn(recorded.action, order.action if order else (), distance))
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)
@@ -272,6 +295,33 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
         "by_recorded": dict(kinds),
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
+
+
+def draw(drawn: Sequence[Drawn], names: Sequence[str], tolerance: float) -> Any:
+    """Draw both answers of each state, a panel an action, and how far they are apart."""
+    from matplotlib.figure import Figure
+
+    names = names[:MOST_PANELS]
+    figure = Figure(figsize=(10, 1.8 * len(names) + 1.8), layout="constrained")
+    *panels, below = figure.subplots(len(names) + 1, sharex=True)
+    *answers, apart = zip(*drawn, strict=True)
+    (differ,) = np.nonzero(np.array(apart) > tolerance)
+    unknown = [math.nan] * len(names)
+    recorded, replayed = (
+        np.array([[*a, *unknown][: len(names)] for a in each]) for each in answers
+    )
+    for place, (name, panel) in enumerate(zip(names, panels, strict=True)):
+        panel.plot(recorded[:, place], label="recorded")
+        panel.plot(replayed[:, place], "--", label="replayed")
+        panel.plot(differ, recorded[differ, place], ".", color="C3", label=f"{len(differ)} differ")
+        panel.set_ylabel(name)
+    panels[0].legend(fontsize=8)
+    # A stop where the other drives is no distance: it stands at the top.
+    below.semilogy(np.clip(apart, LEAST_DRAWN, max([1.0, *filter(math.isfinite, apart)])), ".")
+    below.axhline(tolerance, color="0.4", lw=0.8, linestyle="--")
+    below.set_ylabel("difference")
+    below.set_xlabel("answered states, in their order")
+    return figure
 
 
 def _told(answer: Command | Order) -> dict[str, Any]:

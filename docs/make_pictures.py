@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from bridge.report import write_figure
 from edge_runtime.cli import run_cli
 from edge_runtime.util import read_json
-from hil_tests.campaign import draw_axes
+from hil_tests.envelope import draw_axes
 from trainer.environments import make_environment
 from trainer.evaluation import load_driver
-from trainer.training.curves import write_figure
 from trainer.util import kept
 
 FOLDER = Path(__file__).parent

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import math
 import shlex
 import sys
 from collections import Counter
@@ -19,22 +18,18 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from matplotlib.figure import Figure
-
 from bridge.network import parse_spec
 from bridge.outcomes import GOAL, success_estimate
-from bridge.report import ProgressBar, markdown_table
+from bridge.report import ProgressBar, markdown_table, write_figure
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.envelope import Drivers
+from hil_tests.envelope import Drivers, draw_axes
 from hil_tests.faults.rows import Row
 from hil_tests.faults.run import ROWS, run_faults
-from trainer.training.curves import write_figure
 from trainer.util import cores, kept
 
 Found = Mapping[str, Any]  # A part of a report's JSON
-PANELS = 3  # In a row
 TARGET = 0.98  # Share of successes that a network within the budget leaves
 
 
@@ -200,27 +195,3 @@ def render_latency(latency: Found) -> list[str]:
         head = ("value", "success (95 %)", "episodes")
         lines += [f"### {axis['title']}", "", *markdown_table(head, rows)]
     return lines
-
-
-def draw_axes(swept: Found) -> Figure:
-    """Draw a panel for each axis of a report's part ``latency``."""
-    axes = swept["axes"]
-    rows, columns = math.ceil(len(axes) / PANELS), min(PANELS, len(axes))
-    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
-    for panel, axis in zip(panels, axes, strict=False):
-        values = axis["values"]
-        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
-        panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5)
-        low, high = ([each[end] for each in estimates] for end in ("low", "high"))
-        panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
-        panel.axhline(swept["budget"]["target_success"], color="0.4", lw=0.8, linestyle="--")
-        panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
-        panel.grid(alpha=0.3)
-        panel.set_ylim(-0.03, 1.03)
-    for panel in panels[len(axes) :]:
-        panel.set_visible(False)
-    figure.supylabel("success")
-    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
-    figure.suptitle(f"{Path(swept['policy']).stem}: {drives}; Wilson's 95 % interval; target")
-    return figure

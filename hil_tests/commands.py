@@ -34,7 +34,9 @@ def campaign(parser: argparse.ArgumentParser) -> None:
 def envelope(parser: argparse.ArgumentParser) -> None:
     inner = cli.number("a share above 0.5 and below 1", lambda value: 0.5 < value < 1.0)
     add = parser.add_argument
-    add("--out", required=True, metavar="F.json", type="path", help="envelope to write, as JSON")
+    out = "envelope to write, as JSON, and as a picture F.png: green holds, red breaks; the same "
+    out += "command goes on with an unfinished one"
+    add("--out", required=True, metavar="F.json", type="path", help=out)
     add("--env", default="left_turn", help="scenario, gymnasium id or MODULE:ID")
     _add_common(parser, "ENV")
     add("--promise", type=inner, default=0.95, help="success rate that the policy must keep")

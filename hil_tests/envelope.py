@@ -21,9 +21,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from bridge.network import LatencySpec, parse_spec
-from bridge.outcomes import GOAL, TIMEOUT, TRUNCATED, UNKNOWN
-from bridge.report import EpisodeResult
+from bridge.outcomes import GOAL, TIMEOUT, TRUNCATED, UNKNOWN, success_estimate
+from bridge.report import EpisodeResult, write_figure
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, read_json
@@ -38,6 +40,7 @@ ZONE = 0.7
 98.5 % and from 91.5 %."""
 TRIES = 8  # So many points an axis tries, about; the error of each is that much smaller
 MOST_FAILURES = 50  # At the promise: a point is left undecided after the drives that have so many
+PANELS = 3  # In a row of a picture
 AT_ONCE = 16  # Drives between two looks at whether a point is decided
 OUTAGE_EVERY_S, OUTAGE_START_S = 3.0, 0.97  # Off the ticks, so that rounding decides nothing
 BURST_PERCENT = 5.0  # Share of the messages in bad stretches
@@ -132,6 +135,7 @@ class Search:
                 for success in self._drive(spec, range(first, first + AT_ONCE)):
                     verdict = verdict or test.add(success)
             found = {"verdict": verdict, "drives": test.drives, "successes": test.successes}
+            found["at"] = {name: value for name, value in at.items() if value}
             self.tried[str(spec)] = found
             self._keep()
             print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
@@ -194,7 +198,7 @@ def run(arguments: argparse.Namespace) -> int:
         about = {
             "schema": 2, "policy_id": drivers.policy_id, "env": arguments.env,
             "condition": arguments.condition, "promised_success": arguments.promise,
-            "confidence": CONFIDENCE, "seed": arguments.seed,
+            "confidence": CONFIDENCE, "seed": arguments.seed, "policy": policy,
         }  # fmt: skip
 
         def drive(spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
@@ -203,15 +207,19 @@ def run(arguments: argparse.Namespace) -> int:
         def keep(complete: bool = False) -> None:
             found = {"complete": complete, "edges": search.edges, "tried": search.tried}
             command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
-            write_json_out(out, {**about, "policy": policy, **found, "command": command})
+            write_json_out(out, {**about, **found, "command": command})
 
         search = Search(drive, arguments.promise, arguments.seed, keep)
         begun = read_json(out, "envelope") if Path(out).exists() else {}
         if begun.get("complete") is False and about.items() <= begun.items():
             search.tried = begun["tried"]
             print(f"goes on: {len(search.tried)} networks are known from {out}", file=sys.stderr)
-        find_edges(search)
-    keep(complete=True)
+        try:
+            find_edges(search)
+            keep(complete=True)
+        finally:
+            if search.tried:
+                write_figure(draw_axes(_swept(about, search)), Path(out).with_suffix(".png"))
     for name, edge in search.edges.items():
         print(f"{name} holds up to {edge['limit']:g}, breaks at {edge['breaks_at']}")
     return 0
@@ -270,3 +278,53 @@ def _drive(spec: LatencySpec, seed: int) -> EpisodeResult:
     env, driver, condition = _mine
     (result,) = drive_episodes(env, driver, [seed], condition, latency=spec)
     return replace(result, actions=[])
+
+
+def _swept(about: Mapping[str, Any], search: Search) -> dict[str, Any]:
+    """Return the networks that were tried, as a campaign reports them."""
+    axes, drives = [], [row["drives"] for row in search.tried.values()]
+    for name in AXES:
+        alone = {row["at"].get(name, 0.0): spec for spec, row in search.tried.items()
+                 if {name}.issuperset(row["at"])}  # fmt: skip
+        title, _, unit = name.rpartition("_")
+        edge = search.edges.get(name, {})
+        found = [edge[end] for end in ("limit", "breaks_at") if edge.get(end) is not None]
+        points = sorted(alone.items())
+        values, specs = map(list, zip(*points, strict=True))
+        axes.append(
+            {"title": title, "unit": unit, "values": values, "specs": specs, "edges": found}
+        )
+    return {
+        **about, "scenario": about["env"], "axes": axes, "runs": f"{min(drives)} to {max(drives)}",
+        "budget": {"target_success": about["promised_success"]},
+        "rows": {
+            spec: {"success": success_estimate(row["successes"], row["drives"])._asdict()}
+            for spec, row in search.tried.items()
+        },
+    }  # fmt: skip
+
+
+def draw_axes(swept: Mapping[str, Any]) -> Figure:
+    """Draw a panel for each axis of a campaign's part ``latency``, or of what `_swept` returns."""
+    axes = swept["axes"]
+    rows, columns = math.ceil(len(axes) / PANELS), min(PANELS, len(axes))
+    figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
+    for panel, axis in zip(panels, axes, strict=False):
+        values = axis["values"]
+        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
+        panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5)
+        low, high = ([each[end] for each in estimates] for end in ("low", "high"))
+        panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
+        for edge, color in zip(axis.get("edges", ()), ("C2", "C3"), strict=False):
+            panel.axvline(edge, color=color, lw=0.8)
+        panel.axhline(swept["budget"]["target_success"], color="0.4", lw=0.8, linestyle="--")
+        panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
+        panel.grid(alpha=0.3)
+        panel.set_ylim(-0.03, 1.03)
+    for panel in panels[len(axes) :]:
+        panel.set_visible(False)
+    figure.supylabel("success")
+    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
+    figure.suptitle(f"{Path(swept['policy']).stem}: {drives}; Wilson's 95 % interval; target")
+    return figure

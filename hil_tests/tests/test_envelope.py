@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from bridge.network import parse_spec
 from bridge.outcomes import GOAL
+from bridge.report import write_figure
 from edge_runtime.util import UserError
 from hil_tests import envelope
 from hil_tests.envelope import (
@@ -130,11 +132,12 @@ class Drives:
 
 def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(envelope, "Drivers", Drives)
-    out, other = tmp_path / "found.json", tmp_path / "at_once.json"
+    out, other, figures = tmp_path / "found.json", tmp_path / "at_once.json", []
+    monkeypatch.setattr(envelope, "write_figure", lambda *figure: figures.append(figure))
     Drives.most = 10**6
     assert call(capsys, "envelope", "--out", other, package="hil_tests")[0] == 0
     known = []
-    Drives.most = 100
+    Drives.most = 150
     while call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130:
         part = json.loads(out.read_text())
         assert not part["complete"]
@@ -144,6 +147,10 @@ def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch,
     found, wanted = (json.loads(path.read_text()) for path in (out, other))
     assert {**found, "command": ""} == {**wanted, "command": ""}
     assert found["complete"]
+    assert len(figures) == 1 + len(known) + 1
+    write_figure(*figures[-1])
+    with Image.open(out.with_suffix(".png")) as picture:
+        assert picture.width > 1000
     Drives.most = 0  # A complete one is found anew.
     assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
 

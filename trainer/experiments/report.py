@@ -6,7 +6,6 @@ is made of the numbers of a line's units in one task, one row a unit.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from io import BytesIO
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
 from bridge.outcomes import Estimate, mean_estimate
-from bridge.report import markdown_table
+from bridge.report import markdown_table, write_figure
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer import experiments as plan
@@ -53,7 +51,6 @@ from trainer.experiments.records import (
 )
 from trainer.learner.config import ALGORITHMS
 from trainer.training.config import PRESETS, flat
-from trainer.training.curves import DOTS_PER_INCH
 
 Cell = Callable[[pd.DataFrame], str]
 PHIL = "phil_td3"
@@ -358,7 +355,6 @@ def outcomes(records: Records) -> Mapping[str, Cell]:
 
 # Figures
 
-KEPT_COLOURS = 64  # Of a figure's pixels
 Draw = Callable[[Records], Figure]
 COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", "human_model": "C1"}
 OTHERS = ("C4", "C5", "C6", "C8", "C9", "black", "C1")
@@ -486,12 +482,3 @@ FIGURES: Mapping[str, Mapping[str, Draw]] = {
     "guidance": {"guidance": draw_guidance},
 }  # fmt: skip
 """Study -> name of a figure's file, and of the experiment -> how it is drawn."""
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG of few colours, which takes a third of the bytes."""
-    drawn, buffer = BytesIO(), BytesIO()
-    figure.savefig(drawn, format="png", dpi=DOTS_PER_INCH)
-    picture = Image.open(drawn).convert("RGB").quantize(KEPT_COLOURS, dither=Image.Dither.NONE)
-    picture.save(buffer, "png", optimize=True)
-    write_atomic(path, buffer.getvalue())

@@ -1,7 +1,6 @@
 """``python -m trainer plot``: learning curves of runs, a line and a band for each algorithm."""
 
 import argparse
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bridge.outcomes import mean_estimate
-from edge_runtime.files import write_atomic
+from bridge.report import write_figure
 from edge_runtime.util import UserError, read_json
 from trainer.training.config import CONFIG_FILE, CURVE_FILE
 from trainer.training.metrics import METRICS_FILE, read_metrics
 
-DOTS_PER_INCH = 110
 WINDOW = 20  # Episodes of the moving average
 POINTS = 100  # At which the runs of an algorithm are averaged
 AXES = {"steps": "environment steps", "human_s": "seconds driven by the human"}
@@ -64,12 +62,6 @@ def write_learning_curve(*dirs: Path, out: str | None = None, x: str = "steps") 
     path = dirs[0] / CURVE_FILE if out is None else Path(out)
     write_figure(figure, path)
     return path
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH)
-    write_atomic(path, buffer.getvalue())
 
 
 def _runs_in(directory: Path) -> Sequence[Path]:
