@@ -285,14 +285,8 @@ class Adapter:
         self.last = self.hands_off
 
     def arrays(self, observation: Any) -> dict[str, np.ndarray]:
-        """Return an observation's entries as the task has them.
-
-        Raises UserError for another shape, or where a number would change.
-        """
-        if not isinstance(observation, Mapping):
-            observation = {next(iter(self.task.observation)): observation}
-        entries = self.task.observation.items()
-        return {name: _fitting(observation, name, entry) for name, entry in entries}
+        """Return an observation's entries as the task has them, as `arrays_of` does."""
+        return arrays_of(self.task, observation)
 
     def pack(self, observation: Any) -> dict[str, bytes]:
         """Return an observation as a state carries it."""
@@ -316,6 +310,16 @@ class Adapter:
         press = offered(self.env, "press_brake")
         if callable(press):
             press(pressed)
+
+
+def arrays_of(task: Task, observation: Any) -> dict[str, np.ndarray]:
+    """Return an observation's entries as the task has them.
+
+    Raises UserError for another shape, or where a number would change.
+    """
+    if not isinstance(observation, Mapping):
+        observation = {next(iter(task.observation)): observation}
+    return {name: _fitting(observation, name, entry) for name, entry in task.observation.items()}
 
 
 def _fitting(observation: Mapping[str, Any], name: str, entry: Entry) -> np.ndarray:

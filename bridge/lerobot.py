@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from bridge.film import film, pixel_format
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
 from bridge.replay import RecordedDrive, key_of
@@ -30,7 +31,6 @@ from edge_runtime.util import UserError, counted
 from edge_runtime.wire import Command, State, is_foreign
 
 try:
-    import av
     import pyarrow as pa
     from pyarrow.parquet import write_table
 except ImportError:
@@ -164,27 +164,19 @@ def _encode(
     """Encode the newest picture of each array; return a sample of pixels, and the feature."""
     path.parent.mkdir(parents=True)
     sampled = []
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options=ENCODER)
-        for number, array in enumerate(arrays):
+    with film(path, rate, ENCODER) as add:
+        for array in arrays:
             images: Any = images_of(array)
             height, width = images.shape[1:3]
-            if not number:
-                stream.height, stream.width = height, width
-                # Colours of half the size, as players like them, need even sizes.
-                stream.pix_fmt = "yuv444p" if height % 2 or width % 2 else "yuv420p"
             picture = np.ascontiguousarray(np.broadcast_to(images[-1], (height, width, 3)))
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = number, 1 / rate
-            container.mux(stream.encode(frame))
+            add(picture)
             pixels = picture.reshape(-1, 3)[:: height * width // SAMPLED_PIXELS + 1]
             sampled.append(pixels.copy())  # A view would keep the picture.
-        container.mux(stream.encode(None))
-        info = {
-            "video.height": height, "video.width": width, "video.codec": "h264",
-            "video.pix_fmt": stream.pix_fmt, "video.fps": int(rate), "video.channels": 3,
-            "has_audio": False, "is_depth_map": False,
-        }  # fmt: skip
+    info = {
+        "video.height": height, "video.width": width, "video.codec": "h264",
+        "video.pix_fmt": pixel_format(height, width), "video.fps": int(rate),
+        "video.channels": 3, "has_audio": False, "is_depth_map": False,
+    }  # fmt: skip
     feature = {"dtype": "video", "shape": [height, width, 3], "info": info}
     return np.array(sampled), feature | {"names": ["height", "width", "channels"]}
 

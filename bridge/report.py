@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bridge.environments import finite
 from bridge.inbound import BRAKE_PERIODS, NO_COMMAND, Decision
-from bridge.outcomes import COLLISION, GOAL, is_told, settled
+from bridge.outcomes import COLLISION, GOAL, is_told, settled, success_estimate
 from edge_runtime.files import write_atomic
 from edge_runtime.util import counted, printable
 
@@ -55,7 +55,7 @@ class EpisodeResult:
     lateral_acceleration_mps2: float | None
     longitudinal_acceleration_mps2: float | None
     steps: int
-    actions: list[list[float]] = field(default_factory=list)
+    actions: list[list[float]] = field(default_factory=list, repr=False)
 
 
 def summarise(
@@ -69,12 +69,14 @@ def summarise(
     for result, outcome in zip(results, settled(r.outcome for r in results), strict=True):
         result.outcome = outcome
     outcomes = Counter(result.outcome for result in results)
+    told = success_estimate(outcomes[GOAL], len(results)) if is_told(outcomes) else None
     columns = {key: [getattr(row, name) for row in results] for key, name in QUANTITIES.items()}
     return {
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": outcomes[GOAL] / len(results) if is_told(outcomes) else None,
+        "success_rate": told and told.value,
+        "success_interval": told and [told.low, told.high],
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
             key: {"mean": of_known(values), "std": of_known(values, np.std)}

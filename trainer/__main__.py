@@ -183,6 +183,9 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, " of the first episode; each next episode adds 1")
     out = "write the report with the results of each episode to this file instead of stdout"
     add("--out", metavar="R.json", type="path", help=out)
+    add("--video", metavar="F.mp4", type="path", help="film the episodes, as they look to a person")
+    shown = "show the episodes in the rerun viewer: spawn, serve or F.rrd, as for train"
+    add("--rerun", metavar="spawn|serve|F.rrd", help=shown)
 
 
 @command(

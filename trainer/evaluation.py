@@ -6,7 +6,7 @@ import os
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from os import PathLike, fspath
 from pathlib import Path
@@ -14,13 +14,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from bridge.environments import finite
+from bridge.environments import arrays_of, finite
 from bridge.network import LatencySpec, parse_spec
+from bridge.outcomes import success_estimate
 from bridge.report import EpisodeResult, ProgressBar, accelerations, of_known, summarise
+from bridge.rerun import check_sink
 from edge_runtime.controller import limit_action, neutral_action, shared_limits
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.policy import load_policy
+from edge_runtime.policy import Policy, load_policy
 from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer.environments import (
     CONDITIONS,
@@ -33,11 +36,12 @@ from trainer.environments import (
     scenario_of,
     task_of,
 )
+from trainer.film import check_film, filmed
 from trainer.human import MODEL_FILE
-from trainer.human.guide import Driver
+from trainer.human.guide import Driver, Record
 from trainer.human.model import load_human_model
 from trainer.learner.networks import Actor
-from trainer.learner.replay import Action, Observation
+from trainer.learner.replay import Action, Observation, Transition
 from trainer.training.config import period_of
 from trainer.util import fitting, limited_threads, load_torch
 
@@ -51,14 +55,15 @@ ActTogether = Callable[[Observation], Action]  # Many actions for many observati
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; return the exit status."""
     check_writable(arguments.out)
-    names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key")
+    names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key", "video",
+             "rerun")  # fmt: skip
     found = evaluate(**{name: getattr(arguments, name) for name in names})
     if not arguments.out:
         print(json.dumps(found.report, indent=2))
         return 0
     detail = [asdict(result) for result in found.episodes]
     write_json_out(arguments.out, {**found.report, "per_episode": detail})
-    print(f"{counted(arguments.runs, 'episode')}, return {found.mean_return:.2f}: {arguments.out}")
+    print(f"{found}: {arguments.out}")
     return 0
 
 
@@ -68,6 +73,13 @@ class Evaluation:
 
     report: dict[str, Any]  # As ``trainer evaluate`` prints it
     episodes: list[EpisodeResult]
+
+    def __repr__(self) -> str:
+        said = [counted(len(self.episodes), "episode"), f"return {self.mean_return:.2f}"]
+        if (share := self.success_rate) is not None:
+            count = len(self.episodes)
+            said.insert(1, f"success {success_estimate(round(share * count), count).as_share()} %")
+        return ", ".join(said)
 
     @property
     def success_rate(self) -> float | None:
@@ -89,11 +101,15 @@ def evaluate(
     condition: str = "nominal",
     latency: str = "none",
     public_key: str | None = None,
+    video: str | PathLike[str] | None = None,
+    rerun: str | None = None,
+    on_step: Record | None = None,
 ) -> Evaluation:
     """Drive test episodes with a policy alone, as ``python -m trainer evaluate`` does.
 
     ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
-    else the left turn. Episode i is reset with ``seed + i``.
+    else the left turn. Episode i is reset with ``seed + i``. ``on_step(transition, None, info)`` is
+    called after each control period.
 
     Raises UserError: no such policy, condition or number of runs; a policy of another environment;
     an environment that reports what is no number.
@@ -104,6 +120,9 @@ def evaluate(
         raise UserError(f"runs must be at least 1, and seed at least 0: {runs}, {seed}")
     scenario = scenario or getattr(policy, "scenario", None)
     policy, spec = located(fspath(policy)), parse_spec(latency)
+    sink = None if rerun is None else check_sink(rerun)
+    film = None if video is None else check_film(video)
+    recorders: list[Record] = [] if on_step is None else [on_step]
     named, period_s = trained_in(policy, public_key)
     named = scenario or name_in_file(named, f"{policy} was trained in", "--scenario")
     scenario, seeds = scenario_of(named), range(seed, seed + runs)
@@ -111,9 +130,18 @@ def evaluate(
         closing(make_environment(scenario, condition, period_s=period_s)) as env,
         limited_threads(1),  # The last bits must not depend on the cores.
         ProgressBar("evaluating", runs) as bar,
+        ExitStack() as stack,
     ):
         driver, policy_id = load_driver(policy, env, public_key)
-        results = drive_episodes(env, driver, seeds, condition, lambda _: bar.advance({}), spec)
+        if film:
+            recorders.append(stack.enter_context(filmed(env, film)))
+        if sink:
+            from trainer.view import drives_watched  # rerun takes a second to load
+
+            recorders.append(stack.enter_context(drives_watched(env, sink)))
+        results = drive_episodes(
+            env, driver, seeds, condition, lambda _: bar.advance({}), spec, recorders
+        )
     report = summarise(results, scenario, condition, policy_id, seed)
     return Evaluation({**report, "latency_spec": str(spec)}, results)
 
@@ -135,6 +163,27 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
     # One of `deploy policy` names its environment itself.
     name = str(named or manifest.training.get("environment") or manifest.task)
     return scenario_of(name), manifest.control_period_s
+
+
+class Loaded:
+    """A policy file that answers; ``policy`` is the edge runtime's."""
+
+    def __init__(self, path: str | PathLike[str], policy: Policy) -> None:
+        self.path, self.policy = path, policy
+
+    def __repr__(self) -> str:
+        return f"{self.path}: {self.policy.manifest.text}"
+
+    def act(self, observation: Any) -> NDArray[np.float32]:
+        """Return the action [n], in its range, for an observation as the environment gives it."""
+        manifest = self.policy.manifest
+        action = self.policy.act(arrays_of(manifest, observation))
+        return np.clip(action, *np.array([(row.low, row.high) for row in manifest.action], "f").T)
+
+
+def load(path: str | PathLike[str], public_key: str | PathLike[str] | None = None) -> Loaded:
+    """Load a policy file, signed or not; a known public key must verify its signature."""
+    return Loaded(path, load_policy(path, public_key, allow_unsigned=True))
 
 
 class TogetherDriver(Driver):
@@ -263,11 +312,16 @@ class Drive:
         self._felt: list[list[float | None]] = []
 
     def step(self, action: Action) -> None:
-        """Drive one control period."""
+        """Drive one control period, of which ``seen`` is the transition and its info."""
+        wanted = action
         if self.noise_std:
             disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
+        before = self.observation
         self.observation, reward, terminated, truncated, info = self.env.step(action)
+        self.seen = Transition(
+            before, action, reward, self.observation, terminated, truncated, overruled=wanted
+        ), info  # fmt: skip
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
         result.reward += finite("reward", reward)
@@ -313,6 +367,7 @@ def drive_episodes(
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
     latency: LatencySpec = NO_NETWORK,
+    recorders: Sequence[Record] = (),
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
@@ -328,6 +383,8 @@ def drive_episodes(
         driver.reset()
         while not drive.over:
             drive.step(act(drive.observation))
+            for record in recorders:
+                record(drive.seen[0], None, drive.seen[1])
         results.append(drive.result)
         on_episode(drive.result)
     return results

@@ -6,7 +6,7 @@ import argparse
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 class Export:
     """A policy file's bytes, and the largest difference of onnxruntime from torch."""
 
-    model: bytes
+    model: bytes = field(repr=False)
     policy_id: str
     max_difference: float
 

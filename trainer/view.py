@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.rerun import APPLIED, HUMAN, POLICY, flush, open_sink
+from bridge.rerun import APPLIED, HUMAN, POLICY, ViewerGone, flush, open_sink
 
 # isort: split
 import rerun as rr
@@ -28,7 +28,7 @@ from bridge.rerun.draw import Canvas
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.util import counted
 from trainer.environments import entries_of
-from trainer.human.guide import REASONS, Intervention
+from trainer.human.guide import REASONS, Intervention, Record
 from trainer.learner.replay import Transition
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -53,6 +53,7 @@ EPISODES = {
 DRIVERS = {"policy": POLICY, **dict.fromkeys(REASONS, HUMAN)}
 """The policy, or the human for one of these reasons -> the colour on the time line."""
 Entry = Callable[["TrainingLog"], None]
+Layout = Callable[[SeenScene | None], rrb.Blueprint]
 
 
 @contextmanager
@@ -85,6 +86,33 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
             run.recorders.remove(record)
             waiting.put(None)  # After what still waits
             thread.join()
+
+
+@contextmanager
+def drives_watched(env: Any, sink: str) -> Iterator[Record]:
+    """Show test episodes, every step of them; yield what takes a control period.
+
+    UserError where there is no viewer; one that goes later costs no result.
+    """
+    number, episode, total, opened = 0, 1, 0.0, False
+
+    def record(seen: Transition, _: Intervention | None, info: Mapping[str, Any]) -> None:
+        nonlocal number, episode, total
+        total += seen.reward
+        log.draw_step(number, seen, "policy", info["speed_mps"], **_shown(env, seen))
+        log.draw_return(total, f"# episode {episode}: {info.get('outcome', 'drives')}")
+        number += 1
+        if seen.terminal or seen.truncated:
+            episode, total = episode + 1, 0.0
+
+    try:
+        with open_sink(sink, "phil_hil_evaluation", lay_out_drives(None)) as recording:
+            log, opened = TrainingLog(recording, lay_out_drives), True
+            yield record
+    except ViewerGone as gone:
+        if not opened:
+            raise
+        print(f"{gone}; the drives are unharmed", file=sys.stderr)
 
 
 def draw_all(entries: Iterable[Entry], sink: str) -> None:
@@ -125,11 +153,19 @@ def lay_out(scene: SeenScene | None) -> rrb.Blueprint:
     return draw.two_columns(left, right, [1, 1], "step")
 
 
-class TrainingLog:
-    """Draws one run."""
+def lay_out_drives(scene: SeenScene | None) -> rrb.Blueprint:
+    """Lay out the views of test episodes, as `lay_out`."""
+    left = rrb.Vertical(draw.road_view(scene), draw.sees_view(), row_shares=[3, 1.4])
+    plots = {"action": "Action, from -1 to 1", "speed": "Speed, m/s", "return": "Return so far"}
+    right = rrb.Vertical(*(draw.plot_view(*plot) for plot in plots.items()))
+    return draw.two_columns(left, right, [3, 2], "step")
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
-        self._canvas, self._last_step = Canvas(recording, lay_out, {"driver": DRIVERS}), 0
+
+class TrainingLog:
+    """Draws one run, or test episodes."""
+
+    def __init__(self, recording: rr.RecordingStream, layout: Layout = lay_out) -> None:
+        self._canvas, self._last_step = Canvas(recording, layout, {"driver": DRIVERS}), 0
         self._canvas.style("action/policy", POLICY, ["policy"])
         self._canvas.style("action/applied", APPLIED, ["applied"])
 
@@ -159,6 +195,10 @@ class TrainingLog:
         if scene is not None or picture is not None:
             image = None if picture is None else rr.Image(picture, color_model="RGB")
             canvas.road(scene, image, DRIVERS.get(driver, HUMAN))
+
+    def draw_return(self, value: float, *status: str) -> None:
+        self._canvas.scalar("return/episode", value)
+        self._canvas.status(*status)
 
     def draw_episode(self, metrics: EpisodeMetrics) -> None:
         self._canvas.stand_at(self._last_step)

@@ -1,7 +1,7 @@
 """The human beside the policy: watches each action, takes over, and hands control back."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -78,6 +78,10 @@ def make_transition(
         human=intervention is not None, overruled=policy_action, penalised=penalised,
         foreseen=tuple(foreseen),
     )  # fmt: skip
+
+
+Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]
+"""Takes a control period and the info of its step, once it is stored: a view, or a recording."""
 
 
 class GuideGone(Exception):  # noqa: N818 (no error: it was asked for)

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from bridge import environments as bridge
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from trainer import evaluate, export, train
+from trainer import evaluate, export, load, train
 from trainer.__main__ import main
 from trainer.environments import (
     Adapted,
@@ -165,12 +165,19 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     settings: dict[str, float] = {"batch_size": 8, "warmup_steps": 20, "evaluation_runs": 1}
     settings |= {"late_from_s": 0.05, "late_to_s": 0.1}  # Only together do they hold.
     row, threads = f"{__name__}:PHIL", torch.get_num_threads()
-    run = train(ROVER, algorithm=row, episodes=4, settings=settings, out=tmp_path / "run")
-    assert sum(int(each["human_steps"]) for each in run.metrics) > 0
+    steps: list[Any] = []
+    run = train(
+        ROVER, algorithm=row, episodes=4, settings=settings, out=tmp_path / "run",
+        on_step=lambda seen, intervention, info: steps.append((seen.human, intervention)),
+    )  # fmt: skip
+    numbers = run.metrics
+    assert numbers.human_steps.sum() == sum(human for human, _ in steps) > 0
+    assert numbers.steps.sum() == len(steps) == numbers.total_steps.iloc[-1]
     assert torch.get_num_threads() == threads
     alone = evaluate(run, runs=2)
     made = export(run, tmp_path / "p.onnx")
     assert made.max_difference < 1e-5
+    assert max(len(repr(each)) for each in (run, alone, alone.episodes, made)) < 1000
     policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
     assert list(policy.manifest.observation) == ["camera", "far", "wheels"]
     with pytest.raises(UserError, match="is typed: give --scenario "):
@@ -183,6 +190,11 @@ def test_a_run_is_evaluated_exported_and_driven_in_the_environments_units(tmp_pa
     seen = env.reset(seed=3)[0]
     raw = policy.act({name: seen[name] for name in seen.dtype.names})
     np.testing.assert_allclose(outer(env.action_range, driver.act(seen)), raw, atol=1e-5)
+    ready = load(tmp_path / "p.onnx")
+    action = ready.act({name: seen[name].astype(float) for name in ("far", "wheels")} | {
+        "camera": seen["camera"]})  # fmt: skip
+    np.testing.assert_allclose(action, raw, atol=1e-5)
+    assert len(repr(ready)) < 300
 
 
 @pytest.mark.parametrize(("words", "period_s"), [([], 0.1), (["--period", "0.25"], 0.25)])
@@ -217,8 +229,8 @@ def test_a_simulator_that_lives_once_in_a_process_is_trained_evaluated_and_expor
 ):
     settings = {**SHORT, "evaluate_every_steps": every}
     run = train(odd("Single"), algorithm="per_td3", steps=40, settings=settings, out=tmp_path / "r")
-    assert {row["validation_success"] for row in run.metrics} == {"nan"}  # It does not say.
-    assert [row["validation_reward"] == "nan" for row in run.metrics] == [not every] * 2
+    assert run.metrics.validation_success.isna().all()  # It does not say.
+    assert run.metrics.validation_reward.isna().tolist() == [not every] * 2
     found = evaluate(run, runs=2)
     assert found.report["lateral_acceleration_mps2"] == {"mean": None, "std": None}
     assert [one.lateral_acceleration_mps2 for one in found.episodes] == [None, None]
@@ -251,13 +263,13 @@ def test_a_validation_only_because_a_run_ended_is_forgotten_when_it_goes_on(tmp_
     settings = {**SHORT, "evaluate_every_steps": 35}
     asked: Any = {"algorithm": "per_td3", "settings": settings, "steps": 60, "out": tmp_path}
     first = train(odd("Tells"), **asked, max_minutes=1e-9).metrics
-    assert [row["validation_success"] != "nan" for row in first] == [True]
+    assert first.validation_success.notna().tolist() == [True]
     rows = train(odd("Tells"), **asked, resume=True).metrics
-    due = [row["episode"] for row in rows if row["validation_success"] != "nan"]
-    assert "0" not in due
+    due = rows.episode[rows.validation_success.notna()]
+    assert 0 not in due.tolist()
     best = json.loads((tmp_path / "report.json").read_text())["validation"]["best_at_step"]
-    (row,) = (row for row in rows if row["total_steps"] == str(best))
-    assert int(row["episode"]) + 1 == load_torch(tmp_path / "best_actor.pt")["episode"]
+    (episode,) = rows.episode[rows.total_steps == best]
+    assert episode + 1 == load_torch(tmp_path / "best_actor.pt")["episode"]
 
 
 def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):

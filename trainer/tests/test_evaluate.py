@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import msgspec
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
+from hil_tests.testing.commands import refusal
 from trainer.__main__ import main
 from trainer.environments import make_environment
 from trainer.evaluation import (
@@ -22,6 +24,7 @@ from trainer.evaluation import (
     load_actor,
 )
 from trainer.learner.networks import Actor
+from trainer.tests.odd import odd
 from trainer.util import save_torch
 
 POLICY = Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx"
@@ -96,3 +99,32 @@ def test_an_evaluation_is_behind_its_network():
         for spec in ("none", "300ms")
     )
     assert (alone.actions[0], late.actions[0], late.actions[-1]) == ([1.0], [0.0], [1.0])
+
+
+def test_an_evaluation_is_filmed_shown_and_followed(tmp_path):
+    film, shown, steps = tmp_path / "films/drive.mp4", tmp_path / "drive.rrd", []
+    found = evaluate(
+        "constant:1", "left_turn", runs=2, seed=3, video=film, rerun=str(shown),
+        on_step=lambda seen, _, info: steps.append((seen, info)),
+    )  # fmt: skip
+    lengths = [episode.steps for episode in found.episodes]
+    assert len(steps) == sum(lengths)
+    assert [info["outcome"] for seen, info in steps if seen.terminal] == ["collision"] * 2
+    assert all((seen.action == 1).all() for seen, _ in steps)
+    with av.open(str(film)) as pictures:
+        assert pictures.streams.video[0].average_rate == 10
+        # Each end is held for a second.
+        assert len(list(pictures.decode(video=0))) == sum(lengths) + 2 * 9
+    assert shown.stat().st_size > 10_000
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["drive.mp4", "drive.rrd", "films"]
+    low, high = found.report["success_interval"]
+    assert low == found.success_rate == 0.0
+    assert 0.5 < high < 0.8
+
+
+def test_what_cannot_be_filmed_or_shown_is_refused_and_leaves_nothing(tmp_path, capsys):
+    other = ("--scenario", odd("Tells"), "--video")
+    for words in (("--video", "a.avi"), (*other, "a.mp4"), ("--rerun", "a.txt")):
+        placed = [str(tmp_path / word) if word.startswith("a.") else word for word in words]
+        refusal(capsys, "evaluate", "constant:1", "--runs", "1", *placed)
+    assert list(tmp_path.iterdir()) == []

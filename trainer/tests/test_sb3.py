@@ -3,6 +3,7 @@
 import base64
 import json
 import zipfile
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -28,7 +29,7 @@ OWN = b"(dS'features_extractor_class'\ncsomebody.else\nExtractor\ns."
 
 
 def behind_normaliser():
-    wrapped = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), clip_obs=1.5)
+    wrapped: Any = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), clip_obs=1.5)
     wrapped.obs_rms.mean, wrapped.obs_rms.var = (
         np.array([0.3, -0.2, 1.0]),
         np.array([0.1, 2.0, 9.0]),
@@ -77,8 +78,8 @@ def test_it_answers_as_the_library_behind_its_normalisation(
 @pytest.fixture(scope="module")
 def ppo(tmp_path_factory):
     path = tmp_path_factory.mktemp("ppo") / "m.zip"
-    kwargs = {**SMALL, "features_extractor_class": FlattenExtractor}
-    sizes = {"n_steps": 8, "batch_size": 8}
+    kwargs: Any = {**SMALL, "features_extractor_class": FlattenExtractor}
+    sizes: Any = {"n_steps": 8, "batch_size": 8}
     PPO("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs=kwargs, **sizes).save(path)
     return path
 
@@ -92,7 +93,7 @@ def changed(path, out, **values):
                     key: {":serialized:": base64.b64encode(value).decode()}
                     for key, value in values.items()
                 }
-                data = json.dumps(json.loads(data) | packed)
+                data = json.dumps(json.loads(data) | packed).encode()
             copy.writestr(name, data)
     return out
 

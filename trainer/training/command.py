@@ -20,6 +20,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import pandas as pd
+
 from bridge.outcomes import GOAL, Estimate
 from bridge.report import ProgressBar
 from bridge.rerun import check_sink
@@ -28,6 +30,7 @@ from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer import util
 from trainer.environments import scenario_of
 from trainer.evaluation import CHECKPOINT_FILE, located
+from trainer.human.guide import Record
 from trainer.person import FASTEST, HUMANS, PERSON, SLOWEST
 from trainer.training.config import (
     CONFIG_FILE,
@@ -45,6 +48,7 @@ from trainer.training.curves import write_learning_curve
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
+    metrics_table,
     read_metrics,
 )
 from trainer.training.run import TrainingRun, environment_of, make_parts
@@ -67,9 +71,9 @@ class Run:
         return str(self.directory)
 
     @property
-    def metrics(self) -> list[dict[str, str]]:
-        """The rows of ``metrics.csv``, one a training episode."""
-        return read_metrics(self.directory)
+    def metrics(self) -> pd.DataFrame:
+        """The numbers of ``metrics.csv`` and the outcome, a training episode a row."""
+        return metrics_table(self.directory)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -152,13 +156,14 @@ def train(
     host: str = "127.0.0.1",
     port: int = 0,
     speed: float = 1.0,
+    on_step: Record | None = None,
 ) -> Run:
     """Train a policy with human guidance, as ``python -m trainer train`` does.
 
     The arguments are that command's options, ``out`` a new directory in ``runs`` by default, and
-    ``settings`` what ``--set`` changes, name to value. Returns the run, for ``evaluate`` and
-    ``export``. Raises UserError: no such environment, algorithm, human or setting, or a directory
-    that is taken.
+    ``settings`` what ``--set`` changes, name to value. ``on_step(transition, intervention, info)``
+    is called after each control period. Returns the run, for ``evaluate`` and ``export``. Raises
+    UserError: no such environment, algorithm, human or setting, or a directory that is taken.
     """
     options_given = dict(locals())
     if isinstance(settings, Mapping):
@@ -192,7 +197,7 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     ):
         config = make_config(preset, values, env)
         person.resume = check_directory(run_dir, config, how.resume)
-        return _train(person, config, run_dir, env, how.rerun, util.deadline_s(how.max_minutes))
+        return _train(person, config, run_dir, env, how)
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -206,10 +211,9 @@ def _train(
     config: RunConfig,
     run_dir: Path,
     env: Any,
-    rerun: str | None,
-    end_s: float,
+    how: argparse.Namespace,
 ) -> Run:
-    sink = None if rerun is None else check_sink(rerun)
+    sink, end_s = how.rerun and check_sink(how.rerun), util.deadline_s(how.max_minutes)
     with ExitStack() as stack:
         training: TrainingRun
         if person.human in HUMANS:
@@ -222,6 +226,8 @@ def _train(
             parts = make_parts(config, run_dir, env)
             training = TrainingRun(config, run_dir, person.resume, parts)
             quit_training = partial(_quit, training)
+        if on_step := vars(how).get("on_step"):
+            training.recorders.append(on_step)
         extent = config.episodes, training.episode
         if config.steps:
             extent = config.steps, training.steps

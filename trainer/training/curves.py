@@ -13,7 +13,7 @@ from bridge.outcomes import mean_estimate
 from bridge.report import write_figure
 from edge_runtime.util import UserError, read_json
 from trainer.training.config import CONFIG_FILE, CURVE_FILE
-from trainer.training.metrics import METRICS_FILE, read_metrics
+from trainer.training.metrics import METRICS_FILE, metrics_table
 
 WINDOW = 20  # Episodes of the moving average
 POINTS = 100  # At which the runs of an algorithm are averaged
@@ -77,10 +77,9 @@ def _name(run_dir: Path) -> str:
 
 def _curves(run_dir: Path) -> pd.DataFrame:
     """Return a run's metrics as numbers, an episode a row; validation's are smoothed by nothing."""
-    rows = pd.DataFrame(read_metrics(run_dir))
-    if rows.empty:
+    curves = metrics_table(run_dir).drop(columns="outcome").astype(float)
+    if curves.empty:
         raise UserError(f"{run_dir} holds no metrics to draw")
-    curves = rows.drop(columns="outcome").astype(float)
     curves["human_share"] = curves.human_steps / curves.steps
     smooth = [name for name in PANELS if name not in (SUCCESS, RETURN)]
     curves[smooth] = curves[smooth].rolling(WINDOW, min_periods=1).mean()

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.outcomes import GOAL, Estimate, failed, settled, success_estimate
@@ -137,6 +138,12 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
             if [*row] != NAMES or values["episode"] != number:
                 raise ValueError(row)
     return rows
+
+
+def metrics_table(run_dir: Path) -> pd.DataFrame:
+    """Return a run's rows as numbers, and the outcome as text."""
+    kinds = {name: str if name == "outcome" else int if name in WHOLE else float for name in NAMES}
+    return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(kinds)
 
 
 def _number(name: str, text: str) -> float:

@@ -46,13 +46,14 @@ from trainer.human.guide import (
     HumanGuide,
     Intervention,
     PoorHands,
+    Record,
     make_transition,
     steps_held,
 )
 from trainer.learner import equations
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
-from trainer.learner.replay import Action, Observation, Transition
+from trainer.learner.replay import Action, Observation
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import read_demonstrations
@@ -196,8 +197,6 @@ class Validation(Trials):
 
 
 NOBODY = Guide()
-Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]
-"""Takes a control period and the info of its step, once it is stored: a view, or a recording."""
 
 
 @dataclass
