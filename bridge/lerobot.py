@@ -11,15 +11,15 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bridge.film import film, pixel_format
 from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
 from bridge.replay import RecordedDrive, key_of
@@ -31,10 +31,13 @@ from edge_runtime.util import UserError, counted
 from edge_runtime.wire import Command, State, is_foreign
 
 try:
+    import av
     import pyarrow as pa
     from pyarrow.parquet import write_table
 except ImportError:
-    raise UserError("export needs av and pyarrow: pip install 'phil-hil[lerobot]'") from None
+    raise UserError(
+        "export and films need av and pyarrow: pip install 'phil-hil[lerobot]'"
+    ) from None
 
 EXAMPLE = examples("python -m bridge export drive.mcap --format lerobot --out datasets/drive")
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -174,11 +177,37 @@ def _encode(
             sampled.append(pixels.copy())  # A view would keep the picture.
     info = {
         "video.height": height, "video.width": width, "video.codec": "h264",
-        "video.pix_fmt": pixel_format(height, width), "video.fps": int(rate),
+        "video.pix_fmt": _pixel_format(picture), "video.fps": int(rate),
         "video.channels": 3, "has_audio": False, "is_depth_map": False,
     }  # fmt: skip
     feature = {"dtype": "video", "shape": [height, width, 3], "info": info}
     return np.array(sampled), feature | {"names": ["height", "width", "channels"]}
+
+
+@contextmanager
+def film(
+    path: Path, rate: Fraction, options: dict[str, str] | None = None
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """Write an MP4 of ``rate`` pictures a second; yield what adds one, uint8 [height, width, 3]."""
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=rate, options=options)
+        numbers = count()
+
+        def add(picture: np.ndarray) -> None:
+            if not (number := next(numbers)):
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = _pixel_format(picture)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = number, 1 / rate
+            container.mux(stream.encode(frame))
+
+        yield add
+        container.mux(stream.encode(None))
+
+
+def _pixel_format(picture: np.ndarray) -> str:
+    """Return colours of half the size, as players like them; they need even sizes."""
+    return "yuv444p" if np.any(np.mod(picture.shape[:2], 2)) else "yuv420p"
 
 
 def _write_tables(

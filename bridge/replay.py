@@ -56,16 +56,10 @@ class Exchange(NamedTuple):
     sent_s: float  # When the answer was sent
 
 
-class Drawn(NamedTuple):
-    """What a picture shows of a state's two answers."""
-
-    recorded: Sequence[float]
-    replayed: Sequence[float]
-    distance: float
-
-
 Row = tuple[State, Command | None, Order | None]
 """A state with its recorded answer and the replayed one; no recorded answer of the policy: None."""
+Drawn = tuple[Sequence[float], Sequence[float], float]
+"""The recorded action, the replayed one, and how far they are apart."""
 EXAMPLE = examples("python -m bridge replay drive.mcap --policy my.onnx --public-key policy.pub")
 
 
@@ -281,7 +275,7 @@ def compare(
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
         distances.append(distance := _distance(recorded, order))
         if drawn is not None:
-            drawn.append(Drawn(recorded.action, order.action if order else (), distance))
+            drawn.append((recorded.action, order.action if order else (), distance))
         if distance > tolerance:
             place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)

@@ -20,7 +20,6 @@ from trainer.environments import make_environment
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.replay import ReplayBuffer, Transition
 from trainer.learner.td3 import TD3Learner
-from trainer.policy_file import real_observations
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
 from trainer.training.run import TrainingRun
@@ -84,7 +83,7 @@ def whole_update(batch_size: int) -> Callable[[], None]:
     guided run.
     """
     random, replay = np.random.default_rng(0), ReplayBuffer(TRANSITIONS)
-    frames = real_observations(make_environment("left_turn"), TRANSITIONS + 1)
+    frames = _real_observations(make_environment("left_turn"), TRANSITIONS + 1)
     for before, after in pairwise(frames):
         action, human = random.uniform(-1, 1, 1).astype(np.float32), bool(random.random() < 0.2)
         replay.add(Transition(before, action, random.normal(), after, False, human=human))
@@ -96,6 +95,20 @@ def whole_update(batch_size: int) -> Callable[[], None]:
         replay.update_priorities(batch.indices, losses.priorities)
 
     return update
+
+
+def _real_observations(env: Any, count: int) -> Any:
+    """Collect observations [count, ...] by driving with a pedal that wanders."""
+    random, pedal, over = np.random.default_rng(0), np.zeros(1, np.float32), True
+    seen: list[Any] = []
+    while len(seen) < count:
+        if over:
+            observation, _ = env.reset(seed=len(seen))
+        seen.append(observation)
+        pedal = np.clip(pedal + random.normal(0.0, 0.3, 1), -1, 1).astype(np.float32)
+        observation, _, *ends, _ = env.step(pedal)
+        over = any(ends)
+    return np.stack(seen)
 
 
 def steps_of(scenario: str) -> Callable[[], None]:

@@ -107,9 +107,14 @@ def entries_of(observations: NDArray[Any], plain: str) -> dict[str, NDArray[Any]
     return {name: observations[name] for name in names} if names else {plain: observations}
 
 
+def own_environment(env: Any) -> Any:
+    """Return the environment as its author made it: in its own units."""
+    return env if env.scenario in SCENARIOS else env.env
+
+
 def task_of(env: Any) -> Task:
     """Return what the environment asks of a policy file."""
-    return bridge.describe(env if env.scenario in SCENARIOS else env.env, env.control_period_s)
+    return bridge.describe(own_environment(env), env.control_period_s)
 
 
 def foresee(env: Any, observation: Any, action: Action, steps: int) -> list[Any]:

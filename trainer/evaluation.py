@@ -10,7 +10,7 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -36,7 +36,6 @@ from trainer.environments import (
     scenario_of,
     task_of,
 )
-from trainer.film import check_film, filmed
 from trainer.human import MODEL_FILE
 from trainer.human.guide import Driver, Record
 from trainer.human.model import load_human_model
@@ -109,7 +108,7 @@ def evaluate(
 
     ``policy`` may also be what ``train`` gave; ``scenario`` is by default what it was trained in,
     else the left turn. Episode i is reset with ``seed + i``. ``on_step(transition, None, info)`` is
-    called after each control period.
+    called after each control period; ``info`` has ``episode`` and ``step``, too.
 
     Raises UserError: no such policy, condition or number of runs; a policy of another environment;
     an environment that reports what is no number.
@@ -121,7 +120,9 @@ def evaluate(
     scenario = scenario or getattr(policy, "scenario", None)
     policy, spec = located(fspath(policy)), parse_spec(latency)
     sink = None if rerun is None else check_sink(rerun)
-    film = None if video is None else check_film(video)
+    film = check_writable(video)
+    if film and Path(film).suffix != ".mp4":
+        raise UserError(f"--video {video}: a film's name ends in .mp4")
     recorders: list[Record] = [] if on_step is None else [on_step]
     named, period_s = trained_in(policy, public_key)
     named = scenario or name_in_file(named, f"{policy} was trained in", "--scenario")
@@ -133,12 +134,12 @@ def evaluate(
         ExitStack() as stack,
     ):
         driver, policy_id = load_driver(policy, env, public_key)
-        if film:
-            recorders.append(stack.enter_context(filmed(env, film)))
-        if sink:
-            from trainer.view import drives_watched  # rerun takes a second to load
+        if film or sink:
+            from trainer import view  # rerun takes a second to load
 
-            recorders.append(stack.enter_context(drives_watched(env, sink)))
+            shown = [view.filmed(env, Path(film))] if film else []
+            shown += [view.drives_watched(env, sink)] if sink else []
+            recorders += map(stack.enter_context, shown)
         results = drive_episodes(
             env, driver, seeds, condition, lambda _: bar.advance({}), spec, recorders
         )
@@ -165,25 +166,24 @@ def trained_in(policy: str, public_key: str | None) -> tuple[str, float | None]:
     return scenario_of(name), manifest.control_period_s
 
 
-class Loaded:
-    """A policy file that answers; ``policy`` is the edge runtime's."""
+class Loaded(NamedTuple):
+    """A policy file that answers."""
 
-    def __init__(self, path: str | PathLike[str], policy: Policy) -> None:
-        self.path, self.policy = path, policy
+    policy: Policy  # The edge runtime's
 
     def __repr__(self) -> str:
-        return f"{self.path}: {self.policy.manifest.text}"
+        return f"{self.policy.policy_id[:12]}: {self.policy.manifest.text}"
 
     def act(self, observation: Any) -> NDArray[np.float32]:
         """Return the action [n], in its range, for an observation as the environment gives it."""
         manifest = self.policy.manifest
-        action = self.policy.act(arrays_of(manifest, observation))
-        return np.clip(action, *np.array([(row.low, row.high) for row in manifest.action], "f").T)
+        ends = np.array([(row.low, row.high) for row in manifest.action], np.float32).T
+        return np.clip(self.policy.act(arrays_of(manifest, observation)), *ends)
 
 
 def load(path: str | PathLike[str], public_key: str | PathLike[str] | None = None) -> Loaded:
     """Load a policy file, signed or not; a known public key must verify its signature."""
-    return Loaded(path, load_policy(path, public_key, allow_unsigned=True))
+    return Loaded(load_policy(path, public_key, allow_unsigned=True))
 
 
 class TogetherDriver(Driver):
@@ -312,16 +312,16 @@ class Drive:
         self._felt: list[list[float | None]] = []
 
     def step(self, action: Action) -> None:
-        """Drive one control period, of which ``seen`` is the transition and its info."""
+        """Drive one control period: ``seen``, and the step's ``info``."""
         wanted = action
         if self.noise_std:
             disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
         before = self.observation
         self.observation, reward, terminated, truncated, info = self.env.step(action)
-        self.seen = Transition(
-            before, action, reward, self.observation, terminated, truncated, overruled=wanted
-        ), info  # fmt: skip
+        ends = terminated, truncated
+        self.seen = Transition(before, action, reward, self.observation, *ends, overruled=wanted)
+        self.info = info
         result, self.over = self.result, terminated or truncated
         result.actions.append([float(a) for a in action])
         result.reward += finite("reward", reward)
@@ -378,13 +378,14 @@ def drive_episodes(
     if latency != NO_NETWORK:
         env = DelayedVehicle(env, latency)
         act = env.behind(driver.act)
-    for seed in seeds:
+    for episode, seed in enumerate(seeds):
         drive = Drive(env, seed, CONDITIONS[condition].noise_std)
         driver.reset()
         while not drive.over:
             drive.step(act(drive.observation))
             for record in recorders:
-                record(drive.seen[0], None, drive.seen[1])
+                place = {"episode": episode, "step": len(drive.result.actions)}
+                record(drive.seen, None, {**drive.info, **place})
         results.append(drive.result)
         on_episode(drive.result)
     return results

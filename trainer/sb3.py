@@ -15,8 +15,6 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge import policy_file
 from bridge.environments import Environment
 from bridge.policy_file import Model
@@ -99,9 +97,8 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
         policy = kind(data["observation_space"], done, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
         network = LibraryPolicy(policy.eval(), normaliser, [*task.observation])
-        empty = {n: np.zeros((1, *each.shape), each.dtype) for n, each in task.observation.items()}
         algorithm = kind.__module__.split(".")[1].replace("common", "ppo")
-        return Model(to_onnx(network, empty), algorithm, network.act)
+        return Model(to_onnx(network, task), algorithm, network.act)
 
 
 def read_normaliser(file: str) -> Any:

@@ -1,22 +1,28 @@
-"""Show a training in rerun as it goes on (``train --rerun``).
+"""Show a training in rerun as it goes on (``train --rerun``), and test episodes, or film them.
 
 The training loop only hands each step over, and never waits. A thread of its own draws, because
 calls of rerun take time.
 """
 
 import math
+import os
 import queue
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from fractions import Fraction
+from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
-from bridge.rerun import APPLIED, HUMAN, POLICY, ViewerGone, flush, open_sink
+from bridge.environments import draws
+from bridge.rerun import APPLIED, HUMAN, POLICY, flush, open_sink
 
 # isort: split
 import rerun as rr
@@ -26,13 +32,16 @@ from bridge.messages import Pace, SeenScene, read_scene
 from bridge.rerun import draw
 from bridge.rerun.draw import Canvas
 from edge_runtime.cli import sigterm_as_interrupt
-from edge_runtime.util import counted
+from edge_runtime.files import make_directory
+from edge_runtime.util import UserError, counted
 from trainer.environments import entries_of
 from trainer.human.guide import REASONS, Intervention, Record
 from trainer.learner.replay import Transition
+from trainer.scenarios import SCENARIOS
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 
+HELD_S = 1.0  # An episode's last picture in a film
 MOST_WAITING = 5000
 """Entries, of which ten a second have pictures. A view that is slower loses some; the loop none."""
 EPISODES = {
@@ -90,29 +99,43 @@ def watched(run: TrainingRun, sink: str) -> Iterator[Callable[[EpisodeMetrics], 
 
 @contextmanager
 def drives_watched(env: Any, sink: str) -> Iterator[Record]:
-    """Show test episodes, every step of them; yield what takes a control period.
+    """Show test episodes, every step of them; yield what takes a control period."""
+    numbers = count()
 
-    UserError where there is no viewer; one that goes later costs no result.
-    """
-    number, episode, total, opened = 0, 1, 0.0, False
+    def record(seen: Transition, _: Any, info: Mapping[str, Any]) -> None:
+        log.draw_step(next(numbers), seen, "policy", info["speed_mps"], **_shown(env, seen))
+        log.canvas.scalar("reward/step", seen.reward)
+        log.canvas.status(f"# episode {info['episode'] + 1}: {info.get('outcome', 'drives')}")
 
-    def record(seen: Transition, _: Intervention | None, info: Mapping[str, Any]) -> None:
-        nonlocal number, episode, total
-        total += seen.reward
-        log.draw_step(number, seen, "policy", info["speed_mps"], **_shown(env, seen))
-        log.draw_return(total, f"# episode {episode}: {info.get('outcome', 'drives')}")
-        number += 1
-        if seen.terminal or seen.truncated:
-            episode, total = episode + 1, 0.0
+    with open_sink(sink, "phil_hil_evaluation", lay_out_drives(None)) as recording:
+        log = TrainingLog(recording, lay_out_drives)
+        yield record
+
+
+@contextmanager
+def filmed(env: Any, target: Path) -> Iterator[Record]:
+    """Film test episodes; yield what takes a control period. A film appears when it is complete."""
+    from bridge.lerobot import film  # It needs an extra
+
+    if env.scenario not in SCENARIOS and not draws(env.env):
+        raise UserError(f"{env.scenario} draws no rgb_array that could be filmed")
+    make_directory(target.parent)
+    part, period_s = target.with_name(f".{os.getpid()}.{target.name}"), env.control_period_s
+
+    def record(seen: Transition, _: Any, info: Mapping[str, Any]) -> None:
+        picture, at_s = Image.fromarray(np.asarray(env.render())), info["step"] * period_s
+        said = f"episode {info['episode'] + 1}, {at_s:.1f} s {info.get('outcome', '')}"
+        look: Any = {"font_size": 18, "stroke_width": 2, "stroke_fill": "white"}
+        ImageDraw.Draw(picture).text((8, 6), said, "black", **look)
+        for _ in range(round(HELD_S / period_s) if seen.terminal or seen.truncated else 1):
+            add(np.asarray(picture))
 
     try:
-        with open_sink(sink, "phil_hil_evaluation", lay_out_drives(None)) as recording:
-            log, opened = TrainingLog(recording, lay_out_drives), True
+        with film(part, Fraction(1 / period_s).limit_denominator(1000)) as add:
             yield record
-    except ViewerGone as gone:
-        if not opened:
-            raise
-        print(f"{gone}; the drives are unharmed", file=sys.stderr)
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def draw_all(entries: Iterable[Entry], sink: str) -> None:
@@ -156,7 +179,7 @@ def lay_out(scene: SeenScene | None) -> rrb.Blueprint:
 def lay_out_drives(scene: SeenScene | None) -> rrb.Blueprint:
     """Lay out the views of test episodes, as `lay_out`."""
     left = rrb.Vertical(draw.road_view(scene), draw.sees_view(), row_shares=[3, 1.4])
-    plots = {"action": "Action, from -1 to 1", "speed": "Speed, m/s", "return": "Return so far"}
+    plots = {"action": "Action, from -1 to 1", "speed": "Speed, m/s", "reward": "Reward of a step"}
     right = rrb.Vertical(*(draw.plot_view(*plot) for plot in plots.items()))
     return draw.two_columns(left, right, [3, 2], "step")
 
@@ -165,9 +188,9 @@ class TrainingLog:
     """Draws one run, or test episodes."""
 
     def __init__(self, recording: rr.RecordingStream, layout: Layout = lay_out) -> None:
-        self._canvas, self._last_step = Canvas(recording, layout, {"driver": DRIVERS}), 0
-        self._canvas.style("action/policy", POLICY, ["policy"])
-        self._canvas.style("action/applied", APPLIED, ["applied"])
+        self.canvas, self._last_step = Canvas(recording, layout, {"driver": DRIVERS}), 0
+        self.canvas.style("action/policy", POLICY, ["policy"])
+        self.canvas.style("action/applied", APPLIED, ["applied"])
 
     def draw_step(
         self,
@@ -183,7 +206,7 @@ class TrainingLog:
 
         ``number``: since the run began; ``driver``: "policy", or why the human acted.
         """
-        canvas, self._last_step = self._canvas, number
+        canvas, self._last_step = self.canvas, number
         canvas.stand_at(number)
         assert seen.overruled is not None  # Of a policy that learns
         canvas.scalar("action/policy", *seen.overruled)
@@ -196,20 +219,16 @@ class TrainingLog:
             image = None if picture is None else rr.Image(picture, color_model="RGB")
             canvas.road(scene, image, DRIVERS.get(driver, HUMAN))
 
-    def draw_return(self, value: float, *status: str) -> None:
-        self._canvas.scalar("return/episode", value)
-        self._canvas.status(*status)
-
     def draw_episode(self, metrics: EpisodeMetrics) -> None:
-        self._canvas.stand_at(self._last_step)
+        self.canvas.stand_at(self._last_step)
         for plot, (_, fields) in EPISODES.items():
             for name in fields:
                 if not math.isnan(value := getattr(metrics, name)):
-                    self._canvas.scalar(f"{plot}/{name}", value)
-        self._canvas.status(
+                    self.canvas.scalar(f"{plot}/{name}", value)
+        self.canvas.status(
             f"# episode {metrics.episode + 1}: {metrics.outcome}",
             f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
             f"{counted(metrics.interventions, 'intervention')}, "
             f"{counted(metrics.human_steps, 'step')} the human's",
         )
-        flush(self._canvas.recording)  # Only a flush notices that a viewer has gone.
+        flush(self.canvas.recording)  # Only a flush notices that a viewer has gone.
