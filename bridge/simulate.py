@@ -90,9 +90,7 @@ def run(asked: Namespace) -> int:
     write_json_out(asked.out, found)
     print(report.summary_line(found))
     if found["interrupted"]:
-        print(
-            f"interrupted after {found['episodes']} of {asked.episodes} episodes", file=sys.stderr
-        )
+        print(f"interrupted; it was to be {asked.episodes} episodes", file=sys.stderr)
     return cli.INTERRUPTED if found["interrupted"] else 0
 
 

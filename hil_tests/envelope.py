@@ -164,7 +164,7 @@ class Search:
 
 
 def find_edges(search: Search) -> dict[str, dict[str, Any]]:
-    """Find for each axis ``limit``, ``breaks_at`` and their networks; so for all together.
+    """Return for each axis ``limit``, ``breaks_at`` and their networks; so for all together.
 
     Together, the values are shares of the limits, with the jitter whose limit is smaller. Raises
     UserError where the promise is not kept without a network.
@@ -205,6 +205,8 @@ def run(arguments: argparse.Namespace) -> int:
             return [result.outcome == GOAL for result in drivers.drive(spec, seeds)]
 
         def keep(complete: bool = False) -> None:
+            if len(search.tried) < 2:  # It may fail without a network.
+                return
             found = {"complete": complete, "edges": search.edges, "tried": search.tried}
             command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
             write_json_out(out, {**about, **found, "command": command})
@@ -218,7 +220,7 @@ def run(arguments: argparse.Namespace) -> int:
             find_edges(search)
             keep(complete=True)
         finally:
-            if search.tried:
+            if len(search.tried) > 1:
                 write_figure(draw_axes(_swept(about, search)), Path(out).with_suffix(".png"))
     for name, edge in search.edges.items():
         print(f"{name} holds up to {edge['limit']:g}, breaks at {edge['breaks_at']}")
@@ -289,11 +291,9 @@ def _swept(about: Mapping[str, Any], search: Search) -> dict[str, Any]:
         title, _, unit = name.rpartition("_")
         edge = search.edges.get(name, {})
         found = [edge[end] for end in ("limit", "breaks_at") if edge.get(end) is not None]
-        points = sorted(alone.items())
-        values, specs = map(list, zip(*points, strict=True))
-        axes.append(
-            {"title": title, "unit": unit, "values": values, "specs": specs, "edges": found}
-        )
+        values, specs = map(list, zip(*sorted(alone.items()), strict=True))
+        named = {"title": title.replace("_", " "), "unit": unit, "edges": found}
+        axes.append({**named, "values": values, "specs": specs})
     return {
         **about, "scenario": about["env"], "axes": axes, "runs": f"{min(drives)} to {max(drives)}",
         "budget": {"target_success": about["promised_success"]},

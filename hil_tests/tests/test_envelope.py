@@ -158,3 +158,12 @@ def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch,
 def test_bursts_come_on_top_of_the_loss():
     way = network({"loss_percent": 10.0, "burst_messages": 3.0}).up
     assert way.bad_share == pytest.approx(BURST_PERCENT / 100)
+
+
+def test_what_fails_without_a_network_leaves_no_file(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(envelope, "Drivers", Drives)
+    monkeypatch.setattr(envelope, "GOAL", "never")
+    Drives.most = 10**6
+    refused = call(capsys, "envelope", "--out", tmp_path / "e.json", package="hil_tests")
+    assert refused[0] == 2
+    assert list(tmp_path.iterdir()) == []
