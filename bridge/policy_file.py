@@ -193,8 +193,8 @@ def try_policy(
     if not act and max(answers) <= 1.0 + TOLERANCE < widest:
         warn("all its answers lie within -1 to 1, and the range is wider: does it scale them?")
     if (reach := np.median(reaches)) > BEARABLE:
-        why = f"the first layer gets {reach:.0f}, and of a trained network about 1"
-        warn(f"{why}: does it normalise observations as its training did?")
+        why = f"the network's first layer reaches {reach:.0f}, and trained ones stay near 1"
+        warn(f"{why}: does it normalise observations as in its training?")
     return max(apart)
 
 

@@ -1,7 +1,7 @@
 """``python -m deploy policy``, which also takes the model.zip of Stable-Baselines3.
 
-The library pickles, and a pickle is a program. Here it may only make what `KNOWN` lists; all else
-becomes an object that does nothing.
+The library pickles, and a pickle is a program. Here it can call only what `KNOWN` lists; anything
+else that it names becomes an object that does nothing.
 """
 
 from __future__ import annotations
