@@ -86,7 +86,7 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
         raise UserError(f"{path} acts in {data['action_space']}, {task.task} in {done}")
     if arguments.normalise:
         normaliser = read_normaliser(arguments.normalise)
-    elif is_ppo and data["_last_original_obs"]:  # The others always have one.
+    elif is_ppo and data.get("_last_original_obs"):  # The others always have one.
         raise UserError(f"{path} was trained behind a VecNormalize: add --normalise")
 
     from trainer.policy_file import LibraryPolicy, to_onnx  # It loads torch
