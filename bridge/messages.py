@@ -20,6 +20,8 @@ from edge_runtime.util import UserError
 
 MOST = 1e12  # Of metres, seconds, milliseconds and all else that is drawn
 MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
+SHADOW = "shadow"
+"""Topic of what a policy in the shadow would have commanded: of recordings, never on the wire."""
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
 
@@ -114,6 +116,14 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     ridden: int = 0
 
 
+Place = tuple[str, int, int]  # Session, episode, step
+
+
+def place_of(message: wire.State | wire.Command) -> Place:
+    """Name a state; a command has the place of the state that it answers."""
+    return message.session, message.episode, message.step
+
+
 def plain(value: Any) -> Any:
     """Return NumPy's arrays and numbers as Python's, for msgspec to encode."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
@@ -171,6 +181,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "feedback": wire.decode_feedback,
     "health": wire.decode_health,
     "scene": decode_scene,
+    SHADOW: wire.decode_command,
 }
 """Topic -> decoder, which returns a ``Rejection`` for an invalid message."""
 

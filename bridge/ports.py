@@ -23,9 +23,16 @@ import msgspec
 import zenoh
 
 from bridge.environments import picture_of, say_once, scene_of
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
+from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
-from bridge.recording import RecordingWriter, new_recording
+from bridge.recording import (
+    Recording,
+    RecordingWriter,
+    choose_vehicle,
+    growing_recording,
+    heard_of,
+    new_recording,
+)
 from edge_runtime import cli
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
@@ -38,7 +45,6 @@ from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
 RETRY_S = 0.1
-FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
@@ -230,7 +236,8 @@ def open_listener(
     may not listen: from here that would look the same.
     """
     if tls is not None:
-        access.check_name(tls.name, access.VIEWER)
+        own = [access.common_name(access.SHADOW, vehicle_id)] if vehicle_id != ANY_VEHICLE else []
+        access.check_name(tls.name, access.VIEWER, *own)
     give_up_s = time.monotonic() + wait_s
     with contextlib.ExitStack() as stack:
         session = stack.enter_context(closing(connect_client(connect, wait_s, tls)))
@@ -239,7 +246,7 @@ def open_listener(
             listener.end_s = tls.expires.timestamp()
         # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
         hear = zenoh.handlers.Callback(listener.hear, indirect=False)
-        for topic in DECODERS:
+        for topic in DECODERS.keys() - {SHADOW}:
             stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
         declare = session.liveliness().declare_subscriber
         for topic in TOKEN_TOPICS:
@@ -251,6 +258,33 @@ def open_listener(
         yield listener
         if tls is not None:
             tls.require_valid(time.time())
+
+
+@contextlib.contextmanager
+def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
+    """Yield one vehicle's messages: of the file ``arguments.recording``, or on the wire until its
+    simulator goes; None where none comes for a moment.
+    """
+    vehicle_id, where = arguments.vehicle_id, arguments.connect
+    if arguments.recording:
+        file = Recording(Path(arguments.recording))
+        yield _to_its_end(file, choose_vehicle(file, vehicle_id))
+        return
+    tls, vehicle_id = tls_for(arguments.tls, where), vehicle_id or DEFAULT_VEHICLE_ID
+    with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
+        yield listener.until_gone()
+        _say_dropped(listener)
+
+
+def _to_its_end(file: Recording, vehicle_id: str) -> Iterator[Heard]:
+    yield from heard_of(file, vehicle_id)
+    file.say_trouble()
+
+
+def _say_dropped(listener: WireListener) -> None:
+    if listener.dropped:
+        dropped = counted(listener.dropped, "message")
+        print(f"{dropped} came faster than they could be taken", file=sys.stderr)
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
@@ -349,38 +383,23 @@ def _add_record_arguments(parser: Any) -> None:
 def _run_record(arguments: Any) -> int:
     """Record until the simulators go, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
-    path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
+    vehicle_id = arguments.vehicle_id or ANY_VEHICLE
     with (
         cli.sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
-        closing(RecordingWriter(path)) as writer,
+        # A signal is the ordinary way to end a recording: it must not cut a message in two.
+        cli.quit_on_signals(listener.stop),
+        growing_recording(arguments.out) as writer,
     ):
-        print(f"recording {path}", flush=True)
-        try:
-            # A signal is the ordinary way to end a recording: it must not cut a message in two.
-            with cli.quit_on_signals(listener.stop):
-                _listen(listener, writer, arguments.linger_s)
-                writer.finish()
-        except OSError as error:
-            stopped = f"error: recording {path} stopped: {error.strerror}"
-            print(f"{stopped}; it holds what was written before", file=sys.stderr)
-            return NOT_WRITTEN
-    if listener.dropped:
-        dropped = counted(listener.dropped, "message")
-        print(f"{dropped} came faster than they could be written", file=sys.stderr)
-    print(f"wrote {path}: {counted(writer.messages, 'message')}")
-    return 0
+        _listen(listener, writer, arguments.linger_s)
+    _say_dropped(listener)
+    return NOT_WRITTEN if writer.is_cut else 0
 
 
 def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:
-    flush_s = time.monotonic() + FLUSH_S
-    for heard in listener.until_gone(linger_s):
-        if heard is not None:
-            # Under a flood the copies for viewers are the first to go.
-            writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
-        if time.monotonic() >= flush_s:
-            writer.flush()
-            flush_s = time.monotonic() + FLUSH_S
+    for heard in filter(None, listener.until_gone(linger_s)):
+        # Under a flood the copies for viewers are the first to go.
+        writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
 
 
 RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"

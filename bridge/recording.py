@@ -11,6 +11,7 @@ import contextlib
 import functools
 import struct
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,7 +24,7 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, decode, images_of
+from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, decode, images_of
 from edge_runtime import __version__, wire
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
@@ -32,6 +33,7 @@ from edge_runtime.util import UserError, counted, open_regular
 WIRE_ENCODING = "msgpack"
 ENCODING, SCHEMA_ENCODING = "json", "jsonschema"  # Of the copies for viewers
 CHUNK_BYTES = 1 << 20
+FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
 MAX_RECORD_BYTES = 8 << 20
 """Of a record, and of a chunk when it is unpacked; ours hold little more than 5 MiB."""
 TORN = (
@@ -136,9 +138,9 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
 
 
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
-    """Yield a vehicle's messages, heard and decoded; the invalid are left out."""
+    """Yield a drive's messages, heard and decoded; the invalid, and a shadow's, are left out."""
     for heard in heard_of(recording, vehicle_id):
-        if heard.topic in DECODERS:
+        if heard.topic in DECODERS and heard.topic != SHADOW:
             message = decode(heard)
             if not isinstance(message, wire.Rejection):
                 yield heard, message
@@ -157,6 +159,8 @@ class RecordingWriter:
 
     def __init__(self, path: Path) -> None:
         self.messages = 0
+        self.is_cut = False  # The disk took no more
+        self._flush_s = 0.0  # When the chunk ends
         self._copies = ViewerCopies(self._add_copy)
         self._file, self._mcap = new_recording_at(path)
         # Each is registered once; with its schema, as a picture may have the name of a message.
@@ -173,10 +177,13 @@ class RecordingWriter:
             self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
         if with_view:
             self._copies.write(heard)
+        if time.monotonic() >= self._flush_s:
+            self.flush()
 
     def flush(self) -> None:
         """End the chunk: a kill does not lose what was written before."""
         self._mcap.flush()
+        self._flush_s = time.monotonic() + FLUSH_S
 
     def finish(self) -> None:
         """Write the index: the recording is whole."""
@@ -225,6 +232,28 @@ def whole_recording(path: str | Path) -> Iterator[RecordingWriter]:
         except BaseException:
             path.unlink()
             raise
+
+
+@contextlib.contextmanager
+def growing_recording(path: str | Path) -> Iterator[RecordingWriter]:
+    """Write a recording that keeps what it holds, unless a UserError ends it.
+
+    Where the disk takes no more it says so, leaves the block and sets ``is_cut``.
+    """
+    with contextlib.closing(RecordingWriter(Path(path))) as writer:
+        print(f"recording {path}", flush=True)
+        try:
+            yield writer
+            writer.finish()
+        except UserError:
+            Path(path).unlink()
+            raise
+        except OSError as error:
+            writer.is_cut = True
+            stopped = f"error: recording {path} stopped: {error.strerror}"
+            print(f"{stopped}; it holds what was written before", file=sys.stderr)
+        else:
+            print(f"wrote {path}: {counted(writer.messages, 'message')}")
 
 
 def new_recording(path: str | Path) -> str:

@@ -41,6 +41,7 @@ POLICY: Colour = (40, 120, 230)
 HUMAN: Colour = (60, 170, 90)
 RETURNING: Colour = (185, 140, 255)
 """The person has let go, and the action is on its way back to the policy's."""
+SHADOW: Colour = (20, 160, 150)  # A policy beside the one that drives
 APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
@@ -86,9 +87,17 @@ def view(parser: argparse.ArgumentParser) -> None:
 
     text = "show this recording of bridge record, instead of listening"
     parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
+    add_view(parser, " (the default)")
+    add_options(parser, "--connect", "--tls", "--wait-s")
+    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)
+
+
+def add_view(parser: argparse.ArgumentParser, default: str = "") -> None:
+    """Add the options that say where a drive is shown."""
     add = parser.add_mutually_exclusive_group().add_argument
     kind: Any = {"dest": "sink", "action": "store_const"}
-    add("--spawn", **kind, const=SPAWN, help="open a rerun window (the default)")
+    add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")
     add("--serve", **kind, const=SERVE, help="serve a web page on this machine's loopback only")
     add("--save", dest="sink", metavar="F.rrd", help="write a recording instead of showing it")
     text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
@@ -96,9 +105,15 @@ def view(parser: argparse.ArgumentParser) -> None:
     add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
     text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-    add_options(parser, "--connect", "--tls", "--wait-s")
-    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    add_options(parser, "--vehicle-id", default=None, help=text)
+
+
+def check_view(arguments: argparse.Namespace) -> str:
+    """Return the sink of rerun that the options of ``add_view`` name, or "" for Foxglove."""
+    if not arguments.foxglove:
+        return check_sink(arguments.sink, arguments.port)
+    if arguments.port or arguments.recording:
+        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
+    return ""
 
 
 def has_display() -> bool:

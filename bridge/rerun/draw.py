@@ -12,7 +12,6 @@ import contextlib
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,15 +21,14 @@ import rerun.blueprint as rrb
 from bridge import messages
 from bridge import rerun as shown
 from bridge.inbound import BRAKE_PERIODS
-from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene, place_of
 from bridge.rerun import Colour
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link import link_words
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.util import UserError, counted
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
+from edge_runtime.wire import DRIVE, Command, Feedback, Health, State
 
 RED, GREY = (220, 50, 50), (120, 124, 130)
 MARGIN_M = 8.0  # Ground shown beyond the path
@@ -62,6 +60,10 @@ class Canvas:
             names, colours = list(of), list(of.values())
             look = rr.StateConfiguration(values=names, labels=names, colors=colours)
             self.log(path, look, static=True)
+
+    def lay_out_anew(self) -> None:
+        """Send the layout again with the next road."""
+        self._ground = object()
 
     def stand_at(self, step: int, **seconds: float) -> None:
         """Set the time of all that is drawn next: the step, and seconds by timeline."""
@@ -213,17 +215,23 @@ PLOTS = (
     ("rejected", "Messages rejected so far, by either side"),
 )
 """From top to bottom."""
+APART = ("shadow", "Shadow's action less the command's")
 ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
+SHADOWED = {"action/shadow": shown.SHADOW, "shadow/apart": shown.SHADOW}
 NO_COMMAND, NO_REASON = "no command", "-"
 MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
-STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
+STATES = {
+    "mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": {DRIVE: shown.SHADOW},
+}  # fmt: skip
 
 
-def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
-    """Lay out the views; ``pictures``: whether the policy sees any."""
+def lay_out(scene: SeenScene | None, pictures: bool = True, shadow: bool = False) -> rrb.Blueprint:
+    """Lay out the views; ``pictures``: whether the policy sees any; ``shadow``: whether one did."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
     mode = lanes_view("mode", "Mode, and why it does not drive")
-    right = rrb.Vertical(mode, *(plot_view(*plot) for plot in PLOTS))
+    plots = [plot_view(*plot) for plot in (APART,) * shadow + PLOTS]
+    shares = [1.6 if shadow else 1.0, *[1.0] * len(plots)]  # A lane more
+    right = rrb.Vertical(mode, *plots, row_shares=shares)
     return two_columns(left, right, [3, 2], "sim_time")
 
 
@@ -248,6 +256,7 @@ class WireLog:
         self._mode = self._reason = ""
         self._heard_command_ns = self._plan_periods = 0
         self._health: Health | None = None
+        self._shadow: Command | None = None  # The newest answer of a policy in the shadow
 
     def write(self, heard: Heard) -> None:
         """Draw one message as it came; a token shows as silence."""
@@ -284,6 +293,21 @@ class WireLog:
         self._canvas.scalar("action/asked", *command.action)
         self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
         self._tell(command.mode, command.reason)
+        shadow, place = self._shadow, place_of(command)
+        if shadow and place_of(shadow) == place and shadow.mode == command.mode == DRIVE:
+            both = zip(shadow.action, command.action, strict=False)
+            self._canvas.scalar("shadow/apart", *(ours - theirs for ours, theirs in both))
+
+    def write_shadow(self, command: Command, _arrived_ns: int) -> None:
+        """Draw what a policy in the shadow would have commanded."""
+        if self._shadow is None:
+            self._canvas.lay_out_anew()
+            self._style(SHADOWED)
+        self._shadow = command
+        self._stand_at(command.session, command.episode, command.step)
+        self._canvas.scalar("action/shadow", *command.action)
+        self._canvas.scalar("latency/shadow", command.inference_ns * 1e-6)
+        self._canvas.state("mode/shadow", command.reason or command.mode)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         self._canvas.scalar("action/achieved", *feedback.action)
@@ -300,9 +324,7 @@ class WireLog:
         if scene.task is not None and scene.task != self._task:
             self._task, self._layout = scene.task, Layout(scene.task)
             self._period_s = scene.task.control_period_s
-            for path, colour in ACTIONS.items():
-                names = [f"{path[7:]} {action.name}" for action in scene.task.action]
-                self._canvas.style(path, colour, names)
+            self._style(ACTIONS)
         session = scene.origin.session if scene.origin else self._session
         self._stand_at(session, scene.episode, scene.step)
         if scene.round_trip_ms is not None:
@@ -315,9 +337,17 @@ class WireLog:
             road = None if scene.picture else scene
             self._canvas.road(road, picture, MODES[self._mode or NO_COMMAND])
 
+    def _style(self, paths: Mapping[str, Colour]) -> None:
+        """Name the lines at these paths after the actions, once those are known."""
+        actions = self._task.action if self._task else ()
+        for path, colour in paths.items() if actions else ():
+            names = [f"{path.rpartition('/')[2]} {action.name}" for action in actions]
+            self._canvas.style(path, colour, names)
+
     def _lay_out(self, scene: SeenScene | None) -> rrb.Blueprint:
         entries = self._task.observation.values() if self._task else ()
-        return lay_out(scene, not entries or any(map(messages.is_picture, entries)))
+        pictures = not entries or any(map(messages.is_picture, entries))
+        return lay_out(scene, pictures, self._shadow is not None)
 
     def _stand_at(self, session: str, episode: int, step: int) -> None:
         step += self._starts.setdefault((session, episode), self._end_step)
@@ -349,57 +379,38 @@ class WireLog:
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, or somebody interrupts."""
-    if arguments.foxglove and (arguments.port or arguments.recording):
-        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
-    sink, opened = "", _foxglove
-    if not arguments.foxglove:
-        sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
-    source = _recorded if arguments.recording else _live
+    from bridge.ports import open_source  # It loads zenoh: a training goes without.
+
+    sink = shown.check_view(arguments)
     with (
         sigterm_as_interrupt(),
-        source(arguments) as all_heard,
-        opened(arguments, sink) as show,
+        open_source(arguments) as all_heard,
+        open_view(arguments, sink) as show,
     ):
         try:
-            for heard in all_heard:
+            for heard in filter(None, all_heard):
                 show(heard)
-            if arguments.recording and sink == shown.SERVE:
-                from bridge.ports import wait_to_be_told  # It loads zenoh: a training goes without.
-
-                print("all of it is there; ^C ends", flush=True)
-                wait_to_be_told()
+            keep_page(arguments)
         except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
             if arguments.recording and sink != shown.SERVE:
                 raise
-    if sink.endswith(shown.SUFFIX):
-        print(f"wrote {sink}")
     return 0
 
 
-@contextlib.contextmanager
-def _live(arguments: Any) -> Iterator[Iterator[Heard]]:
-    from bridge.ports import open_listener
-    from edge_runtime.transport import tls_for
+def keep_page(arguments: Any) -> None:
+    """Serve the page of a whole recording until KeyboardInterrupt."""
+    if arguments.recording and arguments.sink == shown.SERVE:
+        from bridge.ports import wait_to_be_told
 
-    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    tls = tls_for(arguments.tls, where)
-    with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
-        yield filter(None, listener.until_gone())
-        if listener.dropped:
-            lost = f"{listener.dropped} messages came faster than they could be drawn"
-            print(lost, file=sys.stderr)
+        print("all of it is there; ^C ends", flush=True)
+        wait_to_be_told()
 
 
-@contextlib.contextmanager
-def _recorded(arguments: Any) -> Iterator[Iterator[Heard]]:
-    file = Recording(Path(arguments.recording))
-    vehicle_id = choose_vehicle(file, arguments.vehicle_id)
-
-    def all_heard() -> Iterator[Heard]:
-        yield from heard_of(file, vehicle_id)
-        file.say_trouble()
-
-    yield all_heard()
+def open_view(
+    arguments: Any, sink: str
+) -> contextlib.AbstractContextManager[Callable[[Heard], None]]:
+    """Yield what shows a message where the options say; ``sink`` is what ``check_view`` gave."""
+    return _rerun(arguments, sink) if sink else _foxglove(arguments)
 
 
 @contextlib.contextmanager
@@ -411,10 +422,12 @@ def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
     if log.left_out:
         said = counted(log.left_out, "message")
         print(f"left out: {said} that cannot be drawn", file=sys.stderr, flush=True)
+    if sink.endswith(shown.SUFFIX):
+        print(f"wrote {sink}")
 
 
 @contextlib.contextmanager
-def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
+def _foxglove(arguments: Any) -> Iterator[Callable[[Heard], None]]:
     """Yield what shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
