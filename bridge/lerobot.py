@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from bridge.messages import images_of, is_picture, place_of
+from bridge.messages import images_of, is_picture
 from bridge.ports import add_options
-from bridge.replay import RecordedDrive
+from bridge.replay import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.config import NONE
 from edge_runtime.files import check_writable, write_json
@@ -121,7 +121,7 @@ def _kept(drive: RecordedDrive, task: Task) -> Iterator[tuple[Layout, State, Com
     """Yield the readable states with their answers, and how to read them."""
     layout = Layout(task)
     for state in drive.states():
-        exchange = None if state.final else drive.answers.get(place_of(state))
+        exchange = None if state.final else drive.answers.get(key_of(state))
         readable = not (layout.refusal(state.observation) or is_foreign(state, task.text))
         if readable and exchange and len(exchange.command.action) == len(task.action):
             yield layout, state, exchange.command
@@ -132,8 +132,8 @@ def _numbers(drive: RecordedDrive, task: Task, rate: Fraction) -> tuple[Columns,
     kept = [answer for _, _, answer in _kept(drive, task)]
     if not kept:
         raise UserError(f"{drive.recording.path} holds no answered state of {task.text}")
-    ended = {place_of(state)[:2] for state in drive.states() if state.final}
-    episodes = [place_of(answer)[:2] for answer in kept]
+    ended = {key_of(state)[:2] for state in drive.states() if state.final}
+    episodes = [key_of(answer)[:2] for answer in kept]
     bounds = [at for at, name in enumerate(episodes) if not at or name != episodes[at - 1]]
     bounds.append(len(kept))
     index, lengths = np.arange(len(kept)), np.diff(bounds)

@@ -6,6 +6,7 @@ holds what the environment knows and the vehicle does not, so the policy never h
 
 from __future__ import annotations
 
+import cmath
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -65,6 +66,23 @@ class SeenCar(msgspec.Struct, frozen=True):
     speed_mps: float = 0.0
 
 
+def body(car: SeenCar) -> list[Point]:
+    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
+    reach = max(0.0, (car.length_m - car.width_m) / 2)
+    return _line(car, -reach, reach)
+
+
+def windscreen(car: SeenCar) -> list[Point]:
+    """Return the line that tells front from back."""
+    return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
+
+
+def _line(car: SeenCar, *points: complex) -> list[Point]:
+    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
+    placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
+    return [(each.real, each.imag) for each in placed]
+
+
 class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
     """The drawn scene: roads, lane lines and the path as polylines, the goal, and the cars."""
 
@@ -114,14 +132,6 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     applied: list[float] | None = None
     braked: bool = False
     ridden: int = 0
-
-
-Place = tuple[str, int, int]  # Session, episode, step
-
-
-def place_of(message: wire.State | wire.Command) -> Place:
-    """Name a state; a command has the place of the state that it answers."""
-    return message.session, message.episode, message.step
 
 
 def plain(value: Any) -> Any:

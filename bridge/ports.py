@@ -25,14 +25,7 @@ import zenoh
 from bridge.environments import picture_of, say_once, scene_of
 from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
-from bridge.recording import (
-    Recording,
-    RecordingWriter,
-    choose_vehicle,
-    growing_recording,
-    heard_of,
-    new_recording,
-)
+from bridge.recording import RecordingWriter, new_recording, read_whole
 from edge_runtime import cli
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
@@ -175,10 +168,9 @@ class WireListener:
         self._is_stopped = False
         self._zero_ns = time.time_ns() - time.monotonic_ns()
 
-    def stop(self) -> bool:
+    def stop(self) -> None:
         """End `until_gone` after its next message; may be called from a signal's handler."""
         self._is_stopped = True
-        return True
 
     def next(self, timeout_s: float) -> Heard | None:
         """Return the next message, or None after ``timeout_s``."""
@@ -265,20 +257,14 @@ def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
     """Yield one vehicle's messages: of the file ``arguments.recording``, or on the wire until its
     simulator goes; None where none comes for a moment.
     """
-    vehicle_id, where = arguments.vehicle_id, arguments.connect
     if arguments.recording:
-        file = Recording(Path(arguments.recording))
-        yield _to_its_end(file, choose_vehicle(file, vehicle_id))
+        yield read_whole(arguments.recording, arguments.vehicle_id)
         return
-    tls, vehicle_id = tls_for(arguments.tls, where), vehicle_id or DEFAULT_VEHICLE_ID
+    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, where)
     with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
         yield listener.until_gone()
         _say_dropped(listener)
-
-
-def _to_its_end(file: Recording, vehicle_id: str) -> Iterator[Heard]:
-    yield from heard_of(file, vehicle_id)
-    file.say_trouble()
 
 
 def _say_dropped(listener: WireListener) -> None:
@@ -383,17 +369,25 @@ def _add_record_arguments(parser: Any) -> None:
 def _run_record(arguments: Any) -> int:
     """Record until the simulators go, or somebody interrupts."""
     tls = tls_for(arguments.tls, arguments.connect)
-    vehicle_id = arguments.vehicle_id or ANY_VEHICLE
+    path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
         cli.sigterm_as_interrupt(),
         open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
-        # A signal is the ordinary way to end a recording: it must not cut a message in two.
-        cli.quit_on_signals(listener.stop),
-        growing_recording(arguments.out) as writer,
+        closing(RecordingWriter(path)) as writer,
     ):
-        _listen(listener, writer, arguments.linger_s)
+        print(f"recording {path}", flush=True)
+        try:
+            # A signal is the ordinary way to end a recording: it must not cut a message in two.
+            with cli.quit_on_signals(listener.stop):
+                _listen(listener, writer, arguments.linger_s)
+                writer.finish()
+        except OSError as error:
+            stopped = f"error: recording {path} stopped: {error.strerror}"
+            print(f"{stopped}; it holds what was written before", file=sys.stderr)
+            return NOT_WRITTEN
     _say_dropped(listener)
-    return NOT_WRITTEN if writer.is_cut else 0
+    print(f"wrote {path}: {counted(writer.messages, 'message')}")
+    return 0
 
 
 def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:

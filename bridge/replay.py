@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bridge.messages import Place, place_of
 from bridge.ports import add_options
 from bridge.recording import Recording, choose_vehicle, valid_messages
 from edge_runtime.cli import ArgumentParser, examples, not_negative_number
@@ -41,6 +40,8 @@ CLOCK_STEP_S = 1.0  # Stamps that leap by more against the recorder's: a clock w
 DEFAULT_TOLERANCE = 1e-5  # Two processors round differently, by far less than this
 DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
+
+Key = tuple[str, int, int]  # Session, episode, step
 
 
 class Exchange(NamedTuple):
@@ -106,7 +107,7 @@ class RecordedDrive:
     def __init__(self, path: Path, vehicle_id: str | None) -> None:
         self.recording = Recording(path)
         self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
-        self.answers: dict[Place, Exchange] = {}
+        self.answers: dict[Key, Exchange] = {}
         self.vehicle = NONE
         self.task: Task | None = None  # As the simulator's scenes say
         self.starts_s: list[float] = []  # Of the edge runtimes, one after the other
@@ -119,10 +120,10 @@ class RecordedDrive:
             if heard.topic == "scene":
                 self.task = self.task or message.task
             elif isinstance(message, Command) and message.reason != RUNTIME_ENDED:
-                known = self.answers.get(place_of(message))
+                known = self.answers.get(key_of(message))
                 exchange = self._exchange(message, heard_s)
                 if known is None or (message.inference_ns and not known.command.inference_ns):
-                    self.answers[place_of(message)] = exchange
+                    self.answers[key_of(message)] = exchange
             elif isinstance(message, Health):
                 self.vehicle = message.vehicle
                 start_s = heard_s - message.uptime_s
@@ -148,11 +149,15 @@ class RecordedDrive:
 
     def states(self) -> Iterator[State]:
         """Yield the states in their order, each once: a network may repeat a message."""
-        seen: set[Place] = set()
+        seen: set[Key] = set()
         for _, state in valid_messages(self.recording, self.vehicle_id):
-            if isinstance(state, State) and place_of(state) not in seen:
-                seen.add(place_of(state))
+            if isinstance(state, State) and key_of(state) not in seen:
+                seen.add(key_of(state))
                 yield state
+
+
+def key_of(message: State | Command) -> Key:
+    return message.session, message.episode, message.step
 
 
 def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row]:
@@ -167,7 +172,7 @@ def replay(drive: RecordedDrive, policy: Policy, config: Config) -> Iterator[Row
     commands = [each.command for each in drive.answers.values()]
     controller, starts_s = None, drive.starts_s[1:]
     for state in drive.states():
-        exchange = drive.answers.get(place_of(state))
+        exchange = drive.answers.get(key_of(state))
         if exchange is None:
             yield state, None, None
             continue
@@ -255,7 +260,7 @@ def compare(rows: Iterable[Row], tolerance: float) -> dict[str, Any]:
         kinds[f"{recorded.mode}: {recorded.reason}".removesuffix(": ")] += 1
         distances.append(distance := _distance(recorded, order))
         if distance > tolerance:
-            place = dict(zip(("session", "episode", "step"), place_of(state), strict=True))
+            place = dict(zip(("session", "episode", "step"), key_of(state), strict=True))
             replayed = None if order is None else _told(order)
             differences.append({**place, "recorded": _told(recorded), "replayed": replayed})
     return {

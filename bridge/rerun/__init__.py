@@ -83,18 +83,15 @@ class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
     "python -m bridge view --foxglove",
 )
 def view(parser: argparse.ArgumentParser) -> None:
-    from bridge.ports import add_options  # It loads zenoh, which the trainer goes without.
-
     text = "show this recording of bridge record, instead of listening"
     parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
     add_view(parser, " (the default)")
-    add_options(parser, "--connect", "--tls", "--wait-s")
-    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def add_view(parser: argparse.ArgumentParser, default: str = "") -> None:
-    """Add the options that say where a drive is shown."""
+    """Add the options that say what is heard, and where it is shown."""
+    from bridge.ports import add_options  # It loads zenoh, which the trainer goes without.
+
     add = parser.add_mutually_exclusive_group().add_argument
     kind: Any = {"dest": "sink", "action": "store_const"}
     add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")
@@ -105,15 +102,9 @@ def add_view(parser: argparse.ArgumentParser, default: str = "") -> None:
     add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
     text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
     parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-
-
-def check_view(arguments: argparse.Namespace) -> str:
-    """Return the sink of rerun that the options of ``add_view`` name, or "" for Foxglove."""
-    if not arguments.foxglove:
-        return check_sink(arguments.sink, arguments.port)
-    if arguments.port or arguments.recording:
-        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
-    return ""
+    add_options(parser, "--connect", "--tls", "--wait-s")
+    text = f"the vehicle (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def has_display() -> bool:

@@ -7,11 +7,11 @@ are lines: rerun cannot turn its flat boxes.
 
 from __future__ import annotations
 
-import cmath
 import contextlib
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ import rerun.blueprint as rrb
 from bridge import messages
 from bridge import rerun as shown
 from bridge.inbound import BRAKE_PERIODS
-from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene, place_of
+from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenScene
 from bridge.rerun import Colour
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
@@ -60,10 +60,6 @@ class Canvas:
             names, colours = list(of), list(of.values())
             look = rr.StateConfiguration(values=names, labels=names, colors=colours)
             self.log(path, look, static=True)
-
-    def lay_out_anew(self) -> None:
-        """Send the layout again with the next road."""
-        self._ground = object()
 
     def stand_at(self, step: int, **seconds: float) -> None:
         """Set the time of all that is drawn next: the step, and seconds by timeline."""
@@ -116,9 +112,10 @@ class Canvas:
         self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene), 0.0]))
         for name, colour in (("traffic", shown.APPLIED), ("ego", ego_colour)):
             cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
-            half_m, bodies = [car.width_m / 2 for car in cars], list(map(body, cars))
+            half_m, bodies = [car.width_m / 2 for car in cars], list(map(messages.body, cars))
             self._strips(f"road/{name}/body", bodies, colour, half_m, order=3.0)
-            self._strips(f"road/{name}/glass", map(windscreen, cars), shown.GLASS, 0.3, order=4.0)
+            glass = map(messages.windscreen, cars)
+            self._strips(f"road/{name}/glass", glass, shown.GLASS, 0.3, order=4.0)
 
     def _draw_ground(self, scene: SeenScene) -> None:
         self._strips("road/roads", scene.roads, shown.ROAD, scene.road_width_m / 2, order=0.0)
@@ -145,23 +142,6 @@ def away_m(scene: SeenScene) -> list[float]:
         if not all(low <= at <= high for at, (low, high) in place):
             return [at - (low + high) / 2 for at, (low, high) in place]
     return [0.0, 0.0]
-
-
-def body(car: SeenCar) -> list[Point]:
-    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
-    reach = max(0.0, (car.length_m - car.width_m) / 2)
-    return _line(car, -reach, reach)
-
-
-def windscreen(car: SeenCar) -> list[Point]:
-    """Return the line that tells front from back."""
-    return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
-
-
-def _line(car: SeenCar, *points: complex) -> list[Point]:
-    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
-    placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
-    return [(each.real, each.imag) for each in placed]
 
 
 def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
@@ -208,30 +188,27 @@ def two_columns(
 
 
 PLOTS = (
-    ("action", "Command: asked and achieved"),
+    ("action", "Command: asked, achieved; a shadow's, and what it adds"),
     ("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     ("latency", "Latency, ms: round trip, and inference"),
     ("link", "Link each way: mean delay and jitter, ms; loss, %"),
     ("rejected", "Messages rejected so far, by either side"),
 )
 """From top to bottom."""
-APART = ("shadow", "Shadow's action less the command's")
 ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
-SHADOWED = {"action/shadow": shown.SHADOW, "shadow/apart": shown.SHADOW}
+ACTIONS |= {"action/shadow": shown.SHADOW, "action/apart": RED}
 NO_COMMAND, NO_REASON = "no command", "-"
 MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
-STATES = {
-    "mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": {DRIVE: shown.SHADOW},
-}  # fmt: skip
+SHADOW = {DRIVE: shown.SHADOW}
+STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": SHADOW}
 
 
-def lay_out(scene: SeenScene | None, pictures: bool = True, shadow: bool = False) -> rrb.Blueprint:
-    """Lay out the views; ``pictures``: whether the policy sees any; ``shadow``: whether one did."""
+def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
+    """Lay out the views; ``pictures``: whether the policy sees any."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
     mode = lanes_view("mode", "Mode, and why it does not drive")
-    plots = [plot_view(*plot) for plot in (APART,) * shadow + PLOTS]
-    shares = [1.6 if shadow else 1.0, *[1.0] * len(plots)]  # A lane more
-    right = rrb.Vertical(mode, *plots, row_shares=shares)
+    plots = [plot_view(*plot) for plot in PLOTS]
+    right = rrb.Vertical(mode, *plots, row_shares=[1.5, *[1] * len(plots)])
     return two_columns(left, right, [3, 2], "sim_time")
 
 
@@ -293,16 +270,12 @@ class WireLog:
         self._canvas.scalar("action/asked", *command.action)
         self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
         self._tell(command.mode, command.reason)
-        shadow, place = self._shadow, place_of(command)
-        if shadow and place_of(shadow) == place and shadow.mode == command.mode == DRIVE:
+        shadow, same = self._shadow, attrgetter("session", "episode", "step", "mode")
+        if shadow and command.mode == DRIVE and same(shadow) == same(command):
             both = zip(shadow.action, command.action, strict=False)
-            self._canvas.scalar("shadow/apart", *(ours - theirs for ours, theirs in both))
+            self._canvas.scalar("action/apart", *(ours - theirs for ours, theirs in both))
 
     def write_shadow(self, command: Command, _arrived_ns: int) -> None:
-        """Draw what a policy in the shadow would have commanded."""
-        if self._shadow is None:
-            self._canvas.lay_out_anew()
-            self._style(SHADOWED)
         self._shadow = command
         self._stand_at(command.session, command.episode, command.step)
         self._canvas.scalar("action/shadow", *command.action)
@@ -324,7 +297,9 @@ class WireLog:
         if scene.task is not None and scene.task != self._task:
             self._task, self._layout = scene.task, Layout(scene.task)
             self._period_s = scene.task.control_period_s
-            self._style(ACTIONS)
+            for path, colour in ACTIONS.items():
+                names = [f"{path[7:]} {action.name}" for action in scene.task.action]
+                self._canvas.style(path, colour, names)
         session = scene.origin.session if scene.origin else self._session
         self._stand_at(session, scene.episode, scene.step)
         if scene.round_trip_ms is not None:
@@ -337,17 +312,9 @@ class WireLog:
             road = None if scene.picture else scene
             self._canvas.road(road, picture, MODES[self._mode or NO_COMMAND])
 
-    def _style(self, paths: Mapping[str, Colour]) -> None:
-        """Name the lines at these paths after the actions, once those are known."""
-        actions = self._task.action if self._task else ()
-        for path, colour in paths.items() if actions else ():
-            names = [f"{path.rpartition('/')[2]} {action.name}" for action in actions]
-            self._canvas.style(path, colour, names)
-
     def _lay_out(self, scene: SeenScene | None) -> rrb.Blueprint:
         entries = self._task.observation.values() if self._task else ()
-        pictures = not entries or any(map(messages.is_picture, entries))
-        return lay_out(scene, pictures, self._shadow is not None)
+        return lay_out(scene, not entries or any(map(messages.is_picture, entries)))
 
     def _stand_at(self, session: str, episode: int, step: int) -> None:
         step += self._starts.setdefault((session, episode), self._end_step)
@@ -377,40 +344,35 @@ class WireLog:
         self._canvas.status(*lines)
 
 
-def run(arguments: Any) -> int:
-    """Run the command until the simulator goes, or somebody interrupts."""
-    from bridge.ports import open_source  # It loads zenoh: a training goes without.
+def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -> int:
+    """Run the command until the simulator goes, or somebody interrupts.
 
-    sink = shown.check_view(arguments)
+    ``stage`` makes what is shown of what `bridge.ports.open_source` yields.
+    """
+    from bridge.ports import open_source, wait_to_be_told  # zenoh: a training goes without.
+
+    if arguments.foxglove and (arguments.port or arguments.recording):
+        raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
+    sink, opened = "", _foxglove
+    if not arguments.foxglove:
+        sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
     with (
         sigterm_as_interrupt(),
         open_source(arguments) as all_heard,
-        open_view(arguments, sink) as show,
+        opened(arguments, sink) as show,
     ):
         try:
-            for heard in filter(None, all_heard):
+            for heard in stage(all_heard) if stage else filter(None, all_heard):
                 show(heard)
-            keep_page(arguments)
+            if arguments.recording and sink == shown.SERVE:
+                print("all of it is there; ^C ends", flush=True)
+                wait_to_be_told()
         except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
             if arguments.recording and sink != shown.SERVE:
                 raise
+    if sink.endswith(shown.SUFFIX):
+        print(f"wrote {sink}")
     return 0
-
-
-def keep_page(arguments: Any) -> None:
-    """Serve the page of a whole recording until KeyboardInterrupt."""
-    if arguments.recording and arguments.sink == shown.SERVE:
-        from bridge.ports import wait_to_be_told
-
-        print("all of it is there; ^C ends", flush=True)
-        wait_to_be_told()
-
-
-def open_view(
-    arguments: Any, sink: str
-) -> contextlib.AbstractContextManager[Callable[[Heard], None]]:
-    """Yield what shows a message where the options say; ``sink`` is what ``check_view`` gave."""
-    return _rerun(arguments, sink) if sink else _foxglove(arguments)
 
 
 @contextlib.contextmanager
@@ -422,12 +384,10 @@ def _rerun(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
     if log.left_out:
         said = counted(log.left_out, "message")
         print(f"left out: {said} that cannot be drawn", file=sys.stderr, flush=True)
-    if sink.endswith(shown.SUFFIX):
-        print(f"wrote {sink}")
 
 
 @contextlib.contextmanager
-def _foxglove(arguments: Any) -> Iterator[Callable[[Heard], None]]:
+def _foxglove(arguments: Any, sink: str) -> Iterator[Callable[[Heard], None]]:
     """Yield what shows a message in Foxglove; UserError where the port is taken."""
     from bridge.recording import ENCODING, SCHEMA_ENCODING, Schema, ViewerCopies
 
