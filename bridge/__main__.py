@@ -14,7 +14,7 @@ COMMANDS = {
     "shadow": ("bridge.shadow", "answer beside the policy that drives, and move nothing"),
     "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and drive on in another way"),
     "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),
-    "view": ("bridge.rerun:view", "show the wire in rerun, live or in a file"),
+    "view": ("bridge.ports:view", "show the wire in rerun, live or in a file"),
 }
 main = program(
     "python -m bridge",

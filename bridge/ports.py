@@ -1,4 +1,4 @@
-"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `bridge record`.
+"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `record`, `view`.
 
 Zenoh's threads only put into a listener's bounded queue, so a listener that falls behind loses
 messages and never holds up the vehicle.
@@ -26,6 +26,7 @@ from bridge.environments import picture_of, say_once, scene_of
 from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
 from bridge.recording import RecordingWriter, new_recording, read_whole
+from bridge.rerun import FOXGLOVE_PORT, SERVE, SPAWN
 from edge_runtime import cli
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
@@ -398,3 +399,33 @@ def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) ->
 
 RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
 RECORD = cli.Subcommand(cli.examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)
+
+
+@cli.command(
+    "bridge.rerun.draw:run",
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view drive.mcap --save drive.rrd",
+    "python -m bridge view --foxglove",
+)
+def view(parser: Any) -> None:
+    text = "show this recording of bridge record, instead of listening"
+    parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
+    add_view(parser, " (the default)")
+
+
+def add_view(parser: Any, default: str = "") -> None:
+    """Add the options that say what is heard, and where it is shown."""
+    add = parser.add_mutually_exclusive_group().add_argument
+    kind: Any = {"dest": "sink", "action": "store_const"}
+    add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")
+    add("--serve", **kind, const=SERVE, help="serve a web page on this machine's loopback only")
+    add("--save", dest="sink", metavar="F.rrd", help="write a recording instead of showing it")
+    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
+    number: Any = {"type": cli.whole_number(1, 65535), "const": FOXGLOVE_PORT}
+    add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
+    text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
+    parser.add_argument("--port", metavar="N", type=cli.whole_number(1, 65534), help=text)
+    add_options(parser, "--connect", "--tls", "--wait-s")
+    text = f"the vehicle (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)

@@ -22,10 +22,9 @@ import numpy as np
 
 from bridge.environments import say_once
 from bridge.messages import SHADOW, Heard
-from bridge.ports import add_options, open_source
+from bridge.ports import add_options, add_view, open_source
 from bridge.recording import new_recording, whole_recording
 from bridge.replay import Key, key_of
-from bridge.rerun import add_view
 from edge_runtime import cli, wire
 from edge_runtime.config import Config, add_trust, load_config
 from edge_runtime.controller import Controller, ControllerConfig, Order, Received, shared_limits
