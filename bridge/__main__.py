@@ -11,9 +11,10 @@ COMMANDS = {
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.ports:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
+    "shadow": ("bridge.shadow", "answer beside the policy that drives, and move nothing"),
     "fork": ("bridge.fork:FORK", "rebuild a recorded drive, and drive on in another way"),
     "export": ("bridge.lerobot", "turn a recording into a LeRobot data set"),
-    "view": ("bridge.rerun:view", "show the wire in rerun, live or in a file"),
+    "view": ("bridge.ports:view", "show the wire in rerun, live or in a file"),
 }
 main = program(
     "python -m bridge",

@@ -6,6 +6,7 @@ holds what the environment knows and the vehicle does not, so the policy never h
 
 from __future__ import annotations
 
+import cmath
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +21,8 @@ from edge_runtime.util import UserError
 
 MOST = 1e12  # Of metres, seconds, milliseconds and all else that is drawn
 MOST_STEPS = 10**8  # In an episode: 11 days at the shortest control period
+SHADOW = "shadow"
+"""Topic of what a policy in the shadow would have commanded: of recordings, never on the wire."""
 TOKEN_TOPICS = ("alive", "simulator")
 """Liveliness tokens: of the edge runtime, and of the simulator (extension)."""
 
@@ -61,6 +64,23 @@ class SeenCar(msgspec.Struct, frozen=True):
     ego: bool = False
     id: int = 0
     speed_mps: float = 0.0
+
+
+def body(car: SeenCar) -> list[Point]:
+    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
+    reach = max(0.0, (car.length_m - car.width_m) / 2)
+    return _line(car, -reach, reach)
+
+
+def windscreen(car: SeenCar) -> list[Point]:
+    """Return the line that tells front from back."""
+    return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
+
+
+def _line(car: SeenCar, *points: complex) -> list[Point]:
+    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
+    placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
+    return [(each.real, each.imag) for each in placed]
 
 
 class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
@@ -171,6 +191,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "feedback": wire.decode_feedback,
     "health": wire.decode_health,
     "scene": decode_scene,
+    SHADOW: wire.decode_command,
 }
 """Topic -> decoder, which returns a ``Rejection`` for an invalid message."""
 

@@ -1,4 +1,4 @@
-"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `bridge record`.
+"""Both ends of the bridge on Zenoh, options that commands share, `bridge router`, `record`, `view`.
 
 Zenoh's threads only put into a listener's bounded queue, so a listener that falls behind loses
 messages and never holds up the vehicle.
@@ -23,9 +23,10 @@ import msgspec
 import zenoh
 
 from bridge.environments import picture_of, say_once, scene_of
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, encode_scene
+from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
-from bridge.recording import RecordingWriter, new_recording
+from bridge.recording import RecordingWriter, new_recording, read_whole
+from bridge.rerun import FOXGLOVE_PORT, SERVE, SPAWN
 from edge_runtime import cli
 from edge_runtime import tls as access
 from edge_runtime.files import check_writable
@@ -38,7 +39,6 @@ from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_STATE_BYTES, Health, check
 ANY_VEHICLE = "*"
 POLL_S = 0.1  # How soon a listener sees that the simulator has gone
 RETRY_S = 0.1
-FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
 NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 LINGER_S = 2.0  # A simulator that stalls for longer than Zenoh's lease, 1 s, comes back
 TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
@@ -169,10 +169,9 @@ class WireListener:
         self._is_stopped = False
         self._zero_ns = time.time_ns() - time.monotonic_ns()
 
-    def stop(self) -> bool:
+    def stop(self) -> None:
         """End `until_gone` after its next message; may be called from a signal's handler."""
         self._is_stopped = True
-        return True
 
     def next(self, timeout_s: float) -> Heard | None:
         """Return the next message, or None after ``timeout_s``."""
@@ -230,7 +229,8 @@ def open_listener(
     may not listen: from here that would look the same.
     """
     if tls is not None:
-        access.check_name(tls.name, access.VIEWER)
+        own = [access.common_name(access.SHADOW, vehicle_id)] if vehicle_id != ANY_VEHICLE else []
+        access.check_name(tls.name, access.VIEWER, *own)
     give_up_s = time.monotonic() + wait_s
     with contextlib.ExitStack() as stack:
         session = stack.enter_context(closing(connect_client(connect, wait_s, tls)))
@@ -239,7 +239,7 @@ def open_listener(
             listener.end_s = tls.expires.timestamp()
         # On Zenoh's own thread: with one for each topic, their order would be anybody's guess.
         hear = zenoh.handlers.Callback(listener.hear, indirect=False)
-        for topic in DECODERS:
+        for topic in DECODERS.keys() - {SHADOW}:
             stack.enter_context(session.declare_subscriber(f"{keys}/{topic}", hear))
         declare = session.liveliness().declare_subscriber
         for topic in TOKEN_TOPICS:
@@ -251,6 +251,27 @@ def open_listener(
         yield listener
         if tls is not None:
             tls.require_valid(time.time())
+
+
+@contextlib.contextmanager
+def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
+    """Yield one vehicle's messages: of the file ``arguments.recording``, or on the wire until its
+    simulator goes; None where none comes for a moment.
+    """
+    if arguments.recording:
+        yield read_whole(arguments.recording, arguments.vehicle_id)
+        return
+    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    tls = tls_for(arguments.tls, where)
+    with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
+        yield listener.until_gone()
+        _say_dropped(listener)
+
+
+def _say_dropped(listener: WireListener) -> None:
+    if listener.dropped:
+        dropped = counted(listener.dropped, "message")
+        print(f"{dropped} came faster than they could be taken", file=sys.stderr)
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
@@ -365,23 +386,46 @@ def _run_record(arguments: Any) -> int:
             stopped = f"error: recording {path} stopped: {error.strerror}"
             print(f"{stopped}; it holds what was written before", file=sys.stderr)
             return NOT_WRITTEN
-    if listener.dropped:
-        dropped = counted(listener.dropped, "message")
-        print(f"{dropped} came faster than they could be written", file=sys.stderr)
+    _say_dropped(listener)
     print(f"wrote {path}: {counted(writer.messages, 'message')}")
     return 0
 
 
 def _listen(listener: WireListener, writer: RecordingWriter, linger_s: float) -> None:
-    flush_s = time.monotonic() + FLUSH_S
-    for heard in listener.until_gone(linger_s):
-        if heard is not None:
-            # Under a flood the copies for viewers are the first to go.
-            writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
-        if time.monotonic() >= flush_s:
-            writer.flush()
-            flush_s = time.monotonic() + FLUSH_S
+    for heard in filter(None, listener.until_gone(linger_s)):
+        # Under a flood the copies for viewers are the first to go.
+        writer.write(heard, with_view=listener.queue.qsize() < QUEUE_MESSAGES // 2)
 
 
 RECORD_EXAMPLE = "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60"
 RECORD = cli.Subcommand(cli.examples(RECORD_EXAMPLE), _add_record_arguments, _run_record)
+
+
+@cli.command(
+    "bridge.rerun.draw:run",
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view drive.mcap --save drive.rrd",
+    "python -m bridge view --foxglove",
+)
+def view(parser: Any) -> None:
+    text = "show this recording of bridge record, instead of listening"
+    parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
+    add_view(parser, " (the default)")
+
+
+def add_view(parser: Any, default: str = "") -> None:
+    """Add the options that say what is heard, and where it is shown."""
+    add = parser.add_mutually_exclusive_group().add_argument
+    kind: Any = {"dest": "sink", "action": "store_const"}
+    add("--spawn", **kind, const=SPAWN, help=f"open a rerun window{default}")
+    add("--serve", **kind, const=SERVE, help="serve a web page on this machine's loopback only")
+    add("--save", dest="sink", metavar="F.rrd", help="write a recording instead of showing it")
+    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
+    number: Any = {"type": cli.whole_number(1, 65535), "const": FOXGLOVE_PORT}
+    add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
+    text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
+    parser.add_argument("--port", metavar="N", type=cli.whole_number(1, 65534), help=text)
+    add_options(parser, "--connect", "--tls", "--wait-s")
+    text = f"the vehicle (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=text)

@@ -2,7 +2,8 @@
 
 The topics ``phil/<id>/...`` hold the exact payloads; ``view/<id>/...`` hold copies for Foxglove, in
 JSON with a JSON Schema: of each message, of its pictures (``foxglove.RawImage``, frame t-1 above
-frame t), and ``events`` (``foxglove.Log``: tokens, unreadable and oversized messages).
+frame t), of the road from above (``foxglove.SceneUpdate``), and ``events`` (``foxglove.Log``:
+tokens, unreadable and oversized messages).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import functools
 import struct
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,7 +25,9 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from bridge.messages import DECODERS, TOKEN_TOPICS, Heard, Scene, decode, images_of
+from bridge import messages
+from bridge import rerun as view
+from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, decode, images_of
 from edge_runtime import __version__, wire
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.manifest import Layout
@@ -32,6 +36,7 @@ from edge_runtime.util import UserError, counted, open_regular
 WIRE_ENCODING = "msgpack"
 ENCODING, SCHEMA_ENCODING = "json", "jsonschema"  # Of the copies for viewers
 CHUNK_BYTES = 1 << 20
+FLUSH_S = 0.5  # A kill loses at most this much of a recording, and what waits in the queue
 MAX_RECORD_BYTES = 8 << 20
 """Of a record, and of a chunk when it is unpacked; ours hold little more than 5 MiB."""
 TORN = (
@@ -135,10 +140,22 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
             yield Heard(channel.topic, topic, data, message.log_time, len(data))
 
 
+def read_whole(path: str, vehicle_id: str | None) -> Iterator[Heard]:
+    """Return the messages of one vehicle; at the end it prints what is wrong with the file."""
+    recording = Recording(Path(path))
+    vehicle_id = choose_vehicle(recording, vehicle_id)
+
+    def read() -> Iterator[Heard]:
+        yield from heard_of(recording, vehicle_id)
+        recording.say_trouble()
+
+    return read()
+
+
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
-    """Yield a vehicle's messages, heard and decoded; the invalid are left out."""
+    """Yield a drive's messages, heard and decoded; the invalid, and a shadow's, are left out."""
     for heard in heard_of(recording, vehicle_id):
-        if heard.topic in DECODERS:
+        if heard.topic in DECODERS and heard.topic != SHADOW:
             message = decode(heard)
             if not isinstance(message, wire.Rejection):
                 yield heard, message
@@ -157,6 +174,7 @@ class RecordingWriter:
 
     def __init__(self, path: Path) -> None:
         self.messages = 0
+        self._flush_s = 0.0  # When the chunk ends
         self._copies = ViewerCopies(self._add_copy)
         self._file, self._mcap = new_recording_at(path)
         # Each is registered once; with its schema, as a picture may have the name of a message.
@@ -173,10 +191,13 @@ class RecordingWriter:
             self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
         if with_view:
             self._copies.write(heard)
+        if time.monotonic() >= self._flush_s:
+            self.flush()
 
     def flush(self) -> None:
         """End the chunk: a kill does not lose what was written before."""
         self._mcap.flush()
+        self._flush_s = time.monotonic() + FLUSH_S
 
     def finish(self) -> None:
         """Write the index: the recording is whole."""
@@ -235,34 +256,44 @@ def new_recording(path: str | Path) -> str:
     return str(Path(path).absolute())
 
 
-class Stamp(msgspec.Struct):
-    """Time since 1970."""
+# Foxglove's own message types, with the fields that we fill; it takes the others as empty.
+define: Any = msgspec.defstruct
+many = list.__class_getitem__
+Stamp = define("Time", [("sec", int), ("nsec", int)])
+RawImage = define("RawImage", [("timestamp", Stamp), ("width", int), ("height", int),
+    ("encoding", str), ("step", int), ("data", bytes), ("frame_id", str)])  # fmt: skip
+Log = define("Log", [("timestamp", Stamp), ("level", int), ("message", str), ("name", str)])
+Vector = define("Vector3", [(axis, float) for axis in "xyz"])
+Paint = define("Color", [(part, float) for part in "rgba"])
+Line = define("LinePrimitive", [("thickness", float), ("points", many(Vector)), ("color", Paint)])
+Entity = define("SceneEntity", [("timestamp", Stamp), ("frame_id", str), ("id", str),
+    ("lines", many(Line))])  # fmt: skip
+SceneUpdate = define("SceneUpdate", [("entities", many(Entity))])
+FrameTransform = define("FrameTransform", [("timestamp", Stamp), ("parent_frame_id", str),
+    ("child_frame_id", str), ("translation", Vector)])  # fmt: skip
+FOXGLOVE = (RawImage, Log, SceneUpdate, FrameTransform)
+ROAD_FRAME, EGO_FRAME = "road", "ego"  # Metres; x to the right, y up on the map
 
-    sec: int
-    nsec: int
 
-
-class RawImage(msgspec.Struct):
-    """``foxglove.RawImage``."""
-
-    timestamp: Stamp
-    width: int
-    height: int
-    encoding: str
-    step: int
-    data: bytes
-    frame_id: str
-
-
-class Log(msgspec.Struct):
-    """``foxglove.Log``, of which we fill time, level, text and sender."""
-
-    timestamp: Stamp
-    level: int
-    message: str
-    name: str
-    file: str = ""
-    line: int = 0
+def draw_road(scene: Scene, now: Any) -> Any:
+    """Return the road from above as a SceneUpdate: wide lines, one above the other."""
+    strips: list[Any] = [
+        *((points, view.ROAD, scene.road_width_m) for points in scene.roads),
+        *((points, view.MARKING, 0.12) for points in scene.lane_lines),
+        (scene.path, view.PATH, 0.3),
+    ]
+    if scene.goal is not None:
+        x, y = scene.goal
+        strips.append(([(x - 0.5, y), (x + 0.5, y)], view.GOAL, 1.0))
+    for car in scene.vehicles:
+        colour = view.POLICY if car.ego else view.APPLIED
+        strips.append((messages.body(car), colour, car.width_m))
+        strips.append((messages.windscreen(car), view.GLASS, 0.6))
+    lines = []
+    for layer, (points, colour, width_m) in enumerate(strips):
+        paint = Paint(*(part / 255 for part in colour), 1.0)
+        lines.append(Line(width_m, [Vector(x, -y, 0.01 * layer) for x, y in points], paint))
+    return SceneUpdate([Entity(now, ROAD_FRAME, ROAD_FRAME, lines)])
 
 
 Schema = tuple[str, bytes]  # The full name of a message type, and its JSON Schema
@@ -274,14 +305,26 @@ INFO, WARNING = 2, 3  # Of ``foxglove.Log.level``
 
 
 @functools.cache
-def describe(kind: type[msgspec.Struct]) -> Schema:
+def describe(kind: Any) -> Schema:
     """Return the schema of the fields that are copied for viewers; None is never copied."""
-    _, parts = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
-    fields = parts.pop(kind.__name__)["properties"].items()
-    copied = {n: field.get("anyOf", [field])[0] for n, field in fields if n not in NOT_COPIED}
-    schema = {"type": "object", "properties": copied, "$defs": parts}  # As Foxglove wants it
-    package = "foxglove" if kind in (RawImage, Log) else "phil"
-    return f"{package}.{kind.__name__}", msgspec.json.encode(schema)
+    name, parts = kind.__name__, msgspec.json.schema_components([kind], ref_template="{name}")[1]
+
+    def plain(part: dict[str, Any]) -> dict[str, Any]:
+        """Foxglove's readers know no references, alternatives, or objects with any keys."""
+        part = part.get("anyOf", [part])[0]
+        part = parts[part["$ref"]] if "$ref" in part else part
+        found: dict[str, Any] = {
+            key: part[key] for key in ("type", "contentEncoding") if key in part
+        }
+        if part["type"] == "object":
+            fields = part.get("properties", {}).items()
+            found["properties"] = {n: plain(field) for n, field in fields if n not in NOT_COPIED}
+        if part["type"] == "array":
+            found["items"] = plain(part["items"])
+        return found
+
+    package = "foxglove" if kind in FOXGLOVE else "phil"
+    return f"{package}.{name}", msgspec.json.encode(plain(parts[name]))
 
 
 class ViewerCopies:
@@ -308,8 +351,18 @@ class ViewerCopies:
         self._copy(heard, heard.topic, message)
         if isinstance(message, Scene):
             self._layouts[heard.vehicle_id] = Layout(message.task) if message.task else None
+            self._copy_road(heard, message)
         elif isinstance(message, wire.State) and (layout := self._layouts.get(heard.vehicle_id)):
             self._copy_images(heard, message, layout)
+
+    def _copy_road(self, heard: Heard, scene: Scene) -> None:
+        """Copy the road from above, if there is any, and where the ego car is."""
+        now = _stamp(heard)
+        if scene.roads or scene.vehicles:
+            self._copy(heard, "road", draw_road(scene, now))
+        for ego in (car for car in scene.vehicles if car.ego):
+            where = Vector(ego.x, -ego.y, 0.0)
+            self._copy(heard, "ego", FrameTransform(now, ROAD_FRAME, EGO_FRAME, where))
 
     def _copy_images(self, heard: Heard, state: wire.State, layout: Layout) -> None:
         if layout.refusal(state.observation) is not None:
@@ -336,5 +389,5 @@ class ViewerCopies:
         self._add(topic, describe(type(values)), heard.arrived_ns, data)
 
 
-def _stamp(heard: Heard) -> Stamp:
+def _stamp(heard: Heard) -> Any:
     return Stamp(*divmod(heard.arrived_ns, 10**9))

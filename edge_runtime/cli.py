@@ -226,7 +226,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
+def quit_on_signals(ask: Callable[[], Optional[bool]]) -> Iterator[None]:
     """Let the first signal ask for the end.
 
     A second one ends the process, and so does the first where ``ask`` returns False: then nothing
@@ -236,12 +236,12 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
 
     def stop(number: int, frame: Any) -> None:
         asked.append(number)
-        if len(asked) > 1 or not ask():
+        if len(asked) > 1 or ask() is False:
             undo.close()
             os.kill(os.getpid(), number)
 
     with contextlib.ExitStack() as undo:
-        undo.enter_context(handled(SIGNALS, stop))
+        undo.enter_context(handled(ENDING_SIGNALS, stop))
         yield
 
 

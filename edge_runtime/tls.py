@@ -112,7 +112,8 @@ def read_signing_key(path: PathLike) -> Ed25519PrivateKey:
     return key
 
 
-EDGE, SIMULATOR, OPERATOR, VIEWER, ROUTER = "edge", "simulator", "operator", "viewer", "router"
+EDGE, SIMULATOR, OPERATOR = "edge", "simulator", "operator"
+VIEWER, SHADOW, ROUTER = "viewer", "shadow", "router"
 
 
 class Rights(NamedTuple):
@@ -147,6 +148,8 @@ ROLES: Dict[str, Rights] = {
         listens=True,
     ),
     OPERATOR: Rights(asks=("status", "rearm")),
+    # A policy beside the one that drives; it says nothing and asks nothing.
+    SHADOW: Rights(reads=("state", "command", "feedback", "health", "scene"), watches=("**",)),
     VIEWER: Rights(reads=("*",), asks=("status",), watches=("**",), all_vehicles=True),
     # Only others connect to it; as somebody's peer it has no rights.
     ROUTER: Rights(all_vehicles=True, listens=True),

@@ -1,4 +1,4 @@
-"""Colours of all views, options of ``bridge view``, and where a view goes: window, page or file.
+"""Colours of all views, and where a view goes: window, page or file.
 
 Window and page are rerun's viewer as a process of its own, on loopback: by itself it would bind all
 interfaces.
@@ -6,7 +6,6 @@ interfaces.
 
 from __future__ import annotations
 
-import argparse
 import colorsys
 import contextlib
 import os
@@ -22,11 +21,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from edge_runtime.cli import command, sigterm_as_interrupt, whole_number
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import check_writable, make_directory
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
 if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without it
     import rerun as rr
@@ -41,6 +39,7 @@ POLICY: Colour = (40, 120, 230)
 HUMAN: Colour = (60, 170, 90)
 RETURNING: Colour = (185, 140, 255)
 """The person has let go, and the action is on its way back to the policy's."""
+SHADOW: Colour = (20, 160, 150)  # A policy beside the one that drives
 APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
@@ -72,33 +71,6 @@ SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
 class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
     """The viewer has ended, hangs, or never came."""
-
-
-@command(
-    "bridge.rerun.draw:run",
-    "python -m bridge view --serve",
-    "python -m bridge view --save drive.rrd --wait-s 60",
-    "python -m bridge view drive.mcap --save drive.rrd",
-    "python -m bridge view --foxglove",
-)
-def view(parser: argparse.ArgumentParser) -> None:
-    from bridge.ports import add_options  # It loads zenoh, which the trainer goes without.
-
-    text = "show this recording of bridge record, instead of listening"
-    parser.add_argument("recording", nargs="?", metavar="F.mcap", help=text)
-    add = parser.add_mutually_exclusive_group().add_argument
-    kind: Any = {"dest": "sink", "action": "store_const"}
-    add("--spawn", **kind, const=SPAWN, help="open a rerun window (the default)")
-    add("--serve", **kind, const=SERVE, help="serve a web page on this machine's loopback only")
-    add("--save", dest="sink", metavar="F.rrd", help="write a recording instead of showing it")
-    text = f"serve Foxglove, on this machine's loopback only (default port: {FOXGLOVE_PORT})"
-    number: Any = {"type": whole_number(1, 65535), "const": FOXGLOVE_PORT}
-    add("--foxglove", nargs="?", metavar="PORT", help=text, **number)
-    text = "of --serve: the page's port, and N + 1 for its data (default: two that are free)"
-    parser.add_argument("--port", metavar="N", type=whole_number(1, 65534), help=text)
-    add_options(parser, "--connect", "--tls", "--wait-s")
-    text = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    add_options(parser, "--vehicle-id", default=None, help=text)
 
 
 def has_display() -> bool:

@@ -7,12 +7,11 @@ are lines: rerun cannot turn its flat boxes.
 
 from __future__ import annotations
 
-import cmath
 import contextlib
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,15 +21,14 @@ import rerun.blueprint as rrb
 from bridge import messages
 from bridge import rerun as shown
 from bridge.inbound import BRAKE_PERIODS
-from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenCar, SeenScene
-from bridge.recording import Recording, choose_vehicle, heard_of
+from bridge.messages import DECODERS, Heard, Pace, Point, Scene, SeenScene
 from bridge.rerun import Colour
 from edge_runtime import wire
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.link import link_words
 from edge_runtime.manifest import Layout, Task
 from edge_runtime.util import UserError, counted
-from edge_runtime.wire import DEFAULT_VEHICLE_ID, DRIVE, Command, Feedback, Health, State
+from edge_runtime.wire import DRIVE, Command, Feedback, Health, State
 
 RED, GREY = (220, 50, 50), (120, 124, 130)
 MARGIN_M = 8.0  # Ground shown beyond the path
@@ -114,9 +112,10 @@ class Canvas:
         self.log(CAMERA, rr.Transform3D(translation=[*away_m(scene), 0.0]))
         for name, colour in (("traffic", shown.APPLIED), ("ego", ego_colour)):
             cars = [car for car in scene.vehicles if car.ego == (name == "ego")]
-            half_m, bodies = [car.width_m / 2 for car in cars], list(map(body, cars))
+            half_m, bodies = [car.width_m / 2 for car in cars], list(map(messages.body, cars))
             self._strips(f"road/{name}/body", bodies, colour, half_m, order=3.0)
-            self._strips(f"road/{name}/glass", map(windscreen, cars), shown.GLASS, 0.3, order=4.0)
+            glass = map(messages.windscreen, cars)
+            self._strips(f"road/{name}/glass", glass, shown.GLASS, 0.3, order=4.0)
 
     def _draw_ground(self, scene: SeenScene) -> None:
         self._strips("road/roads", scene.roads, shown.ROAD, scene.road_width_m / 2, order=0.0)
@@ -143,23 +142,6 @@ def away_m(scene: SeenScene) -> list[float]:
         if not all(low <= at <= high for at, (low, high) in place):
             return [at - (low + high) / 2 for at, (low, high) in place]
     return [0.0, 0.0]
-
-
-def body(car: SeenCar) -> list[Point]:
-    """Return the line that fills the car when it is drawn as wide as it is (round ends)."""
-    reach = max(0.0, (car.length_m - car.width_m) / 2)
-    return _line(car, -reach, reach)
-
-
-def windscreen(car: SeenCar) -> list[Point]:
-    """Return the line that tells front from back."""
-    return _line(car, *(complex(0.2 * car.length_m, y * car.width_m) for y in (-0.35, 0.35)))
-
-
-def _line(car: SeenCar, *points: complex) -> list[Point]:
-    """Return points (m) that lie so far ahead of the car's centre, and aside (imaginary)."""
-    placed = (complex(car.x, car.y) + cmath.rect(1.0, car.heading_rad) * each for each in points)
-    return [(each.real, each.imag) for each in placed]
 
 
 def plot_view(origin: str, title: str) -> rrb.TimeSeriesView:
@@ -206,7 +188,7 @@ def two_columns(
 
 
 PLOTS = (
-    ("action", "Command: asked and achieved"),
+    ("action", "Command: asked, achieved; a shadow's, and what it adds"),
     ("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     ("latency", "Latency, ms: round trip, and inference"),
     ("link", "Link each way: mean delay and jitter, ms; loss, %"),
@@ -214,16 +196,19 @@ PLOTS = (
 )
 """From top to bottom."""
 ACTIONS = {"action/asked": shown.POLICY, "action/achieved": shown.APPLIED}
+ACTIONS |= {"action/shadow": shown.SHADOW, "action/apart": RED}
 NO_COMMAND, NO_REASON = "no command", "-"
 MODES = {DRIVE: shown.POLICY, "safe_stop": RED, NO_COMMAND: (160, 30, 120)}
-STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}}
+SHADOW = {DRIVE: shown.SHADOW}
+STATES = {"mode/mode": MODES, "mode/reason": {NO_REASON: GREY}, "mode/shadow": SHADOW}
 
 
 def lay_out(scene: SeenScene | None, pictures: bool = True) -> rrb.Blueprint:
     """Lay out the views; ``pictures``: whether the policy sees any."""
     left = rrb.Vertical(road_view(scene), sees_view(pictures), row_shares=[3, 1.4])
     mode = lanes_view("mode", "Mode, and why it does not drive")
-    right = rrb.Vertical(mode, *(plot_view(*plot) for plot in PLOTS))
+    plots = [plot_view(*plot) for plot in PLOTS]
+    right = rrb.Vertical(mode, *plots, row_shares=[1.5, *[1] * len(plots)])
     return two_columns(left, right, [3, 2], "sim_time")
 
 
@@ -248,6 +233,7 @@ class WireLog:
         self._mode = self._reason = ""
         self._heard_command_ns = self._plan_periods = 0
         self._health: Health | None = None
+        self._shadow: Command | None = None  # The newest answer of a policy in the shadow
 
     def write(self, heard: Heard) -> None:
         """Draw one message as it came; a token shows as silence."""
@@ -284,6 +270,17 @@ class WireLog:
         self._canvas.scalar("action/asked", *command.action)
         self._canvas.scalar("latency/inference", command.inference_ns * 1e-6)
         self._tell(command.mode, command.reason)
+        shadow, same = self._shadow, attrgetter("session", "episode", "step", "mode")
+        if shadow and command.mode == DRIVE and same(shadow) == same(command):
+            both = zip(shadow.action, command.action, strict=False)
+            self._canvas.scalar("action/apart", *(ours - theirs for ours, theirs in both))
+
+    def write_shadow(self, command: Command, _arrived_ns: int) -> None:
+        self._shadow = command
+        self._stand_at(command.session, command.episode, command.step)
+        self._canvas.scalar("action/shadow", *command.action)
+        self._canvas.scalar("latency/shadow", command.inference_ns * 1e-6)
+        self._canvas.state("mode/shadow", command.reason or command.mode)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         self._canvas.scalar("action/achieved", *feedback.action)
@@ -347,25 +344,27 @@ class WireLog:
         self._canvas.status(*lines)
 
 
-def run(arguments: Any) -> int:
-    """Run the command until the simulator goes, or somebody interrupts."""
+def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -> int:
+    """Run the command until the simulator goes, or somebody interrupts.
+
+    ``stage`` makes what is shown of what `bridge.ports.open_source` yields.
+    """
+    from bridge.ports import open_source, wait_to_be_told  # zenoh: a training goes without.
+
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
     sink, opened = "", _foxglove
     if not arguments.foxglove:
         sink, opened = shown.check_sink(arguments.sink, arguments.port), _rerun
-    source = _recorded if arguments.recording else _live
     with (
         sigterm_as_interrupt(),
-        source(arguments) as all_heard,
+        open_source(arguments) as all_heard,
         opened(arguments, sink) as show,
     ):
         try:
-            for heard in all_heard:
+            for heard in stage(all_heard) if stage else filter(None, all_heard):
                 show(heard)
             if arguments.recording and sink == shown.SERVE:
-                from bridge.ports import wait_to_be_told  # It loads zenoh: a training goes without.
-
                 print("all of it is there; ^C ends", flush=True)
                 wait_to_be_told()
         except KeyboardInterrupt:  # The ordinary way to end a page and a live view, which is kept.
@@ -374,32 +373,6 @@ def run(arguments: Any) -> int:
     if sink.endswith(shown.SUFFIX):
         print(f"wrote {sink}")
     return 0
-
-
-@contextlib.contextmanager
-def _live(arguments: Any) -> Iterator[Iterator[Heard]]:
-    from bridge.ports import open_listener
-    from edge_runtime.transport import tls_for
-
-    where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    tls = tls_for(arguments.tls, where)
-    with open_listener(where, vehicle_id, arguments.wait_s, tls) as listener:
-        yield filter(None, listener.until_gone())
-        if listener.dropped:
-            lost = f"{listener.dropped} messages came faster than they could be drawn"
-            print(lost, file=sys.stderr)
-
-
-@contextlib.contextmanager
-def _recorded(arguments: Any) -> Iterator[Iterator[Heard]]:
-    file = Recording(Path(arguments.recording))
-    vehicle_id = choose_vehicle(file, arguments.vehicle_id)
-
-    def all_heard() -> Iterator[Heard]:
-        yield from heard_of(file, vehicle_id)
-        file.say_trouble()
-
-    yield all_heard()
 
 
 @contextlib.contextmanager

@@ -6,8 +6,10 @@ import pytest
 
 from bridge.ports import open_port
 from edge_runtime.reach import free_endpoint
+from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.drives import LEFT_TURN, TOY
 
+OURS = f"{POLICY.absolute()} --public-key {PUBLIC_KEY.absolute()}"
 ROWS = [
     ("simulate --env phil/Nowhere-v0", "Nowhere"),
     ("simulate --env CartPole-v1", "acts in Discrete(2); the wire carries a Box with bounds"),
@@ -27,6 +29,13 @@ ROWS = [
     ("replay LEFT_TURN --policy none.onnx", "does not exist"),
     ("replay missing.mcap --policy p.onnx", "No such file"),
     ("replay there.mcap --policy p.onnx", "no MCAP recording"),
+    ("shadow --policy none.onnx --from LEFT_TURN", "does not exist"),
+    ("shadow --policy OURS --from missing.mcap", "No such file"),
+    ("shadow --policy OURS --from LEFT_TURN --record there.mcap", "exists"),
+    ("shadow --policy OURS --from LEFT_TURN --port 7000", "--serve"),
+    ("shadow --policy OURS --from LEFT_TURN --foxglove", "F.mcap"),
+    ("shadow --policy OURS --from LEFT_TURN --config none.toml", "does not exist"),
+    ("shadow --policy OURS --connect FREE --wait-s 0", "no link"),
     ("view --connect BUSY --save never.rrd --wait-s 0.2", "--vehicle-id"),
     ("view --connect FREE", "no display"),
     ("view --save /dev/null/a.rrd", "Not a directory"),
@@ -50,7 +59,7 @@ def test_bad_input_is_one_line_and_status_2(command, part, refusal, busy, monkey
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "there.mcap").write_bytes(b"mine")
     words = {"TOY": TOY, "BUSY": busy, "LEFT_TURN": str(LEFT_TURN)}
-    found = (free_endpoint() if w == "FREE" else words.get(w, w) for w in shlex.split(command))
-    assert part in refusal(*found)
+    found = shlex.split(command.replace("OURS", OURS))
+    assert part in refusal(*(free_endpoint() if w == "FREE" else words.get(w, w) for w in found))
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
     assert (tmp_path / "there.mcap").read_bytes() == b"mine"

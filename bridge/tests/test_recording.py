@@ -2,8 +2,11 @@
 
 import collections
 import contextlib
+import inspect
 import json
+import math
 import os
+import re
 import resource
 import shutil
 import signal
@@ -12,6 +15,7 @@ import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import foxglove.messages
 import msgspec
 import numpy as np
 import pytest
@@ -23,10 +27,20 @@ from mcap.records import Chunk, Header, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from bridge import ports
+from bridge import ports, recording
 from bridge.messages import DECODERS, Heard, Scene, encode_scene
 from bridge.ports import QUEUE_MESSAGES, WireListener
-from bridge.recording import Log, RawImage, Recording, RecordingWriter, describe, whole_recording
+from bridge.recording import (
+    FOXGLOVE,
+    FrameTransform,
+    Log,
+    RawImage,
+    Recording,
+    RecordingWriter,
+    SceneUpdate,
+    describe,
+    whole_recording,
+)
 from bridge.replay import RecordedDrive, replay
 from bridge.tests.recordings import chunks, flip, health, heard, start_record
 from edge_runtime.cli import quit_on_signals
@@ -36,7 +50,15 @@ from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_STATE_BYTES, Command, Health, State, decode_state, encode
+from edge_runtime.wire import (
+    MAX_STATE_BYTES,
+    Command,
+    Feedback,
+    Health,
+    State,
+    decode_state,
+    encode,
+)
 from hil_tests.processes import wait_until
 from hil_tests.testing.drives import (
     LEFT_TURN,
@@ -50,6 +72,7 @@ from hil_tests.testing.messages import make_command, make_state
 from hil_tests.testing.policies import SIZE, TASK
 
 ODD = Task(task="", observation={"a": Entry(dtype="odd", shape=[1])}, action=[], control_period_s=1)
+ROOT = Path(__file__).parents[2]
 MIB = 1 << 20
 
 
@@ -141,7 +164,10 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
     assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
 
 
-@pytest.mark.parametrize("kind", [State, Command, Health, Scene, RawImage, Log])
+COPIED = (State, Command, Health, Scene, RawImage, Log, SceneUpdate, FrameTransform)
+
+
+@pytest.mark.parametrize("kind", COPIED)
 def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
     name_of_kind, text = describe(kind)
     schema = msgspec.json.decode(text)
@@ -158,6 +184,53 @@ def test_a_copy_has_the_fields_and_types_of_its_schema(kind, drive):
     for copy in copies:
         for name, value in copy.items():
             assert isinstance(value, kinds[schema["properties"][name].get("type")]), name
+
+
+def check_schema(schema):
+    """Fail at what Foxglove's readers do not know, such as references."""
+    assert set(schema) <= {"type", "properties", "items", "contentEncoding"}
+    if schema["type"] == "array":
+        check_schema(schema["items"])
+    elif schema["type"] == "object":
+        for part in schema["properties"].values():
+            check_schema(part)
+    else:
+        assert schema["type"] in ("string", "number", "integer", "boolean")
+
+
+def test_foxglove_can_read_every_schema_and_knows_the_fields_of_its_own():
+    for kind in {*COPIED, *FOXGLOVE}:
+        check_schema(msgspec.json.decode(describe(kind)[1]))
+    kinds = [
+        kind
+        for kind in vars(recording).values()
+        if isinstance(kind, type(msgspec.Struct)) and hasattr(foxglove.messages, kind.__name__)
+    ]
+    assert {*FOXGLOVE} <= {*kinds}
+    for kind in kinds:
+        official = inspect.signature(getattr(foxglove.messages, kind.__name__))
+        assert {*kind.__struct_fields__} <= {*official.parameters}, kind
+
+
+def test_the_road_is_drawn_as_on_a_map(tmp_path):
+    """y grows upwards there, and downwards in the scene."""
+    car: dict[str, Any] = {"x": 1.0, "y": 2.0, "length_m": 4.0, "width_m": 2.0, "ego": True}
+    scene: dict[str, Any] = {"roads": [[[0.0, 0.0], [0.0, 9.0]]], "goal": [3.0, 4.0]}
+    place: dict[str, Any] = {"episode": 0, "step": 3, "sim_time_s": 0.3}
+    scene["vehicles"] = [{**car, "heading_rad": math.pi / 2}]
+    with whole_recording(tmp_path / "a.mcap") as writer:
+        writer.write(heard("scene", encode_scene(scene, Scene(**place)), 5 * 10**9 + 7))
+    found = {topic: msgspec.json.decode(data) for topic, _, data in told_in(tmp_path / "a.mcap")
+             if topic.startswith("view/")}  # fmt: skip
+    assert found["view/v/ego"]["translation"] == {"x": 1.0, "y": -2.0, "z": 0.0}
+    (entity,) = found["view/v/road"]["entities"]
+    assert entity["timestamp"] == {"sec": 5, "nsec": 7}
+    assert [point["y"] for point in entity["lines"][0]["points"]] == [0.0, -9.0]
+    _, _, goal, ego, _ = entity["lines"]
+    assert [(point["x"], point["y"]) for point in goal["points"]] == [(2.5, -4.0), (3.5, -4.0)]
+    assert ego["thickness"] == 2.0
+    ends = [value for point in ego["points"] for value in (point["x"], point["y"])]
+    assert ends == pytest.approx([1.0, -1.0, 1.0, -3.0])  # Round ends, of a metre each
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.9, 0.999])
@@ -331,3 +404,18 @@ def test_a_bomb_is_passed_over(tmp_path, said_mib, tells_size):
     finally:
         tracemalloc.stop()
     assert recording.damaged_places == 2
+
+
+def test_the_layout_for_foxglove_names_what_a_recording_holds(drive):
+    layout = json.loads((ROOT / "docs" / "foxglove.json").read_text())
+    text = json.dumps(layout["configById"])
+    named = set(re.findall(r"view/hunter01/\w+", text))
+    topics = {topic for topic, _, _ in told_in(drive[0])}
+    # A drive without a vehicle and without a policy in the shadow has neither's.
+    assert named - topics == {"view/hunter01/feedback", "view/hunter01/shadow"}
+    placed = re.findall(r'"(\w+!\w+)"', json.dumps(layout["layout"]))
+    assert sorted(placed) == sorted(layout["configById"])
+    schemas = {"state": State, "command": Command, "scene": Scene, "shadow": Command}
+    for topic, field in re.findall(r"view/hunter01/(\w+)\.(\w+)", text):
+        kind = schemas.get(topic, Feedback)
+        assert field in msgspec.json.decode(describe(kind)[1])["properties"]

@@ -51,7 +51,7 @@ ALONG_Y = messages.SeenCar(
 
 
 def test_a_car_is_drawn_in_place_and_the_view_shows_the_path():
-    lines = [*draw.body(ALONG_Y), *draw.windscreen(ALONG_Y)]
+    lines = [*messages.body(ALONG_Y), *messages.windscreen(ALONG_Y)]
     assert np.round(lines, 9).tolist() == [[5.0, 1.0], [5.0, 3.0], [5.7, 2.8], [4.3, 2.8]]
     path = [(0.0, 0.0), (50.0, 0.0)]
     view: Any = draw.road_view(messages.SeenScene(path=path, vehicles=[ALONG_Y]))

@@ -12,7 +12,8 @@ from edge_runtime.tls import load_tls
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import call, exit_status, refusal
 
-PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
+ROLES = ("edge", "simulator", "operator", "shadow")
+PARTIES = {"router", "viewer", *(f"{role}-hunter01" for role in ROLES)}
 
 
 def make(folder, *options):
@@ -60,7 +61,7 @@ def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path):
     assert make(folder, "--vehicle-id", "two", "--host", "bench.local", "--host", "10.0.0.7") == 0
     after = contents(folder)
     assert before.items() <= after.items()
-    new = {f"{role}-two" for role in ("edge", "simulator", "operator")}
+    new = {f"{role}-two" for role in ROLES}
     assert {p.parts[0] for p in set(after) - set(before)} == new
     names = extension(folder / "simulator-two", x509.SubjectAlternativeName)
     hosts = {str(name.value) for name in names}

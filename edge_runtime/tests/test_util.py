@@ -124,7 +124,7 @@ def test_signals_that_end_a_process_are_interrupts_unless_they_are_ignored(monke
 
 @pytest.mark.parametrize("heeded", [True, False])
 def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(heeded, monkeypatch):
-    before, asked = [signal.getsignal(each) for each in cli.SIGNALS], []
+    before, asked = [signal.getsignal(each) for each in cli.ENDING_SIGNALS], []
 
     def ask():
         asked.append(1)
@@ -132,10 +132,10 @@ def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(heeded,
 
     with cli.quit_on_signals(ask):
         if heeded:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGHUP)
             signal.raise_signal(signal.SIGINT)  # So soon it is the same: `timeout` tells twice.
         monkeypatch.setattr(cli, "AGAIN_S", -1.0)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert asked == [1]
-    assert [signal.getsignal(each) for each in cli.SIGNALS] == before
+    assert [signal.getsignal(each) for each in cli.ENDING_SIGNALS] == before

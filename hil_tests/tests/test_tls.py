@@ -33,7 +33,8 @@ from hil_tests.testing.policies import T
 SETTLE_S = 0.4
 """Until both ends know of a declaration, and until what must not come would have come."""
 VEHICLES = ("hunter01", "hunter02")
-STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", "viewer")
+LISTENERS = ("viewer", "shadow-hunter01")
+STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", *LISTENERS)
 FOREIGN = {"malformed", "foreign_session"}
 
 
@@ -194,10 +195,11 @@ def test_a_certificate_that_really_expires_stops_the_vehicle(parties, tmp_path):
 
 def test_every_process_ends_with_its_certificate(parties, tmp_path):
     place, out = free_endpoint("tls"), tmp_path / "drive.mcap"
-    edge_files, simulator, viewer, router = files = [
+    edge_files, simulator, viewer, router, beside = files = [
         short_lived(parties, tmp_path / name, life_s)
         for name, life_s in
-        (("edge-hunter01", 7.0), ("simulator-hunter01", 8.0), ("viewer", 8.0), ("router", 10.0))
+        (("edge-hunter01", 7.0), ("simulator-hunter01", 8.0), ("viewer", 8.0), ("router", 10.0),
+         ("shadow-hunter01", 9.0))
     ]  # fmt: skip
     flags = edge_flags(place, tmp_path, edge_files)
     where = ("--connect", place, "--tls")
@@ -207,9 +209,10 @@ def test_every_process_ends_with_its_certificate(parties, tmp_path):
         Process("bridge", "simulate", *drive, *where, str(simulator)) as run,
         run_edge(*flags, "--vehicle", "mock") as edge,
         Process("bridge", "record", "--out", str(out), *where, str(viewer)) as recorder,
+        Process("bridge", "shadow", *flags[:3], *where, str(beside)) as shadow,
     ):
         edge.wait_for_line("now=drive")
-        for process, folder in zip((edge, run, recorder, hub), files, strict=True):
+        for process, folder in zip((edge, run, recorder, hub, shadow), files, strict=True):
             assert process.wait() == 2
             assert expired_in(process.errors.splitlines()[-1], folder), process.errors
             assert "Traceback" not in process.errors
@@ -251,11 +254,12 @@ def test_a_drive_over_mutual_tls_among_intruders(parties, tmp_path):
     # A pause of a busy machine may make a message stale; these are an intruder's only.
     assert not FOREIGN & set(report["rejected"])
     assert int(re.findall(r"accepted=(\d+)", log)[-1]) >= 30
-    for name in STRANGERS[:-1]:
+    for name in set(STRANGERS) - set(LISTENERS):
         assert loot[name] == (set(), set()), name
-    heard, answered = loot["viewer"]
-    assert {f"phil/hunter01/{suffix}" for suffix in ("state", "command", "alive")} <= heard
-    assert answered - {"phil/hunter01/alive"} == {"phil/hunter01/status"}
+    for name, may_ask in zip(LISTENERS, ({"phil/hunter01/status"}, set()), strict=True):
+        heard, answered = loot[name]
+        assert {f"phil/hunter01/{suffix}" for suffix in ("state", "command", "alive")} <= heard
+        assert answered - {"phil/hunter01/alive"} == may_ask, name
 
 
 def test_without_tls_the_same_intruder_gets_through(tmp_path):
