@@ -84,7 +84,12 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_q_advantage_only": replace(PHIL, human_td_weight=0.0),
     "phil_advantage_0.1": replace(PHIL, advantage_weight=0.1),
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
-    "phil_weighted": replace(PHIL, weighted_cloning=True),
+    # For humans who err: by both settings few wrong actions count little, and none for ever.
+    "phil_weighted": replace(
+        PHIL,
+        weighted_cloning=True,
+        settings={**FASTER, "cloning_share": 0.5, "cloning_bound": 0.1},
+    ),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
     "phil_without_shaping": replace(PHIL, penalty=False),
     # HG-DAgger (1810.02890), with the replay of the others: IA-TD3 without reinforcement learning,
@@ -229,6 +234,12 @@ class LearnerConfig:
     cloning_weight: float = 40.0
     """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen on
     single runs: with a small weight the policy forgot the human before the critic knew better."""
+    cloning_share: float = 0.0
+    """Share of the run in which that weight falls linearly to 0; 0: it stays. A human who errs is
+    imitated to the end otherwise."""
+    cloning_bound: float = 0.0
+    """Distance from the human's action beyond which the loss grows in proportion, no longer with
+    the square; 0: none. A few wrong actions then count little beside the right ones."""
     preference_beta: float = 0.1
     """How sharply a preference tells two actions apart, per squared distance; the lower, the less
     it minds that the better one is nearer already (2510.01545: beta)."""
@@ -274,7 +285,7 @@ WORDS = {"precision": ("float32", "bfloat16"), "penalty_on": (OVERRULED_ACTION, 
 RANGES = {
     FROM_ONE: ("return_steps", "policy_delay", "warmup_steps"),
     SHARE: ("learning_rate_decay", "learning_rate_final", "gamma", "tau",
-            "exploration_correlation", "alpha", "beta"),
+            "exploration_correlation", "alpha", "beta", "cloning_share"),
     ABOVE_ZERO: ("exploration_share", "priority_offset"),
     ANY: ("intervention_penalty",),
     (1, 2): ("frames",),

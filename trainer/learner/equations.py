@@ -134,13 +134,21 @@ def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:
 
 
 def behaviour_cloning_loss(
-    actions: Tensor, human_actions: Tensor, human: Tensor, weights: Tensor | None = None
+    actions: Tensor,
+    human_actions: Tensor,
+    human: Tensor,
+    weights: Tensor | None = None,
+    bound: float = 0.0,
 ) -> Tensor:
     """Return the mean squared distance to the human's actions: eq. 23's second term, unweighted.
 
-    ``weights`` [n]: what each sample counts, in mean about 1.
+    ``weights`` [n]: what each sample counts, in mean about 1. Beyond ``bound``, unless that is 0, a
+    distance counts in proportion (pseudo-Huber): then the actor learns what most of the human's
+    actions in a state are, not their mean.
     """
     distances = (human_actions - actions).square().sum(dim=1)
+    if bound:
+        distances = 2.0 * bound**2 * ((1.0 + distances / bound**2).sqrt() - 1.0)
     return _masked_mean(distances if weights is None else weights * distances, human)
 
 

@@ -86,6 +86,7 @@ class TD3Learner:
                 group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
+        self._cloning_weight = config.cloning_weight
         # bfloat16 has 8 bits of precision: enough for pixels, too few for numbers.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
@@ -136,7 +137,7 @@ class TD3Learner:
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
-            loss = policy + c.cloning_weight * cloning
+            loss = policy + self._cloning_weight * cloning
             if c.saturation_weight:
                 loss = loss + c.saturation_weight * score.square().mean()
             _differentiate(loss, self.actor)
@@ -147,9 +148,14 @@ class TD3Learner:
         critics, actor, clone, mean = (one.item() for one in (critic_loss, policy, cloning, value))
         return Losses(critics, actor, clone, mean, priorities.double().cpu().numpy())
 
-    def decay_learning_rates(self, progress: float) -> None:
-        """Decay both rates after an episode (table A5); ``progress`` is the share of the run."""
+    def decay(self, progress: float) -> None:
+        """Decay both rates (table A5) and the weight on cloning after an episode.
+
+        ``progress`` is the share of the run.
+        """
         c = self.config
+        if c.cloning_share:
+            self._cloning_weight = c.cloning_weight * max(0.0, 1.0 - progress / c.cloning_share)
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
         for optimiser in (self.actor_optimiser, self.critic_optimiser):
             for group in optimiser.param_groups:
@@ -159,7 +165,8 @@ class TD3Learner:
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimisers, noise and counters: all that a resumed run needs."""
         parts = {name: getattr(self, name).state_dict() for name in (*NETWORKS, *OPTIMISERS)}
-        return {**parts, "noise": self.noise.get_state(), "updates": self.updates}
+        counted = {"updates": self.updates, "cloning_weight": self._cloning_weight}
+        return {**parts, "noise": self.noise.get_state(), **counted}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``."""
@@ -171,7 +178,7 @@ class TD3Learner:
                 # torch does not check.
                 raise ValueError("an optimiser's state is of other weights")
         self.noise.set_state(state["noise"])
-        self.updates = state["updates"]
+        self.updates, self._cloning_weight = state["updates"], state["cloning_weight"]
 
     def _precision(self) -> torch.autocast:
         kind = self.device.type
@@ -272,7 +279,9 @@ class TD3Learner:
         if not cloned:
             return policy, nothing
         weights = equations.cloning_weights(*judged) if row.weighted_cloning else None
-        return policy, equations.behaviour_cloning_loss(own_actions, actions, human, weights)
+        bound = self.config.cloning_bound
+        cloning = equations.behaviour_cloning_loss(own_actions, actions, human, weights, bound)
+        return policy, cloning
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
         """Prefer the human's action in the states to which the overruled one would have led."""

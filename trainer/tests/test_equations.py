@@ -64,6 +64,10 @@ TARGETS, VALUES = t(1.0, 3.0, 2.0, 1.0), t(1.0, 10.0, 3.0, 20.0)
         (eq.behaviour_cloning_loss,
          (t(0, 0.5, 0, -1)[:, None], t(9, 1, 9, 1)[:, None], HUMAN, t(0, 2, 0, 1)),
          (2 * 0.25 + 4.0) / 2),
+        # Near the square below the bound of 0.5, near 2 * 0.5 times the distance above it.
+        (eq.behaviour_cloning_loss,
+         (t(0, 0.5, 0, -1)[:, None], t(9, 1, 9, 1)[:, None], HUMAN, None, 0.5),
+         0.5 * (math.sqrt(2.0) + math.sqrt(17.0) - 2.0) / 2),
         # What the critic finds as good counts as before; at odds of 3 to 1, half more.
         (eq.cloning_weights, (t(1, math.log(3.0)), t(1, 0)), [1.0, 1.5]),
     ],

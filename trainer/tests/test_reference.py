@@ -114,7 +114,11 @@ class ReferenceLearner:
         if cloned:
             weights = 2.0 / (1.0 + torch.exp(judged[1] - judged[0]))
             cloning = equations.behaviour_cloning_loss(
-                own_actions, actions, human, weights if row.weighted_cloning else None
+                own_actions,
+                actions,
+                human,
+                weights if row.weighted_cloning else None,
+                c.cloning_bound,
             )
         if row.foresight and batch.foreseen is not None:
             names = ("next_frames", "actions", "overruled")

@@ -11,7 +11,7 @@ from trainer.learner import networks
 from trainer.learner.config import PHIL
 from trainer.learner.networks import FEATURES, Actor, Critic
 from trainer.learner.td3 import TD3Learner
-from trainer.tests.learners import SMALL, make_batch
+from trainer.tests.learners import SMALL, make_batch, same_weights
 
 
 def test_the_networks_are_those_of_tables_a2_to_a4():
@@ -32,7 +32,20 @@ def test_both_learning_rates_fall_by_the_episode_and_over_the_run():
         )
         assert actor == pytest.approx(SMALL.actor_learning_rate * factor)
         assert critics == pytest.approx(SMALL.critic_learning_rate * factor)
-        learner.decay_learning_rates(progress)
+        learner.decay(progress)
+
+
+def test_the_weight_on_cloning_falls_to_nothing_and_a_checkpoint_keeps_it():
+    settings = replace(SMALL, cloning_share=0.5)
+    learner, resumed = (TD3Learner(settings, PHIL, seed) for seed in (0, 1))
+    never = TD3Learner(replace(settings, cloning_weight=0.0), PHIL, seed=0)
+    for each in (learner, never):
+        each.decay(0.5)
+    resumed.load_state_dict(learner.state_dict())
+    for each in (learner, never, resumed):
+        each.update(make_batch())
+    assert same_weights(learner, never)
+    assert same_weights(resumed, never)
 
 
 def test_pictures_are_shifted_by_some_pixels_and_by_no_more():

@@ -162,7 +162,7 @@ class LearningThread:
         ``progress`` is the run's, 0 to 1. Losses are nan where there was no update. ``keep`` is
         False where a person discards the episode, which only `UnhurriedLearning` can still forget.
         """
-        self.learner.decay_learning_rates(progress)
+        self.learner.decay(progress)
         means = np.mean(self._losses, axis=0) if self._losses else [math.nan] * len(LOSSES)
         names = (*LOSSES, "policy_priority", "human_priority")
         learned = {
