@@ -77,14 +77,7 @@ def run(arguments: Any) -> int:
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
-    report = {
-        "recording": arguments.recording,
-        "policy_id": policy.policy_id,
-        "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), arguments.tolerance),
-    }
-    if report["compared"] == 0:
-        raise UserError(f"{arguments.recording} holds no state with an answer of its policy")
+    report = report_replay(drive, policy, config, arguments.tolerance)
     write_json_out(arguments.out, report)
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
@@ -95,6 +88,21 @@ def run(arguments: Any) -> int:
         place = f"episode {row['episode']} step {row['step']}"
         print(printable(f"  {place}: recorded {row['recorded']}; replayed {row['replayed']}"))
     return DIFFERENT if report["different"] else 0
+
+
+def report_replay(
+    drive: RecordedDrive, policy: Policy, config: Config, tolerance: float = DEFAULT_TOLERANCE
+) -> dict[str, Any]:
+    """Replay a drive and return the command's report; UserError where nothing can be compared."""
+    report = {
+        "recording": str(drive.recording.path),
+        "policy_id": policy.policy_id,
+        "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
+        **compare(replay(drive, policy, config), tolerance),
+    }
+    if report["compared"] == 0:
+        raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")
+    return report
 
 
 class RecordedDrive:

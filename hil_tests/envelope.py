@@ -202,6 +202,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+class UntoldError(UserError):
+    """The environment does not say how a drive ended."""
+
+
 class Drivers(ProcessPoolExecutor):
     """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
 
@@ -221,13 +225,13 @@ class Drivers(ProcessPoolExecutor):
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Drive an episode for each seed; return the results without their actions.
 
-        Raises UserError where the environment does not report of each drive how it ended.
+        Raises UntoldError where the environment does not report of each drive how it ended.
         """
         results = list(self.map(partial(_drive, spec), seeds))
         self._ends.update(result.outcome for result in results)
         # A step limit is a timeout as soon as the end of any other drive was reported.
         if UNKNOWN in self._ends or len(self._ends) == 1:
-            raise UserError("no outcome or is_success in info tells whether it succeeded")
+            raise UntoldError("no outcome or is_success in info tells whether it succeeded")
         return [
             replace(result, outcome=TIMEOUT) if result.outcome == TRUNCATED else result
             for result in results

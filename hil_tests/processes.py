@@ -166,7 +166,7 @@ class Process:
             self.lines.append((seen_s, line.rstrip()))
 
 
-def _operate(endpoint: str, vehicle_id: str, end: threading.Event) -> None:
+def operate(endpoint: str, vehicle_id: str, end: threading.Event) -> None:
     """Re-arm a vehicle after each safe stop, in place of the person of an unattended drive."""
     while not end.wait(OPERATOR_LOOKS_EVERY_S):
         with contextlib.suppress(UserError):  # no runtime yet, or no more
@@ -203,7 +203,7 @@ def drive_shown(
         beside = Process("bridge", *listener, *common, shown=True) if listener else None
         stack.enter_context(beside or contextlib.nullcontext())
         end = threading.Event()
-        operator = threading.Thread(target=_operate, args=(endpoint, vehicle_id, end))
+        operator = threading.Thread(target=operate, args=(endpoint, vehicle_id, end))
         stack.callback(operator.join)
         stack.callback(end.set)
         operator.start()
