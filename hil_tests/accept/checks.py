@@ -1,190 +1,218 @@
-"""The table of checks: each asks one thing of policy, link, vehicle or board, and gives rows."""
+"""The table of checks: each asks one thing of policy, link, vehicle or board."""
 
 from __future__ import annotations
 
-import io
+import contextlib
 import shlex
 import subprocess
 import sys
-import tarfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, suppress
-from dataclasses import replace
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from bridge.environments import NOMINAL
 from bridge.network import LatencySpec
-from bridge.outcomes import Estimate, settled
+from bridge.outcomes import GOAL, Estimate, success_estimate
 from bridge.recording import Recording, valid_messages
-from bridge.replay import DEFAULT_TOLERANCE, RecordedDrive, report_replay
+from bridge.replay import RecordedDrive, report_replay
 from deploy.bundle import UNATTENDED
-from edge_runtime.config import NONE
-from edge_runtime.policy import SIGNATURE_SUFFIX
+from edge_runtime.config import NONE, Config
+from edge_runtime.policy import SIGNATURE_SUFFIX, Policy
+from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, counted, parse_json, read_json
-from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.wire import Command
-from hil_tests.accept.job import (
-    NOT_TRIED,
-    PASSED,
-    VEHICLE_ID,
-    Job,
-    Row,
-    judged,
-    not_tried,
-)
-from hil_tests.envelope import UntoldError
-from hil_tests.faults.rig import free_bus
+from hil_tests.campaign import missed_in
+from hil_tests.envelope import Drivers, UntoldError
+from hil_tests.faults.rows import Row as Fault
 from hil_tests.faults.run import ROWS, run_faults
-from hil_tests.processes import Process
-from trainer.environments import make_environment
-from trainer.evaluation import drive_episodes, load_driver
-from trainer.util import cores
+from hil_tests.processes import Process, operator
+from trainer.evaluation import NO_NETWORK, evaluate
 
-NO_NETWORK = LatencySpec()
 SIGNATURE, INFERENCE = GATES = ("signature and manifest", "inference time")
-"""What fails here is not driven."""
-DRIVE, DRIVE_FILE = "drives in real time", "drive.mcap"
-CONFORMANCE_S, CHECK_S = 600.0, 300.0
-DISTURBED_TRIES = 3
-AT_ONCE = 8  # Faults between two writes of what is done
+"""A policy that fails in one of these is not driven."""
+DRIVE, DRIVE_FILE, VEHICLE_ID = "link: round trip in real time", "drive.mcap", "accept"
+START_S, EPISODE_S, CHECK_S, CONFORMANCE_S = 60.0, 120.0, 300.0, 600.0  # At most
 AXES = {"delay": ("delay_ms", 1000.0, 25.0, "ms"), "loss": ("loss_percent", 50.0, 1.0, "%")}
-"""What of a network gets worse each way: field, the most that is tried, resolution, unit."""
+"""What gets worse each way: the network's setting, the most that is tried, resolution, unit."""
+REALTIME = ("--clock", "realtime", "--latency")
+
+
+class Found(NamedTuple):
+    """What a check measured, and what is wrong, empty where it passed; both in words."""
+
+    measured: str
+    wrong: str = ""
+    data: Mapping[str, Any] = MappingProxyType({})  # For the page
 
 
 class Check(NamedTuple):
-    """A line of the table: what it gives, and about how long it takes on two idle cores, s."""
+    """A line of the table. UserError fails it; an UntoldError says that it cannot be tried."""
 
     name: str
-    run: Callable[[Job], Iterable[Row]]
-    takes_s: float
+    asked: str
+    takes_s: float  # About, on two idle cores
+    run: Callable[[Job], Found]
+    skipped: str = ""  # Why it is not tried
+
+
+@dataclass
+class Job:
+    """What is judged. ``policy`` is None where it may not drive, which ``refusal`` tells."""
+
+    asked: Namespace
+    settings: Any  # The keys of accept.toml
+    policy_id: str
+    policy: Policy | None
+    refusal: str
+    config: Config  # With the vehicle
+    trust: list[str]  # Options of a command that reads the policy
+
+    @property
+    def path(self) -> Path:
+        return Path(self.asked.out)
+
+    @property
+    def period_s(self) -> float:
+        return self.policy.manifest.control_period_s if self.policy else 0.0
+
+    @contextlib.contextmanager
+    def driving(self, condition: str = NOMINAL) -> Iterator[Callable[[LatencySpec, int], Estimate]]:
+        """Give a function of a network and a number of drives: the success, in virtual time."""
+        asked = self.asked
+        with Drivers(asked.policy, asked.env, condition, asked.public_key, 0) as drivers:
+
+            def share(spec: LatencySpec, runs: int) -> Estimate:
+                results = drivers.drive(spec, range(runs))
+                return success_estimate(sum(each.outcome == GOAL for each in results), runs)
+
+            yield share
+
+    def drive(
+        self, episodes: int, *more: str, record: Path | None = None, vehicle: str = NONE
+    ) -> dict[str, Any]:
+        """Drive over the wire, and return the simulator's report; an operator re-arms a vehicle."""
+        out, endpoint = self.path / "drive.json", free_endpoint()
+        ends = [(way, endpoint, "--vehicle-id", VEHICLE_ID) for way in ("--listen", "--connect")]
+        what = (
+            "--env",
+            self.asked.env,
+            "--episodes",
+            str(episodes),
+            "--period",
+            str(self.period_s),
+        )
+        edge = ["--config", self.settings.edge] if self.settings.edge else []
+        with contextlib.ExitStack() as stack:
+            start = stack.enter_context
+            simulate = ("bridge", "simulate", *what, "--out", str(out), *ends[0])
+            simulator = start(Process(*simulate, *more))
+            if record:
+                record.unlink(missing_ok=True)
+                to = ("bridge", "record", "--out", str(record), "--wait-s", str(START_S))
+                start(Process(*to, *ends[1], ready="recording"))
+            run = ("edge_runtime", "run", "--policy", self.asked.policy, *self.trust, *ends[1])
+            start(Process(*run, *edge, "--vehicle", vehicle, ready="ready"))  # Now it drives.
+            if vehicle != NONE:
+                start(operator(endpoint, VEHICLE_ID))
+            simulator.succeed(START_S + episodes * EPISODE_S)
+        return read_json(out, "report")
 
 
 def table(job: Job) -> list[Check]:
-    """Return all checks in order, those that end the others first."""
-    runs, sweep, drives = job.settings.runs, job.settings.sweep_runs, job.settings.drives
-    recordings = [(f"replay of {Path(path).name}", path) for path in job.settings.recordings]
-    recordings.insert(0, ("replay of these drives", str(job.folder / DRIVE_FILE)))
+    """Return all checks in order; those of GATES come first."""
+    ask, link, vehicle = job.settings, job.asked.link, job.config.vehicle
+    unlinked = "no --link is declared" if link == NO_NETWORK else ""
+    unnamed = "no --vehicle is named" if vehicle == NONE else ""
+    share_s, sweep_s = 6.0 + 0.05 * ask.runs, 0.05 * ask.sweep_runs * (3 if job.asked.quick else 9)
+    replays = {
+        "these drives": str(job.path / DRIVE_FILE),
+        **{path: path for path in ask.recordings},
+    }
     return [
-        Check(SIGNATURE, signature, 1.0),
-        Check(INFERENCE, inference, 3.0),
-        Check("over the wire as in process", over_the_wire, 8.0 + job.settings.wire_runs),
-        *(Check(f"success, {condition}", partial(success, condition), 6.0 + 0.05 * runs)
-          for condition in job.settings.success),
-        Check("success behind the link", behind_the_link, 6.0 + 0.05 * runs),
-        *(Check(f"distance to the limit of {axis}", partial(distance, axis),
-                8.0 + 0.06 * sweep * (2 if job.asked.quick else 9)) for axis in AXES),
-        Check(DRIVE, in_real_time, 10.0 + 9.0 * drives),
-        *(Check(name, partial(replayed, name, path), 4.0) for name, path in recordings),
-        Check("driver's conformance", conformance, 40.0 * job.has_vehicle),
-        Check("drives with the vehicle", with_vehicle,
-              (10.0 + 12.0 * job.settings.vehicle_drives) * job.has_vehicle),
-        *faults(job),
+        Check(SIGNATURE, "signed by the known key; manifest and graph agree", 1.0, trusted),
+        Check(INFERENCE, f"p99 at most {ask.inference_share:g} T", 4.0, inference),
+        Check("over the wire as in process", f"{ask.wire_runs} drives with the same end",
+              12.0 + 2.0 * ask.wire_runs, over_the_wire),
+        *(Check(f"success, {condition}", at_least(least), share_s,
+                partial(success, condition, NO_NETWORK, least))
+          for condition, least in ask.success.items()),
+        Check("link: success", at_least(ask.success_link), share_s,
+              partial(success, NOMINAL, link, ask.success_link), unlinked),
+        *(Check(f"link: distance to the limit of {axis}", f"{at_least(ask.success_link)} with"
+                f" {getattr(ask, f'margin_{field}'):g} {unit} more each way", 8.0 + sweep_s,
+                partial(distance, axis)) for axis, (field, _, _, unit) in AXES.items()),
+        Check(DRIVE, f"p99 from state sent to command received at most {ask.round_trip_s:g} s",
+              10.0 + 9.0 * ask.drives, in_real_time),
+        *(Check(f"replay of {name}", "this policy made it, and answers as it did then", 4.0,
+                partial(replay, path)) for name, path in replays.items()),
+        Check("driver's conformance", "every rule kept", 30.0, conformance, unnamed),
+        Check("drives with the vehicle", f"no fault; {at_least(ask.success_vehicle)} to the goal",
+              10.0 + 12.0 * ask.vehicle_drives, with_vehicle, unnamed),
+        *(Check(f"fault {row.name}", f"{row.done}: {row.expected}", 3.0 + 2.5 * ask.tries,
+                partial(fault, row), left_out(row, job)) for row in ROWS),
     ]  # fmt: skip
 
 
-def signature(job: Job) -> Iterator[Row]:
-    asked = "signed by the known key; manifest, graph and answers agree"
-    policy = job.policy
-    told = f"{policy.trust}, policy_id {policy.policy_id[:12]}" if policy else "refused"
-    yield judged(policy is not None, SIGNATURE, asked, told, job.refusal)
+def at_least(share: float) -> str:
+    return f"at least {100 * share:g} %"
 
 
-def inference(job: Job) -> Iterator[Row]:
-    most_ms = 1e3 * job.settings.inference_share * job.period_s
-    where = job.asked.board or "this machine"
-    asked = f"p99 at most {most_ms:.0f} ms on {where} (T is {1e3 * job.period_s:.0f} ms)"
-    try:
-        found = check_there(job)["inference_ms"]
-    except UserError as error:
-        yield judged(False, INFERENCE, asked, "", str(error))
-        return
-    told = f"p50 {found['p50']:.2f}, p99 {found['p99']:.2f} ms"
-    why = f"p99 {found['p99']:.1f} ms is too slow"
-    yield judged(found["p99"] <= most_ms, INFERENCE, asked, told, why, **found)
+def trusted(job: Job) -> Found:
+    return Found(job.policy.trust if job.policy else "refused", job.refusal)
 
 
-def check_there(job: Job) -> dict[str, Any]:
-    """Return the report of ``edge_runtime check``, from here or from the board by ssh."""
-    command, sent = [sys.executable, "-m", "edge_runtime"], None
-    words, board = ["check", job.asked.policy, *job.trust], job.asked.board
-    if board:
-        policy, key = Path(job.asked.policy), job.policy and job.policy.public_key
-        files = {"p.onnx": policy, "p.onnx.sig": Path(f"{policy}{SIGNATURE_SUFFIX}")}
-        files |= {"policy.pub": Path(key)} if key else {}
-        sent = _tar({name: path for name, path in files.items() if path.exists()})
-        trust = ["--public-key", "policy.pub"] if key else ["--allow-unsigned"]
-        check = shlex.join([job.settings.board_command, "check", "p.onnx", *trust])
+def inference(job: Job) -> Found:
+    """Ask ``edge_runtime check``, here or on the board by ssh."""
+    policy, key = Path(job.asked.policy), job.policy and job.policy.public_key
+    command = [sys.executable, "-m", "edge_runtime", "check", str(policy), *job.trust]
+    if board := job.asked.board:
+        trust = ["--public-key", Path(key).name] if key else ["--allow-unsigned"]
+        check = shlex.join([job.settings.board_command, "check", policy.name, *trust])
         there = f"d=$(mktemp -d) && cd $d && tar -xf - && {check}; s=$?; rm -rf $d; exit $s"
-        command, words = ["ssh", *UNATTENDED, "--", board], [there]
+        command = ["ssh", *UNATTENDED, "--", board, there]
+        files = [policy, Path(f"{policy}{SIGNATURE_SUFFIX}"), *([Path(key)] if key else [])]
+        words = [word for f in files if f.exists() for word in ("-C", str(f.parent), f.name)]
+        packing = ["tar", "-cf", "-", *words]
     try:
-        done = subprocess.run([*command, *words], input=sent, capture_output=True, timeout=CHECK_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise UserError(f"{board or 'check'}: {error}") from None
+        sent = subprocess.run(packing, capture_output=True, check=True).stdout if board else None
+        done = subprocess.run(command, input=sent, capture_output=True, timeout=CHECK_S)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise UserError(str(error)) from None
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise UserError(said[-1] if said else f"it ended with status {done.returncode}")
-    return parse_json(done.stdout, "the report of check")
+        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise UserError(said.removeprefix("error: ") or f"it ended with status {done.returncode}")
+    found = parse_json(done.stdout, "the report of check")["inference_ms"]
+    most_ms = 1e3 * job.settings.inference_share * job.period_s
+    told = f"p50 {found['p50']:.2f}, p99 {found['p99']:.2f} ms on {board or 'this machine'}"
+    return Found(told, f"that is over {most_ms:.0f} ms" if found["p99"] > most_ms else "")
 
 
-def _tar(files: dict[str, Path]) -> bytes:
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w") as archive:
-        for name, path in files.items():
-            archive.add(path, name)
-    return packed.getvalue()
+def over_the_wire(job: Job) -> Found:
+    asked, count = job.asked, job.settings.wire_runs
+    here = evaluate(asked.policy, asked.env, runs=count, public_key=asked.public_key).episodes
+    there = job.drive(count)["per_episode"]
+    ends = [
+        ((a["outcome"], a["steps"]), (b.outcome, b.steps)) for a, b in zip(there, here, strict=True)
+    ]
+    apart = [f"seed {seed}: {a} and {b}" for seed, (a, b) in enumerate(ends) if a != b]
+    return Found(f"{count - len(apart)} of {count}", "; ".join(apart))
 
 
-def over_the_wire(job: Job) -> Iterator[Row]:
-    count, asked = job.settings.wire_runs, job.asked
-    for _ in range(DISTURBED_TRIES):
-        report = job.drive(count)
-        if not report["wall_clock_stalls"]:  # Else the machine itself stood still.
-            break
-    with closing(make_environment(asked.env, period_s=job.period_s)) as env:
-        driver, _ = load_driver(asked.policy, env, asked.public_key)
-        here = drive_episodes(env, driver, range(count))
-    outcomes = settled(each.outcome for each in here)
-    ours = [(outcome, each.steps) for outcome, each in zip(outcomes, here, strict=True)]
-    theirs = [(each["outcome"], each["steps"]) for each in report["per_episode"]]
-    apart = [seed for seed in range(count) if ours[seed] != theirs[seed]]
-    first = ", ".join(f"seed {s}: {theirs[s]} over the wire, {ours[s]} here" for s in apart[:1])
-    ask = f"outcome and length of each of {counted(count, 'drive')} the same"
-    yield judged(not apart, "over the wire as in process", ask, f"{count - len(apart)} same", first)
-
-
-def share_row(name: str, least: float, share: Estimate, why: str = "", **data: Any) -> Row:
-    """Judge a share by the lower end of its interval."""
-    asked, told = f"95 % sure of at least {least:.0%}", f"{share.as_share()} % of {share.size}"
-    why = why or f"the drives show no more than {share.low:.1%}"
-    return judged(share.low >= least, name, asked, told, why, share=share, least=least, **data)
-
-
-def success(condition: str, job: Job) -> Iterator[Row]:
-    name = f"success, {condition}"
+def success(condition: str, link: LatencySpec, least: float, job: Job) -> Found:
+    """Judge the share by the lower end of its interval."""
     try:
         with job.driving(condition) as share:
-            found = share(NO_NETWORK, job.settings.runs)
-    except UntoldError as error:
-        yield not_tried(name, str(error))
+            found = share(link, job.settings.runs)
     except UserError as error:
-        if condition == NOMINAL:
-            raise
-        yield not_tried(name, str(error))  # An environment need not have the scene.
-    else:
-        yield share_row(name, job.settings.success[condition], found)
-
-
-def behind_the_link(job: Job) -> Iterator[Row]:
-    name, link = "success behind the link", job.link
-    if link == NO_NETWORK:
-        yield not_tried(name, "no --link is declared")
-        return
-    with job.driving() as share:
-        found = share(link, job.settings.runs)
-    yield share_row(f"{name}", job.settings.success_link, found, link=str(link))
+        # An environment need not have the scene.
+        raise (error if condition == NOMINAL else UntoldError(error)) from None
+    wrong = f"the lower end of its interval is below {100 * least:g} %" if found.low < least else ""
+    return Found(f"{found.as_share()} % of {found.size} drives", wrong)
 
 
 def network_at(link: LatencySpec, field: str, value: float) -> LatencySpec:
@@ -198,157 +226,107 @@ def network_at(link: LatencySpec, field: str, value: float) -> LatencySpec:
 
 
 def mean_of(link: LatencySpec, field: str) -> float:
-    return (getattr(link.up, field) + getattr(link.down, field)) / 2
+    return float(getattr(link.up, field) + getattr(link.down, field)) / 2
 
 
-def distance(axis: str, job: Job) -> Iterator[Row]:
-    """Judge the network that is worse by the margin; look for the limit unless it is to be quick.
+def distance(axis: str, job: Job) -> Found:
+    """Judge the link with the margin on top; look for the limit unless it is to be quick.
 
-    The limit is the largest value found up to which the lower end of the interval is high enough.
+    The limit is the largest value found up to which the success is enough.
     """
-    field, most, step, unit = AXES[axis]
-    declared, least = mean_of(job.link, field), job.settings.success_link
-    margin = getattr(job.settings, f"margin_{field}")
+    (field, most, step, unit), link, least = AXES[axis], job.asked.link, job.settings.success_link
+    declared = mean_of(link, field)
+    worse = declared + getattr(job.settings, f"margin_{field}")
     points: dict[float, Estimate] = {}
     with job.driving() as share:
 
         def holds(value: float) -> bool:
-            points[value] = share(network_at(job.link, field, value), job.settings.sweep_runs)
+            points[value] = share(network_at(link, field, value), job.settings.sweep_runs)
             return points[value].low >= least
 
-        is_good = holds(declared + margin)
-        known = [declared + margin] if is_good else [v for v in {declared, 0.0} if holds(v)]
-        low, high = max(known, default=None), most if is_good else declared + margin
-        while low is not None and high - low > step and not job.asked.quick:
-            middle = step * round((low + high) / 2 / step)
-            low, high = (middle, high) if holds(middle) else (low, middle)
-    name = f"distance to the limit of {axis}"
-    asked = f"{least:.0%} also with {margin:g} {unit} more each way"
-    told = f"at {declared + margin:g} {unit}: {points[declared + margin].as_share()} %"
-    found = "no" if low is None else f"{'at least ' * job.asked.quick}{low:g} {unit}"
-    why = f"it bears {found} {axis} each way, the link has {declared:g} {unit}"
-    data = {"points": points, "declared": declared, "limit": low, "least": least}
-    yield judged(is_good, name, asked, f"{told}; limit {found}", why, unit=unit, **data)
+        held = {value for value in {0.0, declared, worse} if holds(value)}
+        limit, beyond = max(held, default=None), min({*points} - held, default=most)
+        while limit is not None and beyond - limit > step and not job.asked.quick:
+            middle = step * round((limit + beyond) / 2 / step)
+            limit, beyond = (middle, beyond) if holds(middle) else (limit, middle)
+    bears = "nothing" if limit is None else f"{'at least ' * job.asked.quick}{limit:g} {unit}"
+    wrong = f"the policy bears {bears}, the link has {declared:g} {unit}"
+    data = {"points": points, "declared": declared, "limit": limit, "least": least}
+    told = f"{points[worse].as_share()} % at {worse:g} {unit}; bears {bears}"
+    return Found(told, "" if {declared, worse} <= held else wrong, data)
 
 
-def in_real_time(job: Job) -> Iterator[Row]:
-    count, path = job.settings.drives, job.folder / DRIVE_FILE
-    options = ("--clock", "realtime", "--latency", str(job.link))
-    report = job.drive(count, *options, record=path)
-    latency, most_ms = report["latency_ms"], 1e3 * job.settings.round_trip_s
-    asked = f"p99 from state sent to command received at most {most_ms:.0f} ms"
-    told = f"no command in {counted(count, 'drive')}"
-    if latency["p99"] is not None:
-        told = "p50 {p50:.1f}, p99 {p99:.1f} ms".format(**latency)
-    ends = [each["outcome"] for each in report["per_episode"]]
-    told += f"; {', '.join(ends)}; {counted(report['safe_stops'], 'safe stop')}"
-    is_good = latency["p99"] is not None and latency["p99"] <= most_ms
-    why = "the car would follow what it was told too long ago; no rule stops a steady delay"
-    yield judged(is_good, DRIVE, asked, told, why, edge_ms=edge_times_ms(path), outcomes=ends,
-                 period_ms=1e3 * job.period_s)  # fmt: skip
+def in_real_time(job: Job) -> Found:
+    """Drive behind the link, recorded; ``edge_ms`` is from state received to command sent."""
+    record = job.path / DRIVE_FILE
+    report = job.drive(job.settings.drives, *REALTIME, str(job.asked.link), record=record)
+    latency, ends = report["latency_ms"], [each["outcome"] for each in report["per_episode"]]
+    heard = (message for _, message in valid_messages(Recording(record), VEHICLE_ID))
+    answers = (each for each in heard if isinstance(each, Command) and each.inference_ns)
+    times_ms = [round((each.sent_ns - each.received_ns) * 1e-6, 3) for each in answers]
+    data = {"outcomes": ends, "edge_ms": times_ms, "period_ms": 1e3 * job.period_s}
+    if not times_ms or latency["p99"] is None:
+        return Found(", ".join(ends), "no state was answered")
+    wrong = f"over {job.settings.round_trip_s:g} s; no rule stops for a delay that stays the same"
+    told = f"p50 {latency['p50']:.1f}, p99 {latency['p99']:.1f} ms; {', '.join(ends)}"
+    is_late = latency["p99"] > 1e3 * job.settings.round_trip_s
+    told += f"; {counted(report['safe_stops'], 'safe stop')}"
+    return Found(told, wrong if is_late else "", data)
 
 
-def edge_times_ms(path: Path) -> list[float]:
-    """Return how long the edge runtime took for each answer of the policy, ms."""
-    messages = (message for _, message in valid_messages(Recording(path), VEHICLE_ID))
-    answers = (each for each in messages if isinstance(each, Command) and each.inference_ns)
-    return [round((each.sent_ns - each.received_ns) * 1e-6, 3) for each in answers]
-
-
-def replayed(name: str, path: str, job: Job) -> Iterator[Row]:
+def replay(path: str, job: Job) -> Found:
     assert job.policy is not None
-    asked = f"this policy made it; each answer within {DEFAULT_TOLERANCE:g}"
     report = report_replay(RecordedDrive(Path(path), None), job.policy, job.config)
-    own, makers = job.policy.policy_id, report["recorded_policy_ids"]
-    others = [f"policy {each[:12]} made it" for each in makers if each != own]
-    wrong = (
-        [*others, f"{report['different']} answers differ"] if others or report["different"] else []
-    )
+    others = [each[:12] for each in report["recorded_policy_ids"] if each != job.policy_id]
+    wrong = [f"policy {', '.join(others)} made it"] if others else []
+    wrong += [f"{report['different']} answers differ"] if report["different"] else []
     told = f"{report['compared'] - report['different']} of {report['compared']} the same"
-    yield judged(not wrong, name, asked, told, "; ".join(wrong))
+    return Found(told, "; ".join(wrong))
 
 
-def conformance(job: Job) -> Iterator[Row]:
-    name = "driver's conformance"
-    if not job.has_vehicle:
-        yield not_tried(name, "no --vehicle is named")
-        return
-    out = job.folder / "conformance.json"
+def conformance(job: Job) -> Found:
+    out = job.path / "conformance.json"
     out.unlink(missing_ok=True)
-    words = [*job.vehicle_options(), "--period-s", str(job.period_s), "--out", str(out)]
-    with Process("hil_tests", "conformance", *words) as process:
+    edge = ["--config", job.settings.edge] if job.settings.edge else []
+    words = ("--vehicle", job.config.vehicle, *edge, "--period-s", str(job.period_s))
+    with Process("hil_tests", "conformance", *words, "--out", str(out)) as process:
         process.wait(CONFORMANCE_S)
         if not out.exists():  # It could not be opened.
             process.succeed()
     rules = read_json(out, "report")["rules"]
     broken = [rule for rule, wrong in rules.items() if wrong]
-    told = f"{len(rules) - len(broken)} of {counted(len(rules), 'rule')} kept"
-    yield judged(not broken, name, "every rule kept", told, f"broken: {'; '.join(broken)}")
+    return Found(f"{len(rules) - len(broken)} of {len(rules)} rules", "; ".join(broken))
 
 
-def with_vehicle(job: Job) -> Iterator[Row]:
-    name, count = "drives with the vehicle", job.settings.vehicle_drives
-    if not job.has_vehicle:
-        yield not_tried(name, "no --vehicle is named")
-        return
-    options = ("--clock", "realtime", "--loop", "vehicle", "--latency", str(job.link))
-    report = job.drive(count, *options, vehicle=True)
-    faults, least = report["vehicle"]["faults"], job.settings.success_vehicle
-    share = report["success_rate"]
-    told = f"{'unknown' if share is None else f'{share:.0%}'} of {counted(count, 'drive')}"
-    wrong = [f"{each} ({times} times)" for each, times in faults.items()]
-    wrong += ["too few reach the goal"] * (share is not None and share < least)
-    asked = f"no fault of the vehicle; {least:.0%} reach the goal"
-    yield judged(not wrong, name, asked, told, "; ".join(wrong))
+def with_vehicle(job: Job) -> Found:
+    options, count = (
+        (*REALTIME, str(job.asked.link), "--loop", "vehicle"),
+        job.settings.vehicle_drives,
+    )
+    report = job.drive(count, *options, vehicle=job.config.vehicle)
+    wrong, share = list(report["vehicle"]["faults"]), report["success_rate"]
+    wrong += ["too few reach the goal"] * (
+        share is not None and share < job.settings.success_vehicle
+    )
+    ends = ", ".join(each["outcome"] for each in report["per_episode"])
+    return Found(f"{ends}; {counted(report['safe_stops'], 'safe stop')}", "; ".join(wrong))
 
 
-def faults(job: Job) -> Iterator[Check]:
-    """Make a check of each few faults; those that need the machine for themselves come last."""
-    rows = sorted(ROWS, key=lambda row: row.alone)
-    due = [row for row in rows if any(fnmatch(row.name, each) for each in job.settings.faults)]
-    reasons = {row.name: "not among the settings' faults" for row in rows if row not in due}
-    if job.config.vehicle not in (NONE, "hunter"):
-        reasons |= {row.name: "the vehicle is no Hunter" for row in due if _is_hunter(row)}
-    elif not _has_multicast():
-        reasons |= {row.name: "no multicast on this machine" for row in due if _is_hunter(row)}
-    due = [row for row in due if row.name not in reasons]
-    for first in range(0, len(due), AT_ONCE):
-        some = due[first : first + AT_ONCE]
-        takes_s = (1.5 + 1.2 * job.settings.tries) * len(some)
-        yield Check(f"faults from {some[0].name}", partial(_do, some), takes_s)
-    left = [not_tried(f"fault {name}", why) for name, why in reasons.items()]
-    yield Check("other faults", lambda _: left, 0.0)
+def left_out(row: Fault, job: Job) -> str:
+    """Return why a fault is not tried; empty where it is."""
+    if not any(fnmatch(row.name, each) for each in job.settings.faults):
+        return "not among the settings' faults"
+    is_hunters = row.rig.get("vehicle") == "hunter"
+    return "not this vehicle's" if is_hunters and job.config.vehicle not in (NONE, "hunter") else ""
 
 
-def _is_hunter(row: Any) -> bool:
-    return row.rig.get("vehicle") == "hunter"
-
-
-def _has_multicast() -> bool:
-    with suppress(Exception), open_bus(parse_bus(free_bus())):
-        return True
-    return False
-
-
-def _do(rows: list[Any], job: Job) -> Iterator[Row]:
-    asked, tries = job.asked, job.settings.tries
-    report = run_faults(rows, tries, Path(asked.policy), jobs=cores(), public_key=asked.public_key)
-    for row in report["rows"]:
-        times = [(kind, row[f"{kind}_ms"].get("max")) for kind in ("reaction", "recovery")]
-        told = ", ".join(f"{kind} {ms:.0f} ms" for kind, ms in times if ms is not None)
-        limits = [(kind, row[f"{kind}_limit_ms"]) for kind in ("reaction", "recovery")]
-        within = ", ".join(f"{kind} within {ms:.0f} ms" for kind, ms in limits if ms is not None)
-        wrong = [*row["wrong"], *row["unsafe"], *row["crashes"]]
-        wrong += ["too late"] * bool(row["reaction_late"] + row["recovery_late"])
-        ask = f"{row['done']}: {row['expected']}" + f" ({within})" * bool(within)
-        yield judged(
-            row["passed"], f"fault {row['name']}", ask, told or "as asked", "; ".join(wrong)
-        )
-
-
-def blocked_by(rows: Iterable[Row]) -> str:
-    """Return why nothing more is tried; empty where all is well so far."""
-    failed = [
-        row.name for row in rows if row.name in GATES and row.result not in (PASSED, NOT_TRIED)
-    ]
-    return f"a policy that fails in {failed[0]} is not driven" if failed else ""
+def fault(row: Fault, job: Job) -> Found:
+    tries, policy, key = job.settings.tries, Path(job.asked.policy), job.asked.public_key
+    (found,) = run_faults([row], tries, policy, public_key=key)["rows"]
+    told = []
+    for kind in ("reaction", "recovery"):
+        if found[f"{kind}_ms"]:
+            limit_ms = found[f"{kind}_limit_ms"]
+            most = f" of {limit_ms:.0f}" if limit_ms is not None else ""
+            told.append(f"{kind} {found[f'{kind}_ms']['max']:.0f}{most} ms")
+    return Found(", ".join(told), "; ".join(missed_in(found)))
