@@ -42,7 +42,7 @@ class Process:
 
     def __init__(
         self,
-        *arguments: str,
+        *arguments: object,
         ready: str | None = None,
         shown: bool = False,
         environment: Mapping[str, str] | None = None,
@@ -50,13 +50,13 @@ class Process:
         **options: Any,
     ) -> None:
         if shown:
-            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
-        self.name = " ".join(arguments[:2])
+            print(f"\n$ python -m {shlex.join(map(str, arguments))} &", flush=True)
+        self.name = " ".join(map(str, arguments[:2]))
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self._process: subprocess.Popen[str] = subprocess.Popen(
-            [python, "-m", *arguments],
+            [python, "-m", *map(str, arguments)],
             text=True,
             errors="surrogateescape",
             env={**os.environ, **(environment or {})},

@@ -105,7 +105,7 @@ def prepare(asked: Namespace) -> Job:
         *["--allow-unsigned"] * bool(asked.allow_unsigned),
     ]
     make_directory(asked.out)
-    return Job(asked, settings, policy_id, policy, refusal, config, trust)
+    return Job(asked, settings, Path(asked.out), policy_id, policy, refusal, config, trust)
 
 
 def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bridge.messages import Scene
-from bridge.recording import Recording, valid_messages
-from hil_tests.accept.checks import AXES, DRIVE, DRIVE_FILE, VEHICLE_ID
+from bridge.recording import Recording, choose_vehicle, valid_messages
+from hil_tests.accept.checks import AXES, DRIVE, DRIVE_FILE
 from trainer.scenarios.picture import HEIGHT_M, WIDTH_M, draw_scene
 
 PASSED, FAILED, NOT_TRIED = "passed", "failed", "not_tried"
@@ -98,14 +98,16 @@ def draw_times(found: Mapping[str, Any] | None) -> Figure | None:
 
 def svg(figure: Figure) -> str:
     drawn = io.StringIO()
-    figure.savefig(drawn, format="svg")
+    without = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(drawn, format="svg", metadata=without)
     return drawn.getvalue()[drawn.getvalue().index("<svg") :]
 
 
 def strips(path: Path, outcomes: list[str]) -> Iterator[tuple[str, list[tuple[str, str]]]]:
     """Yield some recorded drives, the failed first: title, and frames as times and addresses."""
     films: dict[int, list[Scene]] = {}
-    for _, message in valid_messages(Recording(path), VEHICLE_ID):
+    recording = Recording(path)
+    for _, message in valid_messages(recording, choose_vehicle(recording, None)):
         if isinstance(message, Scene) and (message.vehicles or message.picture):
             films.setdefault(message.episode, []).append(message)
     for episode in sorted(films, key=lambda each: outcomes[each] == "goal")[:STRIPS]:
