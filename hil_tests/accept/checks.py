@@ -88,9 +88,8 @@ class Job:
 
     def share(self, drivers: Drivers, link: LatencySpec) -> Estimate:
         """Return the success behind a network, in virtual time."""
-        runs = self.settings.runs
-        results = drivers.drive(link, range(runs))
-        return success_estimate(sum(each.outcome == GOAL for each in results), runs)
+        results = drivers.drive(link, range(self.settings.runs))
+        return success_estimate(sum(each.outcome == GOAL for each in results), len(results))
 
     def drive(
         self, episodes: int, *more: object, record: Path | None = None, vehicle: str = NONE
@@ -282,7 +281,8 @@ def conformance(job: Job) -> Found:
             process.succeed()
     rules = read_json(out, "report")["rules"]
     broken = [rule for rule, wrong in rules.items() if wrong]
-    return Found(f"{len(rules) - len(broken)} of {len(rules)} rules", "; ".join(broken))
+    wrong = f"broken: {'; '.join(broken)}" if broken else ""
+    return Found(f"{len(rules) - len(broken)} of {len(rules)} rules", wrong)
 
 
 def with_vehicle(job: Job) -> Found:
@@ -304,9 +304,12 @@ def left_out(row: Fault, job: Job) -> str:
 
 
 def fault(row: Fault, job: Job) -> Found:
-    tries, policy, key = job.settings.tries, Path(job.asked.policy), job.asked.public_key
-    (found,) = run_faults([row], tries, policy, public_key=key)["rows"]
-    told = []
+    told, tries, policy = [], job.settings.tries, Path(job.asked.policy)
+    for at_first in ("", "late at first"):  # Once more where the machine may have stood still
+        (found,) = run_faults([row], tries, policy, public_key=job.asked.public_key)["rows"]
+        told = [at_first] if at_first else []
+        if {*missed_in(found)} != {"late"}:
+            break
     for kind in ("reaction", "recovery"):
         if found[f"{kind}_ms"]:
             limit_ms = found[f"{kind}_limit_ms"]

@@ -39,11 +39,9 @@ _KINDS: dict[type, Any] = {
     str: str, list: list[str], dict: dict[str, Any],
 }  # fmt: skip
 _CONDITION: Any = Literal[tuple(CONDITIONS)]
-_SUCCESS = {"success": dict[_CONDITION, float]}
-Settings: Any = msgspec.defstruct(
-    "Settings", [(key, _SUCCESS.get(key, _KINDS[type(value)])) for key, value in _KNOWN.items()],
-    forbid_unknown_fields=True, frozen=True,
-)  # fmt: skip
+_FIELDS = {key: _KINDS[type(value)] for key, value in _KNOWN.items()}
+_FIELDS["success"] = dict[_CONDITION, float]
+Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fields=True)
 """The keys of accept.toml, whose values have the types of the defaults there."""
 
 
@@ -100,10 +98,8 @@ def prepare(asked: Namespace) -> Job:
         with closing(make_environment(asked.env, period_s=period_s)) as env:
             load_driver(asked.policy, env, policy.public_key)  # It is for this environment.
         vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
-    trust = [
-        *(["--public-key", key] if key else []),
-        *["--allow-unsigned"] * bool(asked.allow_unsigned),
-    ]
+    trust = ["--public-key", key] if key else []
+    trust += ["--allow-unsigned"] if asked.allow_unsigned else []
     make_directory(asked.out)
     return Job(asked, settings, Path(asked.out), policy_id, policy, refusal, config, trust)
 
@@ -123,11 +119,9 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
     rows, took_s, table_s = known["rows"], SURE_S, SURE_S
     for check in checks[len(rows) :]:
         begun_s = time.monotonic()
-        gate = next(
-            (row["name"] for row in rows if row["name"] in GATES and row["result"] == FAILED), ""
-        )
-        row = attempt(check._replace(skipped=f"it fails in: {gate}") if gate else check, job)
-        rows.append(row)
+        gates = {row["name"] for row in rows if row["result"] == FAILED} & {*GATES}
+        why = f"it fails in: {', '.join(gates)}" if gates else check.skipped
+        rows.append(row := attempt(check._replace(skipped=why), job))
         known["seconds"] += (seconds := time.monotonic() - begun_s)
         write_json(place, known)
         if row["result"] != NOT_TRIED:
