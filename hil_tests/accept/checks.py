@@ -124,7 +124,7 @@ def table(job: Job) -> list[Check]:
     return [
         Check(SIGNATURE, "signed by the known key; manifest and graph agree", 1.0, trusted),
         Check(INFERENCE, f"p99 at most {ask.inference_share:g} T", 4.0, inference),
-        Check("over the wire as in process", f"{ask.wire_runs} drives with the same end",
+        Check("over the wire as in process", f"the same end of {counted(ask.wire_runs, 'drive')}",
               12.0 + 2.0 * ask.wire_runs, over_the_wire),
         *(Check(f"success, {condition}", at_least(least), share_s,
                 partial(success, condition, NO_NETWORK, least))
@@ -304,15 +304,20 @@ def left_out(row: Fault, job: Job) -> str:
 
 
 def fault(row: Fault, job: Job) -> Found:
-    told, tries, policy = [], job.settings.tries, Path(job.asked.policy)
-    for at_first in ("", "late at first"):  # Once more where the machine may have stood still
-        (found,) = run_faults([row], tries, policy, public_key=job.asked.public_key)["rows"]
-        told = [at_first] if at_first else []
-        if {*missed_in(found)} != {"late"}:
+    """Do a fault, and once more where it was missed: this machine may have stood still.
+
+    A crash and an unsafe command are never the machine's.
+    """
+    told, policy, key = list[str](), Path(job.asked.policy), job.asked.public_key
+    for _ in range(2):
+        (found,) = run_faults([row], job.settings.tries, policy, public_key=key)["rows"]
+        missed = missed_in(found)
+        if told or not missed or found["unsafe"] or found["crashes"]:
             break
+        told = [f"at first {missed[0]}"]
     for kind in ("reaction", "recovery"):
         if found[f"{kind}_ms"]:
             limit_ms = found[f"{kind}_limit_ms"]
             most = f" of {limit_ms:.0f}" if limit_ms is not None else ""
             told.append(f"{kind} {found[f'{kind}_ms']['max']:.0f}{most} ms")
-    return Found(", ".join(told), "; ".join(missed_in(found)))
+    return Found(", ".join(told), "; ".join(missed))

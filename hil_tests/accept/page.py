@@ -72,9 +72,10 @@ def draw_distance(axis: str, found: Mapping[str, Any] | None) -> Figure | None:
     asked = f"asked: {100 * found['least']:g} %, of the interval's lower end"
     panel.axhline(found["least"], color="0.4", lw=0.9, ls="--", label=asked)
     panel.axvline(declared, color=BAD, lw=1.6, label=f"declared link: {declared:g} {unit}")
-    panel.axvspan(0.0, found["limit"] or 0.0, color=GOOD, alpha=0.12, label="enough")
+    if found["limit"]:
+        panel.axvspan(0.0, found["limit"], color=GOOD, alpha=0.12, label="enough")
     panel.set(xlabel=f"{axis} each way, {unit}", ylabel="success", ylim=(-0.03, 1.05))
-    panel.legend(loc="lower left", fontsize=8)
+    panel.legend(fontsize=8)
     return figure
 
 

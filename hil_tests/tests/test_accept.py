@@ -210,6 +210,29 @@ def test_a_recording_that_another_policy_made_fails(signed):
     assert load_policy(POLICY, PUBLIC_KEY).policy_id[:12] in found.wrong
 
 
+@pytest.mark.parametrize(
+    ("reports", "is_good", "calls"),
+    [
+        ([{}], True, 1),
+        ([{"wrong": ["safe stop: no_fresh_state"]}, {}], True, 2),
+        ([{"reaction_late": 1}, {"recovery_late": 1}], False, 2),
+        ([{"wrong": ["x"], "unsafe": ["action 2.0"]}], False, 1),
+        ([{"crashes": ["edge_runtime run"]}], False, 1),
+    ],
+)
+def test_a_fault_is_missed_twice_or_dangerous_before_it_fails(monkeypatch, reports, is_good, calls):
+    whole: dict[str, Any] = {"reaction_late": 0, "recovery_late": 0, "reaction_limit_ms": 250.0}
+    whole |= {"wrong": [], "unsafe": [], "crashes": [], "recovery_limit_ms": None}
+    whole |= {"reaction_ms": {"max": 210.0}, "recovery_ms": {}}
+    left = [{**whole, **report} for report in reports]
+    monkeypatch.setattr(checks, "run_faults", lambda *_, **__: {"rows": [left.pop(0)]})
+    asked = Namespace(policy="p.onnx", public_key=None)
+    job: Any = SimpleNamespace(asked=asked, settings=SimpleNamespace(tries=1))
+    found = checks.fault(checks.ROWS[0], job)
+    assert (not found.wrong, len(reports) - len(left)) == (is_good, calls)
+    assert ("at first" in found.measured) == (calls == 2)
+
+
 def test_the_page_needs_nothing_else_and_shows_the_failed_drives_first(tmp_path):
     share = success_estimate(9, 10)
     link = {"points": {"0.0": share, "50.0": share}, "declared": 50.0, "limit": None, "least": 0.9}
