@@ -197,11 +197,13 @@ def over_the_wire(job: Job) -> Found:
 def success(condition: str, link: LatencySpec, least: float, job: Job) -> Found:
     """Judge the share by the lower end of its interval."""
     try:
-        with job.drivers(condition) as drivers:
-            found = job.share(drivers, link)
-    except UserError as error:
-        # An environment need not have the scene.
-        raise (error if condition == NOMINAL else UntoldError(error)) from None
+        drivers = job.drivers(condition)
+    except UserError:
+        if condition == NOMINAL:
+            raise
+        raise UntoldError("the environment has no such scene") from None
+    with drivers:
+        found = job.share(drivers, link)
     wrong = f"the lower end of its interval is below {100 * least:g} %" if found.low < least else ""
     return Found(f"{found.as_share()} % of {found.size} drives", wrong)
 

@@ -87,8 +87,11 @@ def prepare(asked: Namespace) -> Job:
     policy_id = policy_id_of(read_bytes(asked.policy, "policy file", MAX_POLICY_MIB))
     for path in (*settings.recordings, *([key] if key else [])):
         read_bytes(path, "file", 1 << 12)
-    flags = {"policy": asked.policy, "vehicle": asked.vehicle, "connect": "tcp/127.0.0.1:7447"}
-    config, policy, refusal = load_config(settings.edge or None, flags), None, ""
+    flags = {"policy": asked.policy, "vehicle": asked.vehicle}
+    config = load_config(settings.edge or None, flags, opens_link=False)
+    if config.tls:
+        raise UserError(f"{settings.edge} turns on tls; these drives are local: leave it out")
+    policy, refusal = None, ""
     try:
         policy = load_policy(asked.policy, key, asked.allow_unsigned)
     except UserError as error:

@@ -274,11 +274,13 @@ def test_the_page_needs_nothing_else_and_shows_the_failed_drives_first(tmp_path)
         ((), "success = { sunny = 0.5 }"),
         ((), "recordings = ['none.mcap']"),
         ((), "edge = 'none.toml'"),
+        ((), "edge = 'EDGE'"),
         (("--quick",), "quick = { tries = 'many' }"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, capsys, words, settings):
-    (tmp_path / "accept.toml").write_text(settings)
+    (tmp_path / "edge.toml").write_text("connect = 'tls/10.0.0.1:7447'\ntls = 'certs/edge-a'\n")
+    (tmp_path / "accept.toml").write_text(settings.replace("EDGE", f"{tmp_path}/edge.toml"))
     out = tmp_path / "out"
     given = ("--out", out, *SHIPPED, "--config", tmp_path / "accept.toml", *words)
     assert refusal(capsys, "accept", *given, package="hil_tests")
