@@ -21,7 +21,7 @@ from bridge.outcomes import GOAL, Estimate, success_estimate
 from bridge.recording import Recording, valid_messages
 from bridge.replay import RecordedDrive, report_replay
 from deploy.bundle import UNATTENDED
-from edge_runtime.config import NONE, Config
+from edge_runtime.config import BUILT_IN, NONE, Config
 from edge_runtime.policy import SIGNATURE_SUFFIX, Policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, counted, parse_json, read_json
@@ -301,8 +301,8 @@ def left_out(row: Fault, job: Job) -> str:
     """Return why a fault is not tried; empty where it is."""
     if not any(fnmatch(row.name, each) for each in job.settings.faults):
         return "not among the settings' faults"
-    is_hunters = row.rig.get("vehicle") == "hunter"
-    return "not this vehicle's" if is_hunters and job.config.vehicle not in (NONE, "hunter") else ""
+    is_hunters, vehicle = row.rig.get("vehicle") == "hunter", job.config.vehicle
+    return "not this vehicle's" if is_hunters and vehicle not in (NONE, *BUILT_IN) else ""
 
 
 def fault(row: Fault, job: Job) -> Found:
