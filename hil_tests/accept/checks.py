@@ -22,7 +22,7 @@ from bridge.recording import Recording, valid_messages
 from bridge.replay import RecordedDrive, report_replay
 from deploy.bundle import UNATTENDED
 from edge_runtime.config import BUILT_IN, NONE, Config
-from edge_runtime.policy import SIGNATURE_SUFFIX, Policy
+from edge_runtime.policy import Policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.util import UserError, counted, parse_json, read_json
 from edge_runtime.wire import Command
@@ -155,21 +155,16 @@ def trusted(job: Job) -> Found:
 
 
 def inference(job: Job) -> Found:
-    """Ask ``edge_runtime check``, here or on the board by ssh."""
-    policy, key = Path(job.asked.policy), job.policy and job.policy.public_key
-    command = [sys.executable, "-m", "edge_runtime", "check", str(policy), *job.trust]
+    """Ask ``edge_runtime check``, here or on the board by ssh, which is lent the policy."""
+    command = [sys.executable, "-m", "edge_runtime", "check", job.asked.policy, *job.trust]
     if board := job.asked.board:
-        trust = ["--public-key", Path(key).name] if key else ["--allow-unsigned"]
-        check = shlex.join([job.settings.board_command, "check", policy.name, *trust])
-        there = f"d=$(mktemp -d) && cd $d && tar -xf - && {check}; s=$?; rm -rf $d; exit $s"
+        check = f"{shlex.quote(job.settings.board_command)} check $p --allow-unsigned"
+        there = f"p=$(mktemp) && cat > $p && {check}; s=$?; rm -f $p; exit $s"
         command = ["ssh", *UNATTENDED, "--", board, there]
-        files = [policy, Path(f"{policy}{SIGNATURE_SUFFIX}"), *([Path(key)] if key else [])]
-        words = [word for f in files if f.exists() for word in ("-C", str(f.parent), f.name)]
-        packing = ["tar", "-cf", "-", *words]
     try:
-        sent = subprocess.run(packing, capture_output=True, check=True).stdout if board else None
-        done = subprocess.run(command, input=sent, capture_output=True, timeout=CHECK_S)
-    except (OSError, subprocess.SubprocessError) as error:
+        policy = Path(job.asked.policy).read_bytes()
+        done = subprocess.run(command, input=policy, capture_output=True, timeout=CHECK_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
         raise UserError(str(error)) from None
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
