@@ -71,7 +71,7 @@ bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, 
 # One call for each policy; after ^C it goes on.
 ACCEPT := $(BIN)/python -m hil_tests accept --public-key results/policies/policy.pub \
 	--vehicle mock --link 50ms+-10ms,loss=1%
-accept: $(STAMP)  ## may the shipped policies drive? a page for each in runs/accept, in 25 minutes at most
+accept: $(STAMP)  ## may the shipped policies drive? a page for each in runs/accept
 	$(ACCEPT) --policy results/policies/left_turn.onnx --env left_turn \
 		--config hil_tests/recordings/accept.toml --out runs/accept/left_turn
 	$(ACCEPT) --policy results/policies/congestion.onnx --env congestion --out runs/accept/congestion

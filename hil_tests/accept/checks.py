@@ -7,12 +7,11 @@ import shlex
 import subprocess
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from bridge.environments import NOMINAL
@@ -48,7 +47,7 @@ class Found(NamedTuple):
 
     measured: str
     wrong: str = ""
-    data: Mapping[str, Any] = MappingProxyType({})  # For the page
+    data: dict[str, Any] | None = None  # For the page
 
 
 class Check(NamedTuple):

@@ -147,4 +147,4 @@ def attempt(check: Check, job: Job) -> dict[str, Any]:
         except UserError as error:
             result, why = FAILED, str(error)
     row = {"name": check.name, "asked": check.asked, "measured": found.measured}
-    return {**row, "result": result, "why": why, "data": dict(found.data)}
+    return {**row, "result": result, "why": why, "data": found.data}

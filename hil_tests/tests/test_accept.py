@@ -193,6 +193,7 @@ def test_the_limit_is_found_from_the_declared_link(link, limit_ms, quick, passes
     job.settings = SimpleNamespace(success_link=0.9, margin_delay_ms=50.0)
     found = checks.distance("delay", job)
     assert bool(found.wrong) != passes
+    assert found.data
     limit = found.data["limit"]
     assert limit == bears or abs(limit - bears) <= 25.0
     assert limit is None or limit <= limit_ms
