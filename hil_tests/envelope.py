@@ -222,6 +222,14 @@ class Drivers(ProcessPoolExecutor):
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
 
+    def submit(self, *arguments: Any, **named: Any) -> Any:
+        """Start processes that ^C does not reach, not even while they load: their parent ends."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            return super().submit(*arguments, **named)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Drive an episode for each seed; return the results without their actions.
 
@@ -248,7 +256,6 @@ def _load(policy: str, env: str, condition: str, key: str | None, period_s: floa
 
 
 def _begin(*task: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=die_with_parent, daemon=True).start()
     set_threads(1)
     environment, driver, _ = _load(*task)

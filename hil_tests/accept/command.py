@@ -112,6 +112,7 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
     place, checks = job.path / UNFINISHED, table(job)
     what = {name: str(value) for name, value in vars(job.asked).items()}
     what |= {"policy_id": job.policy_id, "settings": str(job.settings)}
+    what["checks"] = str([check.name for check in checks])
     known: dict[str, Any] = {}
     with suppress(UserError):
         known = read_json(place, "what is done")

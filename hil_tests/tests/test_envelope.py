@@ -1,3 +1,8 @@
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +17,7 @@ from hil_tests.envelope import (
     BURST_PERCENT,
     HOLDS,
     TRIES,
+    Drivers,
     Search,
     SequentialTest,
     find_edges,
@@ -103,3 +109,12 @@ def test_what_fails_without_a_network_has_no_envelope():
 def test_bursts_come_on_top_of_the_loss():
     way = network({"loss_percent": 10.0, "burst_messages": 3.0}).up
     assert way.bad_share == pytest.approx(BURST_PERCENT / 100)
+
+
+def test_an_interrupt_does_not_reach_the_processes_not_even_while_they_load():
+    drivers: Any = Drivers.__new__(Drivers)
+    ProcessPoolExecutor.__init__(drivers, 1, get_context("spawn"))
+    with drivers:
+        blocked = drivers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+    assert signal.SIGINT in blocked
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
