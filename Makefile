@@ -8,7 +8,7 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-board lint format bench \
+.PHONY: help install doctor pictures demo accept test test-ray test-board lint format bench \
 	bench-quick bench-loop recording mutate lock clean
 
 help:  ## this list
@@ -67,6 +67,14 @@ bench-quick: $(STAMP)  ## a look at the same
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start
 	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
+
+# One call for each policy; after ^C it goes on.
+ACCEPT := $(BIN)/python -m hil_tests accept --public-key results/policies/policy.pub \
+	--vehicle mock --link 50ms+-10ms,loss=1%
+accept: $(STAMP)  ## may the shipped policies drive? a page for each in runs/accept
+	$(ACCEPT) --policy results/policies/left_turn.onnx --env left_turn \
+		--config hil_tests/recordings/accept.toml --out runs/accept/left_turn
+	$(ACCEPT) --policy results/policies/congestion.onnx --env congestion --out runs/accept/congestion
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python hil_tests/recordings/make_recording.py

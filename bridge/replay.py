@@ -85,14 +85,7 @@ def run(arguments: Any) -> int:
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
     drawn: list[Drawn] = []
-    report = {
-        "recording": arguments.recording,
-        "policy_id": policy.policy_id,
-        "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), arguments.tolerance, drawn),
-    }
-    if report["compared"] == 0:
-        raise UserError(f"{arguments.recording} holds no state with an answer of its policy")
+    report = report_replay(drive, policy, config, arguments.tolerance, drawn)
     write_json_out(arguments.out, report)
     if arguments.out:
         names = [row.name for row in policy.manifest.action]
@@ -108,6 +101,28 @@ def run(arguments: Any) -> int:
         place = f"episode {row['episode']} step {row['step']}"
         print(printable(f"  {place}: recorded {row['recorded']}; replayed {row['replayed']}"))
     return DIFFERENT if report["different"] else 0
+
+
+def report_replay(
+    drive: RecordedDrive,
+    policy: Policy,
+    config: Config,
+    tolerance: float = DEFAULT_TOLERANCE,
+    drawn: list[Drawn] | None = None,
+) -> dict[str, Any]:
+    """Replay a drive and return the command's report; ``drawn`` takes what a picture shows.
+
+    Raises UserError where nothing can be compared.
+    """
+    report = {
+        "recording": str(drive.recording.path),
+        "policy_id": policy.policy_id,
+        "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
+        **compare(replay(drive, policy, config), tolerance, [] if drawn is None else drawn),
+    }
+    if report["compared"] == 0:
+        raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")
+    return report
 
 
 class RecordedDrive:

@@ -44,7 +44,7 @@ import sys
 from deploy.installer.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
-_UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
+UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 """A password asked for in the middle would hang a script, and so would a board without power."""
 TARGETS = {  # Python, processor, and the oldest C library
     "jetpack5": ("3.8", "aarch64", "2.31"),  # Jetson Xavier NX: Ubuntu 20.04
@@ -262,10 +262,10 @@ def run_push(given: argparse.Namespace) -> int:
         installer.write_bytes(build_installer())
         # Absolute: scp would take "a:b" for a file of the host a.
         files = (given.bundle, Path(f"{given.bundle}.sig"), given.trust, installer)
-        ssh = ["ssh", *_UNATTENDED, "--", given.host]
+        ssh = ["ssh", *UNATTENDED, "--", given.host]
         for command in (
             [*ssh, f"umask 077 && mkdir -p {place}"],
-            ["scp", "-q", *_UNATTENDED, "--", *(str(path.absolute()) for path in files),
+            ["scp", "-q", *UNATTENDED, "--", *(str(path.absolute()) for path in files),
              f"{given.host}:{place}/"],
             [*ssh, f"{shlex.join(install)}; s=$?; rm -rf {place}; exit $s"],
         ):  # fmt: skip

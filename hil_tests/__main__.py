@@ -12,6 +12,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "list what this machine can and cannot do, and how to install the rest",
     ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
+    "accept": (
+        "hil_tests.commands:accept",
+        "judge whether a policy may drive a vehicle over a network: one page, one verdict",
+    ),
     "campaign": (
         "hil_tests.commands:campaign",
         "inject every fault, test every simulated network, and write a report",

@@ -115,6 +115,12 @@ def choose(names: str | None, only: str | None) -> tuple[list[Axis], list[Row]]:
     return wanted, [row for row in faults if row.name in chosen]
 
 
+def missed_in(row: Found) -> list[str]:
+    """Return what was not as expected in a fault's row of a report."""
+    late = ["late"] * (row["reaction_late"] + row["recovery_late"])
+    return [*late, *row["wrong"], *row["unsafe"], *row["crashes"]]
+
+
 def render_faults(report: Found) -> list[str]:
     """Render a row for each fault; reaction and recovery as min / median / max over its tries."""
     head = ("fault", "expected", "tries", "reaction, ms", "limit", "recovery, ms", "limit",
@@ -127,8 +133,7 @@ def render_faults(report: Found) -> list[str]:
             spread, limit = row[f"{kind}_ms"].values(), row[f"{kind}_limit_ms"]
             times.append(" / ".join(f"{value:.0f}" for value in spread) or "-")
             times.append("-" if limit is None else f"{limit:.0f}")
-        missed = ["late"] * (row["reaction_late"] + row["recovery_late"])
-        missed += [*row["wrong"], *row["unsafe"], *row["crashes"]]
+        missed = missed_in(row)
         counted = sum(row["rejected"].values())
         met = f"met, {counted:,} rejected and counted" if counted else "met"
         verdict = f"MISSED {row['name']}: {'; '.join(missed)}" if missed else met

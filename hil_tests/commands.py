@@ -3,8 +3,10 @@
 import argparse
 
 from bridge.environments import NOMINAL
+from bridge.network import parse_spec
 from edge_runtime import cli
 from edge_runtime.cli import add_public_key, command
+from edge_runtime.config import add_trust
 from trainer.__main__ import add_scenario
 from trainer.environments import CONDITIONS
 
@@ -40,6 +42,30 @@ def envelope(parser: argparse.ArgumentParser) -> None:
     add("--env", default="left_turn", help="scenario, gymnasium id or MODULE:ID")
     _add_common(parser, "ENV")
     add("--promise", type=inner, default=0.95, help="success rate that the policy must keep")
+
+
+@command(
+    "hil_tests.accept.command:run",
+    "python -m hil_tests accept --policy P.onnx --env left_turn --out runs/accept",
+    "python -m hil_tests accept --policy P.onnx --env left_turn --vehicle mock \\\n"
+    "    --link 50ms+-10ms,loss=1% --config accept.toml --quick --out runs/accept",
+)
+def accept(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--policy", required=True, metavar="P.onnx", type="path", help="policy file to judge")
+    add_trust(parser)
+    add("--env", required=True, help="scenario, gymnasium id or MODULE:ID")
+    driver = "its driver is tried and driven, as by `edge_runtime run`: lift the wheels"
+    add("--vehicle", metavar="NAME", help=driver)
+    link = "the network that it is to drive over, such as 50ms+-10ms,loss=1%%"
+    add("--link", metavar="SPEC", type=parse_spec, default="none", help=link)
+    board = "measure the inference time there, by ssh"
+    add("--board", metavar="USER@HOST", help=board)
+    settings = "thresholds (hil_tests/accept/accept.toml explains them)"
+    add("--config", metavar="accept.toml", type="path", help=settings)
+    add("--quick", action="store_true", help="fewer drives and faults: minutes")
+    out = "folder of report.html, report.json and junit.xml; after ^C the same command goes on"
+    add("--out", required=True, metavar="DIR", type="path", help=out)
 
 
 def _add_common(parser: argparse.ArgumentParser, env: str) -> None:

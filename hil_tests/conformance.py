@@ -16,6 +16,7 @@ from typing import Any
 from edge_runtime import log
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, load_config
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.manifest import Action, Car, Entry, Manifest
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import make_vehicle
@@ -39,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--vehicle", metavar="NAME|MODULE:CLASS", help="the driver (default: that of --config)")
     add("--config", metavar="FILE.toml", help="its settings, as for `edge_runtime run`")
+    add("--out", metavar="R.json", type=check_writable, help="write what breaks each rule, as JSON")
     add("--period-s", type=float, default=0.1, metavar="S", help="the policy's control period T")
 
 
@@ -55,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         control_period_s=arguments.period_s, algorithm="", training={}, created="",
     )  # fmt: skip
     vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
-    bench, kept = Bench(vehicle, arguments.period_s), 0
+    bench, rules = Bench(vehicle, arguments.period_s), dict[str, str]()
     try:
         for rule, is_kept in RULES.items():
             try:
@@ -63,11 +65,13 @@ def run(arguments: argparse.Namespace) -> int:
             # A driver may raise anything, and the next rule is due.
             except (Exception, SystemExit) as error:
                 wrong = f"{type(error).__name__}: {error}"
-            print(f"broken  {rule}: {printable(wrong)}" if wrong else f"kept    {rule}", flush=True)
-            kept += not wrong
+            rules[rule] = printable(wrong)
+            print(f"broken  {rule}: {rules[rule]}" if wrong else f"kept    {rule}", flush=True)
     finally:
         close_in_time(vehicle)  # the last rule does, where it came so far
         log.close()
+    kept = list(rules.values()).count("")
+    write_json_out(arguments.out, {"vehicle": vehicle.name, "rules": rules})
     print(f"{vehicle.name}: {kept} rules kept, {len(RULES) - kept} broken")
     return 0 if kept == len(RULES) else 1
 

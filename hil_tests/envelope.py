@@ -227,6 +227,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+class UntoldError(UserError):
+    """The environment does not say how a drive ended."""
+
+
 class Drivers(ProcessPoolExecutor):
     """A pool of processes, each with an environment and the policy; 0 jobs: one a core.
 
@@ -243,16 +247,24 @@ class Drivers(ProcessPoolExecutor):
     def __exit__(self, *_: object) -> None:
         self.shutdown(cancel_futures=True)
 
+    def submit(self, *arguments: Any, **named: Any) -> Any:
+        """Start processes that ^C does not reach, not even while they load: their parent ends."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            return super().submit(*arguments, **named)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
     def drive(self, spec: LatencySpec, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Drive an episode for each seed; return the results without their actions.
 
-        Raises UserError where the environment does not report of each drive how it ended.
+        Raises UntoldError where the environment does not report of each drive how it ended.
         """
         results = list(self.map(partial(_drive, spec), seeds))
         self._ends.update(result.outcome for result in results)
         # A step limit is a timeout as soon as the end of any other drive was reported.
         if UNKNOWN in self._ends or len(self._ends) == 1:
-            raise UserError("no outcome or is_success in info tells whether it succeeded")
+            raise UntoldError("no outcome or is_success in info tells whether it succeeded")
         return [
             replace(result, outcome=TIMEOUT) if result.outcome == TRUNCATED else result
             for result in results
@@ -269,7 +281,6 @@ def _load(policy: str, env: str, condition: str, key: str | None, period_s: floa
 
 
 def _begin(*task: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=die_with_parent, daemon=True).start()
     set_threads(1)
     environment, driver, _ = _load(*task)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,7 +42,7 @@ class Process:
 
     def __init__(
         self,
-        *arguments: str,
+        *arguments: object,
         ready: str | None = None,
         shown: bool = False,
         environment: Mapping[str, str] | None = None,
@@ -50,13 +50,13 @@ class Process:
         **options: Any,
     ) -> None:
         if shown:
-            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
-        self.name = " ".join(arguments[:2])
+            print(f"\n$ python -m {shlex.join(map(str, arguments))} &", flush=True)
+        self.name = " ".join(map(str, arguments[:2]))
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self._process: subprocess.Popen[str] = subprocess.Popen(
-            [python, "-m", *arguments],
+            [python, "-m", *map(str, arguments)],
             text=True,
             errors="surrogateescape",
             env={**os.environ, **(environment or {})},
@@ -166,14 +166,26 @@ class Process:
             self.lines.append((seen_s, line.rstrip()))
 
 
-def _operate(endpoint: str, vehicle_id: str, end: threading.Event) -> None:
+@contextlib.contextmanager
+def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
     """Re-arm a vehicle after each safe stop, in place of the person of an unattended drive."""
-    while not end.wait(OPERATOR_LOOKS_EVERY_S):
-        with contextlib.suppress(UserError):  # no runtime yet, or no more
-            status = ask(endpoint, vehicle_id, "status")
-            stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
-            if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
-                print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
+    end = threading.Event()
+
+    def operate() -> None:
+        while not end.wait(OPERATOR_LOOKS_EVERY_S):
+            with contextlib.suppress(UserError):  # no runtime yet, or no more
+                status = ask(endpoint, vehicle_id, "status")
+                stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
+                if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
+                    print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
+
+    thread = threading.Thread(target=operate)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
 
 
 def run_command(*arguments: object) -> None:
@@ -202,11 +214,7 @@ def drive_shown(
         stack.enter_context(Process(*edge, ready="ready", shown=True))
         beside = Process("bridge", *listener, *common, shown=True) if listener else None
         stack.enter_context(beside or contextlib.nullcontext())
-        end = threading.Event()
-        operator = threading.Thread(target=_operate, args=(endpoint, vehicle_id, end))
-        stack.callback(operator.join)
-        stack.callback(end.set)
-        operator.start()
+        stack.enter_context(operator(endpoint, vehicle_id))
         where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
         run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
         if beside is not None:

@@ -49,6 +49,12 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     assert 10 < report["memory_mb"] < 500
 
 
+def test_check_of_a_slow_policy_ends_soon(make_policy, monkeypatch, capsys):
+    monkeypatch.setattr(commands, "_MOST_S", 0.0)
+    assert exit_status(main, ["check", *make_policy().flags[1:]]) == 0
+    assert json.loads(capsys.readouterr().out)["inference_runs"] == commands._FEWEST_RUNS
+
+
 @pytest.fixture
 def refuses(tmp_path, monkeypatch, capfd):  # capfd: what a library in C prints counts, too
     """Run a command: it must end with status 2 and one line, which holds the word."""

@@ -167,10 +167,12 @@ class VehicleWatch:
         for name, value in report.action.items():
             if name == PEDAL and report.commanded_speed_mps is not None:
                 continue  # worked out from a speed, whose limits are the driver's to judge
-            asked = [action[name] for action in self._asked.values if name in action]
+            asked = [action.get(name) for action in self._asked.values]
+            if None in asked:
+                continue  # the policy does not have it: beside a stop, nobody asks for it
             low, high = self._range(name)
             most = LAG_DEVIATION * (high - low)
-            if asked and not min(asked) - most <= value <= max(asked) + most:
+            if not min(asked) - most <= value <= max(asked) + most:
                 return True
         return False
 

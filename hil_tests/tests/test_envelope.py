@@ -1,5 +1,9 @@
 import json
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +23,7 @@ from hil_tests.envelope import (
     BURST_PERCENT,
     HOLDS,
     TRIES,
+    Drivers,
     Search,
     SequentialTest,
     find_edges,
@@ -167,3 +172,12 @@ def test_what_fails_without_a_network_leaves_no_file(monkeypatch, capsys, tmp_pa
     refused = call(capsys, "envelope", "--out", tmp_path / "e.json", package="hil_tests")
     assert refused[0] == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_does_not_reach_the_processes_not_even_while_they_load():
+    drivers: Any = Drivers.__new__(Drivers)
+    ProcessPoolExecutor.__init__(drivers, 1, get_context("spawn"))
+    with drivers:
+        blocked = drivers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+    assert signal.SIGINT in blocked
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
