@@ -9,7 +9,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install doctor pictures demo test test-ray test-board lint format bench \
-	bench-quick bench-loop recording mutate lock clean
+	bench-quick recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,9 +64,6 @@ bench: $(STAMP)  ## speed of learner, environments and training, as JSON in resu
 
 bench-quick: $(STAMP)  ## a look at the same
 	$(BIN)/python -m trainer bench --quick --threads 1
-
-bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start
-	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python hil_tests/recordings/make_recording.py

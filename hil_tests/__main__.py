@@ -25,7 +25,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "run a simulated Hunter on a CAN bus, with its faults",
     ),
     "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),
-    "bench": ("hil_tests.bench_loop", "measure the loop's latency beside a bare Zenoh callback"),
 }
 
 
