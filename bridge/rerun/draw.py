@@ -1,7 +1,7 @@
 """The adapter from a drive to rerun, and ``python -m bridge view``, which shows the wire by it.
 
 A `Canvas` draws lines, states, pictures and the road from above; the functions after it lay views
-out, also those of a training (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
+out, also those of test drives (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
 are lines: rerun cannot turn its flat boxes.
 """
 
