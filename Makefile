@@ -8,7 +8,7 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-board lint format bench \
+.PHONY: help install pictures demo test test-ray test-board lint format bench \
 	bench-quick recording mutate lock clean
 
 help:  ## this list
@@ -23,10 +23,6 @@ $(STAMP): pyproject.toml requirements/workstation.txt
 	@touch $@
 
 install: $(STAMP)  ## the virtual environment with the locked dependencies
-
-# Before the installation, too: then with any Python.
-doctor:  ## what this machine can and cannot do, and how to get the rest
-	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
 
 pictures: $(STAMP)  ## the pictures of docs that need no screen
 	$(BIN)/python docs/make_pictures.py
@@ -50,8 +46,7 @@ lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests docs
-	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer \
-	  hil_tests/__init__.py hil_tests/__main__.py hil_tests/doctor.py
+	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .

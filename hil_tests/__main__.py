@@ -7,10 +7,6 @@ import sys
 from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "doctor": (
-        "hil_tests.doctor",
-        "list what this machine can and cannot do, and how to install the rest",
-    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "campaign": (
         "hil_tests.commands:campaign",
@@ -28,10 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-main = program(
-    "python -m hil_tests", "Proves the loop.", COMMANDS,
-    "python -m hil_tests doctor", "python -m hil_tests demo",
-)  # fmt: skip
+main = program("python -m hil_tests", "Proves the loop.", COMMANDS, "python -m hil_tests demo")
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))
