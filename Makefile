@@ -8,7 +8,7 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install pictures demo test test-ray test-board lint format bench \
+.PHONY: help install demo test test-ray test-board lint format bench \
 	bench-quick recording mutate lock clean
 
 help:  ## this list
@@ -23,9 +23,6 @@ $(STAMP): pyproject.toml requirements/workstation.txt
 	@touch $@
 
 install: $(STAMP)  ## the virtual environment with the locked dependencies
-
-pictures: $(STAMP)  ## the pictures of docs that need no screen
-	$(BIN)/python docs/make_pictures.py
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
@@ -45,7 +42,7 @@ test-board: $(STAMP)  ## whole bundles installed, with every fault; minutes, roo
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests docs
+	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
 	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 format: $(STAMP)  ## mend what ruff can
