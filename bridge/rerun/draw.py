@@ -349,7 +349,7 @@ def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -
 
     ``stage`` makes what is shown of what `bridge.ports.open_source` yields.
     """
-    from bridge.ports import open_source, wait_to_be_told  # zenoh: a training goes without.
+    from bridge.ports import open_source, wait_to_be_told  # zenoh: test drives go without.
 
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")
