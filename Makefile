@@ -8,8 +8,8 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo accept test test-ray test-board lint format bench \
-	bench-quick bench-loop recording mutate lock clean
+.PHONY: help install demo accept test test-ray test-board lint format bench \
+	bench-quick recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,13 +23,6 @@ $(STAMP): pyproject.toml requirements/workstation.txt
 	@touch $@
 
 install: $(STAMP)  ## the virtual environment with the locked dependencies
-
-# Before the installation, too: then with any Python.
-doctor:  ## what this machine can and cannot do, and how to get the rest
-	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
-
-pictures: $(STAMP)  ## the pictures of docs that need no screen
-	$(BIN)/python docs/make_pictures.py
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
@@ -49,9 +42,8 @@ test-board: $(STAMP)  ## whole bundles installed, with every fault; minutes, roo
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests docs
-	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer \
-	  hil_tests/__init__.py hil_tests/__main__.py hil_tests/doctor.py
+	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
+	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
@@ -64,9 +56,6 @@ bench: $(STAMP)  ## speed of learner, environments and training, as JSON in resu
 
 bench-quick: $(STAMP)  ## a look at the same
 	$(BIN)/python -m trainer bench --quick --threads 1
-
-bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start
-	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
 
 # One call for each policy; after ^C it goes on.
 ACCEPT := $(BIN)/python -m hil_tests accept --public-key results/policies/policy.pub \

@@ -118,7 +118,7 @@ def report_replay(
         "recording": str(drive.recording.path),
         "policy_id": policy.policy_id,
         "recorded_policy_ids": sorted({each.command.policy_id for each in drive.answers.values()}),
-        **compare(replay(drive, policy, config), tolerance, [] if drawn is None else drawn),
+        **compare(replay(drive, policy, config), tolerance, drawn),
     }
     if report["compared"] == 0:
         raise UserError(f"{drive.recording.path} holds no state with an answer of its policy")

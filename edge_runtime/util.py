@@ -91,7 +91,7 @@ def parse_json(data: bytes, what: str) -> Dict[str, Any]:
 
 def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
     """Read the tables of a TOML file. Raises UserError where it is none, or nested too deep."""
-    import msgspec  # here: `hil_tests doctor` runs before anything is installed
+    import msgspec  # here: the installer runs where nothing is installed
 
     try:
         return dict(msgspec.toml.decode(read_bytes(path, what)))

@@ -7,10 +7,6 @@ import sys
 from edge_runtime.cli import program, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "doctor": (
-        "hil_tests.doctor",
-        "list what this machine can and cannot do, and how to install the rest",
-    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "accept": (
         "hil_tests.commands:accept",
@@ -29,14 +25,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "run a simulated Hunter on a CAN bus, with its faults",
     ),
     "conformance": ("hil_tests.conformance", "test a vehicle's driver against the safety rules"),
-    "bench": ("hil_tests.bench_loop", "measure the loop's latency beside a bare Zenoh callback"),
 }
 
 
-main = program(
-    "python -m hil_tests", "Proves the loop.", COMMANDS,
-    "python -m hil_tests doctor", "python -m hil_tests demo",
-)  # fmt: skip
+main = program("python -m hil_tests", "Proves the loop.", COMMANDS, "python -m hil_tests demo")
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -41,7 +41,7 @@ Group = argparse.ArgumentParser | argparse._ArgumentGroup
     "trainer.training.command:run",
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
     "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
-    "python -m trainer train --human web --rerun mine.rrd --out runs/mine",
+    "python -m trainer train --human web --out runs/mine",
     "python -m trainer train --set    # lists the settings",
 )
 def train(parser: argparse.ArgumentParser) -> None:
@@ -88,9 +88,6 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_time_limit(how, "stop after this many minutes, at the end of the running episode")
     add_device(how)
     add_threads(how)
-    shown = "show the training in the rerun viewer: spawn opens a window, serve a page on this "
-    shown += "machine, F.rrd is a file to write"
-    how.add_argument("--rerun", metavar="spawn|serve|F.rrd", help=shown)
     for action in parser._actions:
         if action.dest in TYPED:  # Only what is typed wins over a run's own config.
             action.help = f"{action.help} (default: {action.default})"
@@ -184,7 +181,8 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
     out = "write the report with the results of each episode to this file instead of stdout"
     add("--out", metavar="R.json", type="path", help=out)
     add("--video", metavar="F.mp4", type="path", help="film the episodes, as they look to a person")
-    shown = "show the episodes in the rerun viewer: spawn, serve or F.rrd, as for train"
+    shown = "show the episodes in the rerun viewer: spawn opens a window, serve a page on this "
+    shown += "machine, F.rrd is a file to write"
     add("--rerun", metavar="spawn|serve|F.rrd", help=shown)
 
 

@@ -42,7 +42,7 @@ KNOWN = {
 }  # fmt: skip
 """All that a pickle may name: module -> names."""
 MOST_MIB = 512
-OTHERWISE = "export an ONNX that holds all of it, as examples/sb3_policy.py does"
+OTHERWISE = "export an ONNX that holds all of it, as docs/own_policy.md says"
 
 
 class _Unknown:

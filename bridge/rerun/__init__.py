@@ -69,7 +69,7 @@ FOXGLOVE_PORT = 8765  # Foxglove looks at this port first
 SPAWN, SERVE, SUFFIX = "spawn", "serve", ".rrd"
 
 
-class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
+class ViewerGone(UserError):  # noqa: N818 (a person closed it: no error)
     """The viewer has ended, hangs, or never came."""
 
 

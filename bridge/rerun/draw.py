@@ -1,7 +1,7 @@
 """The adapter from a drive to rerun, and ``python -m bridge view``, which shows the wire by it.
 
 A `Canvas` draws lines, states, pictures and the road from above; the functions after it lay views
-out, also those of a training (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
+out, also those of test drives (``trainer.view``). Metres; y grows downwards, as in the scene. Cars
 are lines: rerun cannot turn its flat boxes.
 """
 
@@ -349,7 +349,7 @@ def run(arguments: Any, stage: Callable[[Any], Iterator[Heard]] | None = None) -
 
     ``stage`` makes what is shown of what `bridge.ports.open_source` yields.
     """
-    from bridge.ports import open_source, wait_to_be_told  # zenoh: a training goes without.
+    from bridge.ports import open_source, wait_to_be_told  # zenoh: test drives go without.
 
     if arguments.foxglove and (arguments.port or arguments.recording):
         raise UserError("--foxglove PORT listens: it goes with neither --port nor F.mcap")

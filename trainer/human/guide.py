@@ -11,10 +11,8 @@ from trainer.learner.replay import Action, Observation, Transition
 
 Reason = str  # Why the human takes over
 STUCK, ASKED, BY_PERSON = "stuck", "asked", "person"
-REASONS: tuple[Reason, ...] = ("collision", "lane", STUCK, "heading", "offset", BY_PERSON, ASKED)
-"""In this order: a crash can hardly be avoided; the car stops in the traffic's lane; it waits for
-nothing; it turns aside; it is aside; a person took over; the robot asked for help. Another
-environment's expert may have others."""
+"""It waits for nothing; the robot asked for help; a person took over. Our scenarios' experts have
+``collision``, ``lane`` (it stops in the traffic's), ``heading`` and ``offset``, too."""
 HOLD_S = 1.5
 
 
@@ -56,28 +54,6 @@ class Intervention:
     action: Action
     reason: Reason
     first: bool  # Whether the human took over at this step (eq. 17's intervention time)
-
-
-Stepped = tuple[Observation, float, bool, bool, dict[str, Any]]
-"""What ``env.step`` gives: observation, reward, terminated, truncated, info."""
-
-
-def make_transition(
-    observation: Observation,
-    policy_action: Action | None,
-    action: Action,
-    intervention: Intervention | None,
-    stepped: Stepped,
-    penalised: bool = False,
-    foreseen: Sequence[Observation] = (),
-) -> Transition:
-    """Make the transition of a control period, whether driven now or read from a recording."""
-    next_observation, reward, terminated, truncated, _ = stepped
-    return Transition(
-        observation, action, reward, next_observation, terminated, truncated=truncated,
-        human=intervention is not None, overruled=policy_action, penalised=penalised,
-        foreseen=tuple(foreseen),
-    )  # fmt: skip
 
 
 Record = Callable[[Transition, Intervention | None, dict[str, Any]], None]

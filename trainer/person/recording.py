@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from bridge.outcomes import DISCARDED
 from bridge.recording import Recording, new_recording_at
 from edge_runtime.util import UserError
-from trainer.person import Amount, Control
+from trainer.learner.replay import Transition
+from trainer.person import Amount, Control, vector
 
 TOPIC = "person/step"
 DIRECTORY = "sittings"  # Where a training run keeps its recordings
@@ -68,6 +69,14 @@ class RecordedStep(msgspec.Struct, frozen=True):
     def foreseen(self) -> tuple[NDArray[Any], ...]:
         """``Transition.foreseen``: the observation, and those of ``ahead``."""
         return tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
+
+    def transition(self, penalised: bool = False) -> Transition:
+        """Return what was stored of the step; a learner's penalty is not recorded."""
+        overruled = None if self.policy_action is None else vector(self.policy_action)
+        return Transition(
+            self.observation, vector(self.action), self.reward, self.next_observation,
+            self.terminated, self.truncated, self.human, overruled, penalised, self.foreseen,
+        )  # fmt: skip
 
 
 def packed(array: NDArray[Any]) -> bytes:

@@ -21,11 +21,11 @@ from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory
 from edge_runtime.util import UserError
 from trainer.evaluation import TogetherDriver
-from trainer.human.guide import BY_PERSON, Intervention, Stepped, make_transition
+from trainer.human.guide import BY_PERSON, Intervention
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
 from trainer.person import vector, web
-from trainer.person.recording import DIRECTORY, RecordedStep, Recorder, read_episodes, steps_since
+from trainer.person.recording import DIRECTORY, Recorder, read_episodes, steps_since
 from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
@@ -72,7 +72,9 @@ def _recover(training: TrainingRun, sitting: Sitting) -> None:
     steps = human = 0
     for episode in read_episodes(steps_since(training.run_dir / DIRECTORY, sitting.saved_at)):
         for step in episode:
-            restore_step(training, step)
+            action = vector(step.action)
+            by_person = Intervention(action, BY_PERSON, step.first) if step.human else None
+            training.learning.add(step.transition(training.penalises(by_person)))
         training.learning.release()
         steps += len(episode)
         human += sum(step.human for step in episode)
@@ -83,20 +85,6 @@ def _recover(training: TrainingRun, sitting: Sitting) -> None:
     if ended := read_metrics(training.run_dir)[training.episode :]:
         training.episode += len(ended)
         training.steps = int(ended[-1]["total_steps"])
-
-
-def restore_step(training: TrainingRun, step: RecordedStep) -> None:
-    """Give the learner a recorded step as the loop gives it one that is driven."""
-    action = vector(step.action)
-    policy_action = action if step.policy_action is None else vector(step.policy_action)
-    by_person = Intervention(action, BY_PERSON, step.first) if step.human else None
-    stepped: Stepped = step.next_observation, step.reward, step.terminated, step.truncated, {}
-    training.learning.add(
-        make_transition(
-            step.observation, policy_action, action, by_person, stepped,
-            training.penalises(by_person), step.foreseen,
-        )
-    )  # fmt: skip
 
 
 def check_settings(config: RunConfig) -> None:

@@ -20,7 +20,7 @@ from edge_runtime.files import check_writable
 from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import load_driver, located, trained_in
-from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention, make_transition
+from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.person import (
     Amount,
@@ -340,11 +340,13 @@ def drive(
             policy_action = None if policy is None else policy.act(observation)
             intervention = sitting.watch(observation, policy_action)
             action = vector(sitting.applied)
-            stepped = vehicle.step(action)
-            step = make_transition(observation, policy_action, action, intervention, stepped)
-            observation, info = step.next_observation, stepped[-1]
+            seen, reward, terminated, truncated, info = vehicle.step(action)
+            step = Transition(
+                observation, action, reward, seen, terminated, truncated,
+                intervention is not None, policy_action,
+            )  # fmt: skip
+            observation, ended = seen, terminated or truncated
             sitting.record(step, intervention, info)
-            ended = step.terminal or step.truncated
         sitting.end_episode(info["outcome"])
 
 

@@ -9,7 +9,6 @@ import pytest
 from bridge.network import LatencySpec, parse_spec
 from trainer.environments import DelayedVehicle, make_environment, ticks_late
 from trainer.evaluation import TogetherDriver, drive_episodes
-from trainer.human.guide import Intervention, make_transition
 from trainer.learner.replay import Transition
 from trainer.tests.loops import CONFIG, ScriptedEnv, frames, number
 from trainer.training.learning import LearningThread
@@ -29,15 +28,16 @@ def driven(monkeypatch, spec, ticks=60, seed=0, human=(), ahead=0) -> tuple[list
     act = vehicle.behind(answer)
     for tick in range(ticks):
         policy_action = action = act(observation)
-        by_human = None
         if tick in human:
             action = np.array([0.9], np.float32)
-            by_human = Intervention(action, "collision", True)
-        stepped = vehicle.step(action)
-        foreseen = [frames(tick + n) for n in range(ahead)]
-        given = policy_action, action, by_human, stepped, False, foreseen
-        learning.add(make_transition(observation, *given))
-        observation = stepped[0]
+        seen, reward, terminated, truncated, _ = vehicle.step(action)
+        foreseen = tuple(frames(tick + n) for n in range(ahead))
+        transition = Transition(
+            observation, action, reward, seen, terminated, truncated, tick in human, policy_action,
+            foreseen=foreseen,
+        )  # fmt: skip
+        learning.add(transition)
+        observation = seen
     learning.close()
     return env.actions, stored
 

@@ -24,7 +24,6 @@ import pandas as pd
 
 from bridge.outcomes import GOAL, Estimate
 from bridge.report import ProgressBar
-from bridge.rerun import check_sink
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json
 from trainer import util
@@ -79,8 +78,8 @@ class Run:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.seeds is None:
         return INTERRUPTED if _run(arguments).interrupted else 0
-    if arguments.rerun or vars(arguments).get("human") in HUMANS:
-        raise UserError("--seeds goes with neither a person nor --rerun")
+    if vars(arguments).get("human") in HUMANS:
+        raise UserError("--seeds does not go with a person")
     ends = list(_run_seeds(arguments))
     return INTERRUPTED if any(ends) else 0
 
@@ -152,7 +151,6 @@ def train(
     demonstrations: str = DEFAULTS.demonstrations,
     success: str = DEFAULTS.success,
     resume: bool = False,
-    rerun: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
     speed: float = 1.0,
@@ -213,7 +211,7 @@ def _train(
     env: Any,
     how: argparse.Namespace,
 ) -> Run:
-    sink, end_s = how.rerun and check_sink(how.rerun), util.deadline_s(how.max_minutes)
+    end_s = util.deadline_s(how.max_minutes)
     with ExitStack() as stack:
         training: TrainingRun
         if person.human in HUMANS:
@@ -232,12 +230,6 @@ def _train(
         if config.steps:
             extent = config.steps, training.steps
         bar = stack.enter_context(ProgressBar("training", *extent))
-        watch = None
-        if sink:
-            from trainer.view import watched  # rerun takes a second to load
-
-            watch = stack.enter_context(watched(training, sink))
-        # Entered last: the first signal is ours, and the second the viewer's.
         stack.enter_context(quit_on_signals(quit_training))
         recent: deque[EpisodeMetrics] = deque(maxlen=20)
         explored = training.progress >= config.learner.exploration_share
@@ -257,8 +249,6 @@ def _train(
             figures["return"] = f"{fmean(m.episode_return for m in recent):.1f}"
             figures["success"] = f"{fmean(m.outcome == GOAL for m in recent):.2f}"
             bar.advance(figures, metrics.steps if config.steps else 1)
-            if watch:
-                watch(metrics)
 
         training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first

@@ -20,7 +20,6 @@ from bridge.recording import Recording
 from edge_runtime.util import UserError
 from trainer.environments import inner, task_of
 from trainer.learner.replay import Transition
-from trainer.person import vector
 from trainer.person.recording import TOPIC, RecordedStep, find_recordings, read_episodes, read_steps
 
 Episode = list[Transition]
@@ -47,14 +46,7 @@ def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
 def _from_sitting(steps: list[RecordedStep], env: Any) -> Episode:
     if steps[0].scenario != env.scenario:
         raise UserError(f"a demonstration is of {steps[0].scenario}, not of {env.scenario}")
-    return [
-        Transition(
-            step.observation, vector(step.action), step.reward, step.next_observation,
-            step.terminated, step.truncated, step.human,
-            None if step.policy_action is None else vector(step.policy_action),
-        )
-        for step in steps
-    ]  # fmt: skip
+    return [step.transition() for step in steps]
 
 
 def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:

@@ -47,13 +47,12 @@ from trainer.human.guide import (
     Intervention,
     PoorHands,
     Record,
-    make_transition,
     steps_held,
 )
 from trainer.learner import equations
 from trainer.learner.config import find_algorithm
 from trainer.learner.networks import Actor
-from trainer.learner.replay import Action, Observation
+from trainer.learner.replay import Action, Observation, Transition
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import read_demonstrations
@@ -401,12 +400,12 @@ class TrainingRun:
             self.delayed.release_brake()
         if intervention is not None and self.algorithm.foresight:
             foreseen = foresee(self.env, observation, policy_action, self.algorithm.foresight)
-        stepped = next_observation, reward, terminated, truncated, info = self.vehicle.step(action)
+        next_observation, reward, terminated, truncated, info = self.vehicle.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
-        transition = make_transition(
-            observation, policy_action, action, intervention, stepped,
-            self.penalises(intervention), foreseen,
+        transition = Transition(
+            observation, action, reward, next_observation, terminated, truncated,
+            intervention is not None, policy_action, self.penalises(intervention), tuple(foreseen),
         )  # fmt: skip
         self.learning.add(transition)
         stored_s = time.perf_counter()

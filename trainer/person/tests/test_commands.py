@@ -43,8 +43,6 @@ WRONG = [
     (HUMAN, ("{tmp}/policy",), "nobody took over"),
     (HUMAN, (MINE, "--scenario", "congestion"), "was driven in left_turn, not in congestion"),
     (HUMAN, (MINE, "{tmp}/crafted"), "steps that are none of left_turn"),
-    (TRAIN, ("--rerun", "window"), "neither spawn nor serve"),
-    (TRAIN, ("--rerun", "spawn"), "no display"),
 ]
 
 
