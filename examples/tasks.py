@@ -95,5 +95,47 @@ class HillExpert:
         return "wasted" if self.against > self.PATIENCE else None
 
 
+class Lander(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Gymnasium's LunarLanderContinuous-v3; the goal is to come to rest on the ground."""
+
+    LANDED = 100.0  # The reward of the step in which it does
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(gymnasium.make("LunarLanderContinuous-v3", **options))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode."""
+        seen, info = self.env.reset(seed=seed, options=options)
+        self.unwrapped.seen = seen
+        return seen, info
+
+    def step(self, action: Any) -> Any:
+        """Drive for one control period and report success."""
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self.unwrapped.seen = seen
+        landed = terminated and reward == self.LANDED
+        return seen, reward, terminated, truncated, {**info, "is_success": landed}
+
+
+class LanderExpert:
+    """Gymnasium's own heuristic, which takes over from a policy that does something else."""
+
+    STRICT = 0.5  # Difference of an action, in [-1, 1]
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def act(self) -> np.ndarray:
+        """Return the main engine's and the side engines' throttle, each in [-1, 1]."""
+        from gymnasium.envs.box2d.lunar_lander import heuristic
+
+        return np.clip(heuristic(self.env, self.env.seen), -1.0, 1.0)
+
+    def wants_control(self, policy_action: np.ndarray) -> str | None:
+        """Return why it takes over, or None."""
+        return "off" if np.abs(policy_action - self.act()).max() > self.STRICT else None
+
+
 gymnasium.register("examples/Racetrack-v0", Racetrack, max_episode_steps=150)
 gymnasium.register("examples/Hill-v0", Hill, max_episode_steps=200)
+gymnasium.register("examples/Lander-v0", Lander, max_episode_steps=600)
