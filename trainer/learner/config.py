@@ -240,6 +240,17 @@ class LearnerConfig:
     cloning_bound: float = 0.0
     """Distance from the human's action beyond which the loss grows in proportion, no longer with
     the square; 0: none. A few wrong actions then count little beside the right ones."""
+    cloning_batch_size: int = 0
+    """The human's transitions in a batch of its own, all drawn alike often, from which the actor
+    imitates by an optimiser of its own; 0: it imitates those of the common minibatch. Default where
+    no picture is seen: 128. Few labels are soon fitted exactly; from then on one optimiser for both
+    terms follows the critics' error alone, at full length, whatever the weights."""
+    cloning_learning_rate: float = 1e-3
+    """Of that optimiser."""
+    fresh_actors: int = 0
+    """How often in a run, at even distances, a fresh actor that is fitted to all of the human's
+    actions takes the actor's place. One that began with few of them generalises worse (Ash and
+    Adams, 2020). Default where no picture is seen: 3."""
     preference_beta: float = 0.1
     """How sharply a preference tells two actions apart, per squared distance; the lower, the less
     it minds that the better one is nearer already (2510.01545: beta)."""
@@ -290,6 +301,7 @@ RANGES = {
     ANY: ("intervention_penalty",),
     (1, 2): ("frames",),
     (1, 10**6): ("batch_size",),
+    (0, 10**6): ("cloning_batch_size", "fresh_actors"),
     (1, 10**9): ("replay_capacity",),
     (0, 20): ("picture_shift",),
 }  # fmt: skip
@@ -299,6 +311,8 @@ UNGUIDED_NUMBERS = {
     "exploration_searching": 1.0, "exploration_initial": 0.6, "exploration_final": 0.3,
 }  # fmt: skip
 """Without a human only noise finds what pays, and where numbers are seen it does little harm."""
+IMITATED_NUMBERS = {"cloning_batch_size": 128, "fresh_actors": 3}
+"""Numbers are cheap: imitation can have a batch of its own."""
 
 
 def task_settings(row: Algorithm, numbers: bool, period_s: float) -> dict[str, float]:
@@ -310,7 +324,10 @@ def task_settings(row: Algorithm, numbers: bool, period_s: float) -> dict[str, f
     shorter, usual = min(period_s / PERIOD_S, 1.0), LearnerConfig()
     names = ("gamma", "exploration_correlation")
     lasting = {name: getattr(usual, name) ** shorter for name in names}
-    return lasting | (UNGUIDED_NUMBERS if numbers and not row.guided else {})
+    if not numbers:
+        return lasting
+    imitated = IMITATED_NUMBERS if row.behaviour_cloning else {}
+    return lasting | imitated | ({} if row.guided else UNGUIDED_NUMBERS)
 
 
 PRINTED_LEARNER = LearnerConfig(

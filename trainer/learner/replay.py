@@ -76,6 +76,8 @@ class Batch:
     penalised: NDArray[np.bool_]  # Whether the overruled action is penalised (eq. 17), [n]
     foreseen: Batch | None = None
     """A second batch, whose ``next_frames`` overruled actions would have led to."""
+    shown: Batch | None = None
+    """A further batch, of the human's transitions alone, to imitate."""
 
 
 class ReplayBuffer:
@@ -99,6 +101,8 @@ class ReplayBuffer:
         human_share: share of the human's transitions in a minibatch once there are both kinds,
             which are then drawn separately; 0: not fixed.
         foresees: also keep, and draw, the observations to which overruled actions would have led.
+        shown: number of the human's transitions that each minibatch draws besides, all alike
+            likely.
     """
 
     def __init__(
@@ -113,8 +117,10 @@ class ReplayBuffer:
         layout: ReplayLayout = FRAMES_LAYOUT,
         human_share: float = 0.0,
         foresees: bool = False,
+        shown: int = 0,
     ) -> None:
         self.capacity, self.alpha, self.human_share = capacity, alpha, human_share
+        self.shown = shown
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
         self.reward_scale = 1.0
         """What a reward is multiplied by when it is drawn."""
@@ -231,7 +237,14 @@ class ReplayBuffer:
         batch = self._gather(self._draw(count, random))
         if self._foreseen:  # there, and not empty
             batch = replace(batch, foreseen=self._foreseen.sample(count, random))
+        if self.shown and self.human_count:
+            batch = replace(batch, shown=self.show(self.shown, random))
         return batch
+
+    def show(self, count: int, random: np.random.Generator) -> Batch:
+        """Draw the human's transitions alone, all alike likely; there must be one."""
+        humans = self.alive[self._human[self.alive]]
+        return self._gather(random.choice(humans, count))
 
     def _draw(self, count: int, random: np.random.Generator) -> Indices:
         # Stratified: one draw from each of `count` equal parts.

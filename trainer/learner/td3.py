@@ -5,8 +5,10 @@ written plainly.
 """
 
 import copy
+from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain
+from functools import partial
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +40,8 @@ def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
 
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
-OPTIMISERS = ("actor_optimiser", "critic_optimiser")
+OPTIMISERS = ("actor_optimiser", "critic_optimiser", "cloning_optimiser")
+MOST_BATCHES = 3000  # By which a fresh actor is fitted
 
 
 def _values(critics: networks.CriticPair, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
@@ -68,7 +71,8 @@ class TD3Learner:
             _calculate_exactly()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.actor = Actor(action_size, config.frames, space).to(self.device)
+            self._make_actor = partial(Actor, action_size, config.frames, space)
+            self.actor = self._make_actor().to(self.device)
             critics = CriticPair(
                 action_size, config.frames, config.action_bound, config.critic_norm, space
             )
@@ -81,12 +85,15 @@ class TD3Learner:
         self.critic_optimiser = torch.optim.Adam(
             self.critics.parameters(), config.critic_learning_rate, fused=True
         )
-        for optimiser in (self.actor_optimiser, self.critic_optimiser):
+        self.cloning_optimiser = torch.optim.Adam(
+            self.actor.parameters(), config.cloning_learning_rate, fused=True
+        )
+        for optimiser in (getattr(self, name) for name in OPTIMISERS):
             for group in optimiser.param_groups:
                 group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
-        self._cloning_weight = config.cloning_weight
+        self._fade = 1.0  # Of the weight on cloning
         # bfloat16 has 8 bits of precision: enough for pixels, too few for numbers.
         self._reduces = isinstance(space, Box) and networks.is_picture(space.dtype, space.shape)
         self._charges_overruled = charges_overruled(config, algorithm)
@@ -128,25 +135,62 @@ class TD3Learner:
         score = self.actor.head(own_picture)
         own_actions = torch.tanh(score)
         judged = self._judge(seen, actions, human, own_actions.detach())
-        policy, cloning = self._actor_losses(
-            pictures[0].detach(), own_actions, actions, human, judged
-        )
+        policy = self._policy_loss(pictures[0].detach(), own_actions, human)
+        cloning = self._cloning_loss(batch.shown, own_actions, actions, human, judged)
         priorities = self._priorities(errors, judged, human)
         if self.algorithm.foresight and batch.foreseen is not None:
             policy = policy + self._preference_loss(batch.foreseen)
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
-            loss = policy + self._cloning_weight * cloning
-            if c.saturation_weight:
-                loss = loss + c.saturation_weight * score.square().mean()
-            _differentiate(loss, self.actor)
-            self.actor_optimiser.step()
+            self._step_actor(policy, cloning, score, apart=batch.shown is not None)
         self.critic_optimiser.step()
         if with_policy:
             self._update_targets()
         critics, actor, clone, mean = (one.item() for one in (critic_loss, policy, cloning, value))
         return Losses(critics, actor, clone, mean, priorities.double().cpu().numpy())
+
+    def _step_actor(self, policy: Tensor, cloning: Tensor, score: Tensor, apart: bool) -> None:
+        """Step by both terms of eq. 23; ``apart``: by an optimiser each."""
+        c, row = self.config, self.algorithm
+        saturation = c.saturation_weight * score.square().mean() if c.saturation_weight else 0.0
+        if not apart:
+            loss = policy + self._fade * c.cloning_weight * cloning + saturation
+            _differentiate(loss, self.actor)
+            self.actor_optimiser.step()
+            return
+        parameters = list(self.actor.parameters())
+        towards_human = torch.autograd.grad(cloning, parameters)
+        if row.q_term or row.foresight:
+            _differentiate(policy + saturation, self.actor)
+            self.actor_optimiser.step()
+        for parameter, gradient in zip(parameters, towards_human, strict=True):
+            parameter.grad = gradient
+        self.cloning_optimiser.step()
+
+    def begin_actor_anew(self, batches: Iterable[Batch]) -> None:
+        """Put a fresh actor in place, fitted to batches of the human's actions.
+
+        To as many as there were updates, and at most ``MOST_BATCHES``.
+        """
+        c, most = self.config, min(self.updates, MOST_BATCHES)
+        with torch.random.fork_rng():
+            torch.manual_seed(self.updates)
+            fresh = self._make_actor().to(self.device)
+        fresh.load_state_dict({**fresh.state_dict(), **dict(self.actor.named_buffers())})
+        optimiser = torch.optim.Adam(fresh.parameters(), c.cloning_learning_rate, fused=True)
+        for done, batch in enumerate(islice(batches, most)):
+            optimiser.param_groups[0]["lr"] = c.cloning_learning_rate * (1 - done / most)
+            seen, human = tensors(self._shift(batch.frames), self.device), self._tensor(batch.human)
+            loss = equations.behaviour_cloning_loss(
+                fresh(*seen), self._tensor(batch.actions), human, None, c.cloning_bound
+            )
+            _differentiate(loss, fresh)
+            optimiser.step()
+        for actor in (self.actor, self.target_actor):
+            actor.load_state_dict(fresh.state_dict())
+        self.actor_optimiser.state.clear()
+        self.cloning_optimiser.state.clear()
 
     def decay(self, progress: float) -> None:
         """Decay both rates (table A5) and the weight on cloning after an episode.
@@ -155,17 +199,19 @@ class TD3Learner:
         """
         c = self.config
         if c.cloning_share:
-            self._cloning_weight = c.cloning_weight * max(0.0, 1.0 - progress / c.cloning_share)
+            self._fade = max(0.0, 1.0 - progress / c.cloning_share)
         left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
-        for optimiser in (self.actor_optimiser, self.critic_optimiser):
+        for optimiser in (getattr(self, name) for name in OPTIMISERS):
             for group in optimiser.param_groups:
                 group["decayed_lr"] *= c.learning_rate_decay
                 group["lr"] = group["decayed_lr"] * left
+        for group in self.cloning_optimiser.param_groups:
+            group["lr"] *= self._fade
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimisers, noise and counters: all that a resumed run needs."""
         parts = {name: getattr(self, name).state_dict() for name in (*NETWORKS, *OPTIMISERS)}
-        counted = {"updates": self.updates, "cloning_weight": self._cloning_weight}
+        counted = {"updates": self.updates, "fade": self._fade}
         return {**parts, "noise": self.noise.get_state(), **counted}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -178,7 +224,7 @@ class TD3Learner:
                 # torch does not check.
                 raise ValueError("an optimiser's state is of other weights")
         self.noise.set_state(state["noise"])
-        self.updates, self._cloning_weight = state["updates"], state["cloning_weight"]
+        self.updates, self._fade = state["updates"], state["fade"]
 
     def _precision(self) -> torch.autocast:
         kind = self.device.type
@@ -262,26 +308,37 @@ class TD3Learner:
                 loss = loss + equations.proxy_value_loss(*pair, human)
         return loss, errors, mean
 
-    def _actor_losses(
+    def _policy_loss(self, picture: Tensor, own_actions: Tensor, human: Tensor) -> Tensor:
+        """Return eq. 23's first term; without cloning it has all samples."""
+        if not self.algorithm.q_term:
+            return torch.zeros((), device=self.device)
+        values = self.critics.first.value(picture, own_actions)
+        split = self.config.split_loss and self.algorithm.behaviour_cloning
+        return equations.policy_loss(values, human, split)
+
+    def _cloning_loss(
         self,
-        picture: Tensor,
+        shown: Batch | None,
         own_actions: Tensor,
         actions: Tensor,
         human: Tensor,
         judged: tuple[Tensor, Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """Return eq. 23's two terms, unweighted; without cloning the first has all samples."""
-        row, nothing = self.algorithm, torch.zeros((), device=self.device)
-        cloned, policy = row.behaviour_cloning, nothing
-        if row.q_term:
-            values = self.critics.first.value(picture, own_actions)
-            policy = equations.policy_loss(values, human, self.config.split_loss and cloned)
-        if not cloned:
-            return policy, nothing
+    ) -> Tensor:
+        """Return eq. 23's second term, unweighted: of ``shown``, else of the minibatch."""
+        row = self.algorithm
+        if not row.behaviour_cloning:
+            return torch.zeros((), device=self.device)
+        if shown is not None:
+            seen = tensors(self._shift(shown.frames), self.device)
+            actions, human = self._tensor(shown.actions), self._tensor(shown.human)
+            with self._precision():
+                picture = self.actor.picture(*seen)
+            own_actions = torch.tanh(self.actor.head(picture))
+            if row.weighted_cloning:
+                judged = self._judge(seen, actions, human, own_actions.detach())
         weights = equations.cloning_weights(*judged) if row.weighted_cloning else None
         bound = self.config.cloning_bound
-        cloning = equations.behaviour_cloning_loss(own_actions, actions, human, weights, bound)
-        return policy, cloning
+        return equations.behaviour_cloning_loss(own_actions, actions, human, weights, bound)
 
     def _preference_loss(self, foreseen: Batch) -> Tensor:
         """Prefer the human's action in the states to which the overruled one would have led."""

@@ -1,6 +1,8 @@
 """Tasks of any scale: numbers by their spread, grids, rewards of any size, any control period."""
 
 from contextlib import closing
+from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from trainer.learner.config import PHIL
 from trainer.learner.networks import Actor, Convolutions, Numbers, make_trunk
 from trainer.learner.replay import Transition
 from trainer.learner.td3 import NETWORKS, TD3Learner
-from trainer.tests.learners import SMALL
+from trainer.tests.learners import SMALL, make_batch
 from trainer.training.config import make_config
 from trainer.training.learning import LearningThread
 
@@ -79,6 +81,43 @@ def test_new_units_of_the_reward_change_every_value_alike():
     for critic, value in zip(critics, before, strict=True):
         after = critic.value(critic.picture(seen), actions)
         assert after.tolist() == pytest.approx((0.1 * value).tolist(), rel=1e-5)
+
+
+def test_a_fresh_actor_is_fitted_to_the_humans_actions_and_keeps_the_scale():
+    learner = TD3Learner(SMALL, PHIL, seed=0, space=WIDE)
+    learner.fit_numbers(SEEN)
+    actions = np.array([[0.7], [-0.4]], np.float32)
+    shown = replace(make_batch(size=2, humans=2), frames=SEEN, actions=actions)
+    assert shown.human.all()
+    learner.updates, before = 300, learner.actor.act(SEEN)
+    learner.begin_actor_anew(repeat(shown))
+    for actor in (learner.actor, learner.target_actor):
+        assert actor.act(SEEN) == pytest.approx(actions, abs=0.05)
+        assert actor.picture.trunk.middle.tolist() == pytest.approx([41.0, 0.5005, 5.0, 8.0])
+    assert before != pytest.approx(actions, abs=0.05)
+
+
+@pytest.mark.parametrize("algorithm", ["phil_td3", "hi_td3"])
+def test_the_actor_begins_anew_at_even_parts_of_a_run(algorithm, monkeypatch):
+    """And a resumed run does not begin it once more. What does not imitate goes on."""
+    env = make_environment("Pendulum-v1")
+    with closing(env):
+        config = make_config("ours", {**SETTINGS, "algorithm": algorithm}, env)
+        learning, resumed = LearningThread(config, env), LearningThread(config, env)
+        begun: list[Any] = []
+        for each in (learning, resumed):
+            monkeypatch.setattr(each.learner, "begin_actor_anew", begun.append)
+        store(learning, [1.0] * 30)
+        seen = learning.replay.observations(1)[0]
+        learning.add(Transition(seen, np.zeros(1, np.float32), 0.0, seen, False, human=True))
+        for progress, times in ((0.2, 0), (0.3, 1), (0.4, 1), (0.8, 2), (1.0, 2)):
+            learning.end_episode(progress)
+            assert len(begun) == (times if algorithm == "phil_td3" else 0)
+        resumed.load_state_dict(learning.state_dict())
+        resumed.end_episode(1.0)
+        assert len(begun) == (2 if algorithm == "phil_td3" else 0)
+        learning.close()
+        resumed.close()
 
 
 def test_a_fitted_actor_acts_on_what_it_has_seen():

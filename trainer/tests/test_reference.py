@@ -58,11 +58,12 @@ class ReferenceLearner:
             self.critics = CriticPair(1, config.frames, config.action_bound, config.critic_norm)
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
-        self.actor_optimiser, self.critic_optimiser = (
+        self.actor_optimiser, self.critic_optimiser, self.cloning_optimiser = (
             torch.optim.Adam(module.parameters(), rate)
             for module, rate in (
                 (self.actor, config.actor_learning_rate),
                 (self.critics, config.critic_learning_rate),
+                (self.actor, config.cloning_learning_rate),
             )
         )
         self.noise = torch.Generator().manual_seed(seed)
@@ -112,11 +113,18 @@ class ReferenceLearner:
             judge = self.target_critics.first
             judged = q(judge, frames, actions), q(judge, frames, own_actions)
         if cloned:
-            weights = 2.0 / (1.0 + torch.exp(judged[1] - judged[0]))
+            names = ("frames", "actions", "human")
+            seen, shown, by_human = (
+                torch.from_numpy(getattr(batch.shown or batch, n)) for n in names
+            )
+            imitating = torch.tanh(policy_score(self.actor, seen))
+            with torch.no_grad():
+                preferred = q(judge, seen, shown) - q(judge, seen, imitating)
+            weights = 2.0 / (1.0 + torch.exp(-preferred))
             cloning = equations.behaviour_cloning_loss(
-                own_actions,
-                actions,
-                human,
+                imitating,
+                shown,
+                by_human,
                 weights if row.weighted_cloning else None,
                 c.cloning_bound,
             )
@@ -128,8 +136,7 @@ class ReferenceLearner:
             )
             odds = (around.log_prob(better) - around.log_prob(worse)).sum(dim=1)
             policy = policy - torch.log(torch.sigmoid(c.preference_beta * odds)).mean()
-        actor_loss = policy + c.cloning_weight * cloning
-        actor_loss = actor_loss + c.saturation_weight * scores.square().mean()
+        policy_loss = policy + c.saturation_weight * scores.square().mean()
 
         with torch.no_grad():
             advantage = equations.q_advantage(*judged, c.advantage_bound)
@@ -140,9 +147,17 @@ class ReferenceLearner:
         self.critic_optimiser.zero_grad()
         critic_loss.backward()
         if self.updates % c.policy_delay == 0:
-            self.actor_optimiser.zero_grad()
-            actor_loss.backward(inputs=list(self.actor.parameters()))
-            self.actor_optimiser.step()
+            parameters = list(self.actor.parameters())
+            if batch.shown:  # An optimiser for each of the two terms
+                steps = [(self.actor_optimiser, policy_loss)] if row.q_term else []
+                steps.append((self.cloning_optimiser, cloning))
+            else:
+                steps = [(self.actor_optimiser, policy_loss + c.cloning_weight * cloning)]
+            gradients = [torch.autograd.grad(loss, parameters) for _, loss in steps]
+            for (optimiser, _), towards in zip(steps, gradients, strict=True):
+                for parameter, gradient in zip(parameters, towards, strict=True):
+                    parameter.grad = gradient
+                optimiser.step()
         self.critic_optimiser.step()
         if self.updates % c.policy_delay == 0:
             for online, target in (
@@ -172,11 +187,13 @@ def both(config: LearnerConfig, algorithm: Algorithm) -> tuple[TD3Learner, Refer
     return fast, plain
 
 
-def check(config: LearnerConfig, algorithm: Algorithm, humans: int = 4) -> None:
+def check(
+    config: LearnerConfig, algorithm: Algorithm, humans: int = 4, shown: Batch | None = None
+) -> None:
     fast, plain = both(config, algorithm)
     start = weights_of(fast)
     for seed in range(2):
-        batch, off = make_batch(seed, humans), 1e-3 if seed else 1e-5
+        batch, off = replace(make_batch(seed, humans), shown=shown), 1e-3 if seed else 1e-5
         ours, wanted = fast.update(batch, beta=0.5), plain.update(batch, beta=0.5)
         np.testing.assert_allclose(ours[:4], wanted[:4], rtol=off, atol=0.01 * off)
         np.testing.assert_allclose(ours.priorities, wanted.priorities, rtol=max(off, 1e-4))
@@ -224,6 +241,11 @@ def test_every_switch(change):
 @pytest.mark.parametrize("humans", [0, 12])
 def test_batches_of_one_kind(humans):
     check(replace(SMALL, split_loss=True), PHIL, humans)
+
+
+@pytest.mark.parametrize("name", ["phil_td3", "phil_weighted", "cloning_only"])
+def test_a_batch_of_its_own_is_imitated_by_an_optimiser_of_its_own(name):
+    check(SMALL, ALGORITHMS[name], shown=make_batch(9, humans=7, size=7))
 
 
 def test_reduced_precision_is_near_and_repeatable():

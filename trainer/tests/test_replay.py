@@ -169,6 +169,20 @@ def test_half_of_what_is_drawn_is_the_humans_where_there_are_both(steps, share):
     np.testing.assert_allclose(counts / 4000, batch.probabilities[where], atol=0.002)
 
 
+@pytest.mark.parametrize("steps", [(30, -10), (-10, 30), (30,)])
+def test_what_is_shown_is_the_humans_whatever_its_priority(steps):
+    buffer, _ = filled(*steps, shown=400)
+    buffer.update_priorities(buffer.alive, np.arange(1.0, len(buffer) + 1))
+    shown = sample(buffer).shown
+    if steps == (30,):
+        assert shown is None
+        return
+    assert shown.human.all()
+    drawn = np.unique(shown.indices, return_counts=True)[1]
+    assert len(drawn) == 10
+    assert drawn.max() < 2 * drawn.min()
+
+
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=70), st.floats(0, 1, exclude_max=True))
 def test_find_inverts_the_cumulative_sum(weights, share):
     plain = np.array(weights)

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ LOSSES = Losses._fields[:4]  # What is averaged over an episode
 MOST_TO_FIT = 4096  # Observations by whose spread numbers are scaled
 USUAL_RETURN, USUAL_FACTOR = 10.0, 3.0
 """Returns of about +-10 stay as they are: within that factor."""
+FRESH_BATCH_SIZE = 256
 NICENESS = 10  # Of what learns beside a person, with torch's own threads: the loop goes first
 
 
@@ -61,6 +63,7 @@ class LearningThread:
                 c.replay_capacity, action_size, c.alpha, row.separate_buffers, c.return_steps,
                 c.gamma, c.intervention_penalty if charges_overruled(c, row) else None,
                 env.layout, row.human_share, bool(row.foresight),
+                c.cloning_batch_size if row.behaviour_cloning else 0,
             )  # fmt: skip
         except MemoryError as error:
             raise UserError(f"replay_capacity {c.replay_capacity}: {error}") from None
@@ -74,7 +77,7 @@ class LearningThread:
         self._thread = ThreadPoolExecutor(1, "learner", torch.set_flush_denormal, (True,))
         self._begun: tuple[list[Batch], Future[tuple[list[Losses], float]]] | None = None
         self._scenario = config.scenario
-        self._fitted = False
+        self._fitted, self._renewed = False, 0
         """Whether observations and rewards are scaled by what the warm-up has seen."""
         self._forget_losses()
 
@@ -163,6 +166,7 @@ class LearningThread:
         False where a person discards the episode, which only `UnhurriedLearning` can still forget.
         """
         self.learner.decay(progress)
+        self._begin_actor_anew(progress)
         means = np.mean(self._losses, axis=0) if self._losses else [math.nan] * len(LOSSES)
         names = (*LOSSES, "policy_priority", "human_priority")
         learned = {
@@ -175,6 +179,14 @@ class LearningThread:
         if self._fitted:
             self._scale_rewards()
         return learned
+
+    def _begin_actor_anew(self, progress: float) -> None:
+        times = self.config.fresh_actors
+        due = min(int(progress * (times + 1)), times)
+        if due > self._renewed and self.replay.human_count:
+            self._renewed = due
+            batches = (self.replay.show(FRESH_BATCH_SIZE, self._random) for _ in count())
+            self._thread.submit(self.learner.begin_actor_anew, batches).result()
 
     def release(self, keep: bool = True) -> None:
         """Let the next transition begin an episode; store, or forget, what was kept back."""
@@ -194,13 +206,13 @@ class LearningThread:
         }
         drawing = self._random.bit_generator.state
         return {"learner": self.learner.state_dict(), "replay": replay, "drawing": drawing,
-                "fitted": self._fitted}  # fmt: skip
+                "fitted": self._fitted, "renewed": self._renewed}  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
-        self._fitted = state["fitted"]
+        self._fitted, self._renewed = state["fitted"], state["renewed"]
 
     def close(self) -> None:
         self._thread.shutdown()
