@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trainer.environments import CONDITIONS
-from trainer.learner.config import ALGORITHMS, FASTER
+from trainer.learner.config import ALGORITHMS, FASTER, task_settings
 
 RESULTS_VERSION = 1
 """Raised by hand when a change of the code makes earlier records another experiment."""
@@ -44,8 +44,8 @@ ROWS, HELPED = (tuple(DATA["groups"][name]) for name in ("rows", "helped"))
 """Rows of the table of human guidance, and those that a human helps."""
 RIVALS = tuple(name for name in HELPED if name != "phil_td3")
 TUNED: Mapping[str, Mapping[str, Any]] = dict.fromkeys(DATA["groups"]["guided"], FASTER)
-"""Row of the table of human guidance -> the hyper-parameters that its tuning chose there, where the
-paper's experiments have others. What it chose for the other rows stands in ``ALGORITHMS``."""
+"""Row of the table of human guidance -> the hyper-parameters that its tuning chose in our scenes,
+where the paper's experiments have others. What it chose for other rows stands in ``ALGORITHMS``."""
 DEFAULT_SEEDS = 5
 PAPER_TESTS = 50
 """Of the test drives in a scene, the first so many have the paper's seeds (section VII-D)."""
@@ -151,13 +151,13 @@ class Study:
     search_points: int = 21  # Actions on each of the two grids of that search
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
-    slow: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Task -> fields that are others in it, since its steps take long."""
+    by_task: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Task -> fields that are others in it."""
     name: str = ""  # Of its page's template, and of its folders in ``results`` and ``runs``
 
     def of(self, task: str) -> Study:
         """Return the study with what holds for one task."""
-        return replace(self, **self.slow.get(task, {}))
+        return replace(self, **self.by_task.get(task, {}))
 
     def quick(self) -> Study:
         """Return the same rows in a minute or two; the numbers mean nothing."""
@@ -193,8 +193,11 @@ class Study:
             return {**values, "search": [here.search_runs, here.search_points]}
         if not unit.trained:
             return values
-        tuned = TUNED.get(unit.algorithm, {}) if unit.setting in HUMANS else {}
-        own = ALGORITHMS[unit.algorithm].settings
+        is_tuned = unit.setting in HUMANS and unit.scenario in SCENARIOS
+        tuned = TUNED.get(unit.algorithm, {}) if is_tuned else {}
+        row, asked = ALGORITHMS[unit.algorithm], dict[str, float]()
+        if period_s := TASKS[unit.scenario].get("numbers_period_s"):
+            asked = task_settings(row, numbers=True, period_s=period_s)
         factor = here.confirmation_factor
         confirmed = {"confirmation_factor": factor} if factor else {}  # Records without it are kept
         return {
@@ -206,7 +209,13 @@ class Study:
             "evaluation_runs": here.evaluation_runs,
             **confirmed,
             **setting.get("run", {}),
-            "learner": {**own, **tuned, **here.learner, **setting.get("learner", {})},
+            "learner": {
+                **asked,
+                **row.settings,
+                **tuned,
+                **here.learner,
+                **setting.get("learner", {}),
+            },
         }
 
     def run_name(self, unit: Unit) -> str:
