@@ -4,6 +4,8 @@ import math
 
 import pytest
 from hil_tests.testing.policies import T
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge_runtime.controller import ActionLimit
 from edge_runtime.tests.rigs import SPEC
@@ -12,6 +14,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.plausibility import (
     DEVIATES_S,
     FOLLOWS_S,
+    LAG_S,
     DriveWatch,
     Fault,
     FollowWatch,
@@ -65,9 +68,30 @@ def test_after_a_stop_a_pedal_that_the_policy_does_not_have_is_nobodys():
     watch.begin(100.0)
     for tick in range(40):
         now_s, stops = 100.0 + tick * TICK_S, tick < 20
-        watch.command({"lamp": 0.0, **({"pedal": -1.0} if stops else {})}, now_s, not stops)
+        watch.command({"lamp": 0.0}, now_s, not stops)
         watch.report(report(pedal=-1.0 if stops else 0.0, speed_mps=0.0), now_s)
         assert watch.fault(now_s) is None
+
+
+@given(
+    policy=st.dictionaries(st.sampled_from(["pedal", "lamp"]), st.floats(-1, 0)),
+    history=st.lists(st.booleans(), max_size=30),
+    stays=st.floats(0.26, 1.0),
+)
+def test_a_pedal_that_stays_is_found_in_every_stop_and_one_that_obeys_in_none(
+    policy, history, stays
+):
+    """Whether or not the policy has a pedal; what it asks for beside a stop may be any up to 0."""
+    watch, obeys = VehicleWatch(T, MockVehicle.limits), {"pedal": stays, "lamp": 0.0, **policy}
+    watch.begin(0.0)
+    stop = [True] * round((LAG_S + DEVIATES_S) / TICK_S + 3)
+    for tick, stops in enumerate([*history, *stop]):
+        now_s, stuck = tick * TICK_S, tick >= len(history)
+        pedal = stays if stuck else -1.0 if stops else obeys["pedal"]
+        watch.command(policy, now_s, not stops)
+        watch.report(report(pedal, lamp=obeys["lamp"]), now_s)
+        assert stuck or watch.fault(now_s) is None
+    assert watch.fault(now_s) is Fault.STUCK
 
 
 @pytest.mark.parametrize("wheel", ["steering", "front"])

@@ -153,6 +153,19 @@ def test_a_stop_brakes_whatever_number_is_the_policys(runner):
         assert runner.now() in ("", SILENT)  # a busy machine may pause; it is never stuck
 
 
+def test_a_pedal_that_stays_in_a_stop_is_stuck_though_the_policy_has_none(vehicle):
+    vehicle.odd = {"action": {"pedal": 1.0, "steering": 0.0}}
+    runner = VehicleRunner(vehicle, ["steering"], lambda _: None)
+    runner.start()
+
+    def stops():
+        runner.command(make_command(mode=SAFE_STOP, action=[0.0]))
+        return runner.fault(time.monotonic()) == Fault.STUCK.value
+
+    wait_until(stops, "the fault")
+    assert runner.close()
+
+
 def test_an_enable_that_fails_ends_the_start_and_is_a_fault_until_one_succeeds(vehicle, runner):
     vehicle.raises = {"enable": RuntimeError("no control of the gearbox")}
     with pytest.raises(UserError, match="vehicle mock cannot be enabled: no control"):

@@ -17,7 +17,7 @@ from edge_runtime import log
 from edge_runtime.controller import Limits
 from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.util import UserError, ends_within, printable
-from edge_runtime.vehicles.plausibility import PEDAL, Fault, VehicleReport, VehicleWatch
+from edge_runtime.vehicles.plausibility import Fault, VehicleReport, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 
@@ -249,9 +249,7 @@ class VehicleRunner:
         self._last = command = order.command
         now_s, vehicle = time.monotonic(), self._vehicle
         action = dict(zip(self._action_names, command.action))
-        self._watch.command(action, now_s)
-        if command.mode == SAFE_STOP:
-            self._watch.command({**action, PEDAL: -1.0}, now_s, drives=False)
+        self._watch.command(action, now_s, command.mode != SAFE_STOP)
         try:
             if command.mode == SAFE_STOP:
                 vehicle.brake(now_s, order.latch)

@@ -124,8 +124,14 @@ class VehicleWatch:
         self._enabled_s = now_s
 
     def command(self, action: Dict[str, float], now_s: float, drives: bool = True) -> None:
-        """Note what was asked; `drives` is False for a safe stop."""
+        """Note what was asked; `drives` is False for a safe stop, which brakes whatever is asked.
+
+        A pedal may then be at what the policy asks for, too; one that it does not have may not.
+        """
         self._drives = drives
+        if not drives:
+            self._asked.note({PEDAL: -1.0, **action}, now_s)
+            action = {**action, PEDAL: -1.0}
         self._asked.note(action, now_s)
 
     def report(self, report: VehicleReport, now_s: float) -> None:
@@ -169,7 +175,7 @@ class VehicleWatch:
                 continue  # worked out from a speed, whose limits are the driver's to judge
             asked = [action.get(name) for action in self._asked.values]
             if None in asked:
-                continue  # the policy does not have it: beside a stop, nobody asks for it
+                continue  # in a drive, nobody asks for what the policy does not have
             low, high = self._range(name)
             most = LAG_DEVIATION * (high - low)
             if not min(asked) - most <= value <= max(asked) + most:
