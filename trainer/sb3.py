@@ -1,7 +1,8 @@
 """``python -m deploy policy``, which also takes the model.zip of Stable-Baselines3.
 
 The library pickles, and a pickle is a program. Here it can call only what `KNOWN` lists; anything
-else that it names becomes an object that does nothing.
+else that it names becomes an object that does nothing. Arrays hold plain numbers, and memory is
+limited: a few bytes can ask for all of it.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from gymnasium.spaces import Box, Dict
+
 from bridge import policy_file
 from bridge.environments import Environment
 from bridge.policy_file import Model
 from edge_runtime.cli import Subcommand, examples
 from edge_runtime.manifest import Task
 from edge_runtime.util import UserError, read_bytes
-from trainer.util import fitting, load_torch
+from trainer.util import fitting, limited_memory, load_torch
 
 LIBRARY = "stable_baselines3"
 KNOWN = {
@@ -35,13 +39,12 @@ KNOWN = {
     "torch.nn.modules.activation": "ELU GELU LeakyReLU Mish ReLU SELU SiLU Sigmoid Softplus Tanh",
     "gymnasium.spaces.box": "Box",
     "gymnasium.spaces.dict": "Dict",
-    "numpy": "dtype ndarray",
-    "numpy._core.multiarray": "_reconstruct scalar",
+    "numpy._core.multiarray": "_reconstruct",
     "numpy._core.numeric": "_frombuffer",
     "collections": "OrderedDict",
 }  # fmt: skip
 """All that a pickle may name: module -> names."""
-MOST_MIB = 512
+MOST_MIB, MOST_MEMORY_MIB = 512, 4096
 OTHERWISE = "export an ONNX that holds all of it, as docs/own_policy.md says"
 
 
@@ -50,9 +53,38 @@ class _Unknown:
     def __setstate__(self, _: Any) -> None: ...
 
 
+class _Array(np.ndarray):
+    """An array of a pickle, which may not call it: a buffer could pass for Python objects."""
+
+    def __new__(cls, *_: Any) -> Any:
+        raise TypeError("an array is made by _reconstruct")
+
+
+def _plain(dtype: Any, *_: Any) -> np.dtype[Any]:
+    """Return numpy's own type of plain numbers: a pickle's `__setstate__` cannot change that."""
+    made = np.dtype(np.dtype(dtype).type)
+    if made.kind not in "biuf":
+        raise TypeError(made)
+    return made
+
+
+def _scalar(dtype: np.dtype[Any], data: bytes) -> Any:
+    return np.frombuffer(data, dtype)[0]
+
+
+OURS = {
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _plain,
+    ("numpy._core.multiarray", "scalar"): _scalar,
+}
+"""In place of numpy's own, which can be made to take any number for an object's address."""
+
+
 class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy.core", "numpy._core")  # As numpy 1 writes
+        if (module, name) in OURS:
+            return OURS[module, name]
         if name in KNOWN.get(module, "").split():
             return super().find_class(module, name)
         return type(name, (_Unknown,), {"__module__": module})
@@ -62,6 +94,19 @@ def _read(pickled: bytes) -> Any:
     return _Reader(io.BytesIO(pickled)).load()
 
 
+def _space(made: Any) -> Any:
+    """Make a space anew from the numbers of one that was read; of others, return the name."""
+    if isinstance(made, Dict):
+        return Dict([(name, _box(each)) for name, each in made.spaces.items()])
+    return _box(made)
+
+
+def _box(made: Any) -> Any:
+    is_box = isinstance(made, Box)
+    return Box(made.low, made.high, dtype=made.dtype) if is_box else type(made).__name__
+
+
+@limited_memory(MOST_MEMORY_MIB)
 def read_model(arguments: argparse.Namespace, environment: Environment, task: Task) -> Model:
     """Convert a model.zip's deterministic policy, with its squash, scaling and normalisation.
 
@@ -77,13 +122,14 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
         for name in ("policy_class", "policy_kwargs", "observation_space", "action_space"):
             if packed := data[name].get(":serialized:"):
                 data[name] = _read(base64.b64decode(packed))
+        seen, acts = (_space(data[f"{each}_space"]) for each in ("observation", "action"))
         kind, options, is_ppo = data["policy_class"], data["policy_kwargs"], "gae_lambda" in data
         options = {n: value for n, value in options.items() if not n.startswith("optimizer")}
         for name, each in {"policy_class": kind, **options}.items():
             if _Unknown in (type(each).__base__, getattr(each, "__base__", None)):
                 raise UserError(f"the {name} of {path} is not the library's: {OTHERWISE}")
-    if data["action_space"] != done:
-        raise UserError(f"{path} acts in {data['action_space']}, {task.task} in {done}")
+    if acts != done:
+        raise UserError(f"{path} acts in {acts}, {task.task} in {done}")
     if arguments.normalise:
         normaliser = read_normaliser(arguments.normalise)
     elif is_ppo and data.get("_last_original_obs"):  # The others always have one.
@@ -91,14 +137,14 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
 
     from trainer.policy_file import LibraryPolicy, to_onnx  # It loads torch
 
-    with fitting(f"{path} does not fit {task.task}: it observes {data['observation_space']}"):
-        data["observation_space"].seed(0)  # Its generator was not admitted.
+    unfit = f"{path} does not fit {task.task}: it observes {seen}"
+    with fitting(unfit):
         options = {"use_sde": data["use_sde"], **options} if is_ppo else options
-        policy = kind(data["observation_space"], done, lambda _: 0.0, **options)
+        policy = kind(seen, done, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
         network = LibraryPolicy(policy.eval(), normaliser, [*task.observation])
         algorithm = kind.__module__.split(".")[1].replace("common", "ppo")
-        return Model(to_onnx(network, task), algorithm, network.act)
+        return Model(to_onnx(network, task), algorithm, fitting(unfit)(network.act))
 
 
 def read_normaliser(file: str) -> Any:

@@ -9,6 +9,7 @@ import math
 import multiprocessing
 import os
 import platform
+import resource
 import signal
 import subprocess
 import threading
@@ -94,8 +95,11 @@ def load_torch(path: Path, data: bytes | None = None) -> dict[str, Any]:
 
     try:
         with open_regular(path) if data is None else io.BytesIO(data) as stream:
+            archive = zipfile.ZipFile(stream)
+            if any(part.compress_type for part in archive.infolist()):
+                raise ValueError("torch compresses nothing")  # What was not torch's could be huge
             # torch writes a checksum of each part, and checks none.
-            if damaged := zipfile.ZipFile(stream).testzip():
+            if damaged := archive.testzip():
                 raise ValueError(f"{damaged} is damaged")
             stream.seek(0)
             state = torch.load(stream, map_location="cpu", weights_only=True)  # noqa: TID251
@@ -115,6 +119,20 @@ def fitting(words: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise UserError(words) from error
+
+
+@contextmanager
+def limited_memory(most_mib: int) -> Iterator[None]:
+    """Let this process take at most so much memory more; what asks for more fails by itself."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    pages = int(Path("/proc/self/statm").read_text().split()[5])
+    most = pages * resource.getpagesize() + (most_mib << 20)
+    known = [each for each in (soft, hard, most) if each != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(known), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 @contextmanager

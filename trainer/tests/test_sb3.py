@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from edge_runtime.policy import load_policy
 from hil_tests.testing.commands import call, refusal
+from trainer import sb3
 
 STOP = ("--set", "action.0.stop=0")
 SMALL = {"net_arch": [16, 8]}
@@ -25,6 +26,20 @@ def program(path):
     return f"cposix\nsystem\n(S'touch {path}'\ntR.".encode()
 
 
+def calls(place, *arguments):
+    """A pickle that calls `module:name`; arguments are pickles without their ends."""
+    return "c{}\n{}\n(".format(*place.split(":")).encode() + b"".join(arguments) + b"tR"
+
+
+NUMBERS, OBJECTS, ADDRESS = b"V>f8\n", b"VO\n", b"C\x08AAAAAAAA"
+FIELD = b"(I3\nV<\nN(Va\nt}Va\n(" + calls("numpy:dtype", OBJECTS) + b"I0\ntsI8\nI1\nI0\ntb"
+"""The state of a type of numbers, after which it is one of objects."""
+HOLDS_ADDRESSES = [
+    calls("numpy:ndarray", b"(I1\nt", OBJECTS, ADDRESS),
+    calls("numpy:ndarray", b"(I1\nt", calls("numpy:dtype", OBJECTS), ADDRESS),
+    calls("numpy._core.multiarray:scalar", calls("numpy:dtype", NUMBERS) + FIELD, ADDRESS),
+]
+LAUGHS = b"N" + 22 * b"2\x86"  # Pairs of the same pair
 OWN = b"(dS'features_extractor_class'\ncsomebody.else\nExtractor\ns."
 
 
@@ -108,6 +123,29 @@ def test_what_a_file_would_run_is_not_run(capsys, tmp_path, ppo, key):
     assert status == 2
     assert not (tmp_path / "pwned").exists()
     assert not out.exists()
+
+
+@pytest.mark.parametrize("pickled", HOLDS_ADDRESSES)
+def test_a_number_never_passes_for_the_address_of_an_object(pickled):
+    with pytest.raises(TypeError):
+        sb3._read(pickled + b".")
+
+
+@pytest.mark.parametrize("key", ["action_space", "observation_space", "policy_kwargs"])
+def test_a_refusal_shows_nothing_that_a_pickle_can_blow_up(capsys, tmp_path, ppo, key):
+    path = changed(ppo, tmp_path / "laughs.zip", **{key: LAUGHS + b"."})
+    (status, _, err), out = policy(capsys, tmp_path, path)
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert len(err) < 500
+    assert not out.exists()
+
+
+def test_what_has_a_normalisers_names_alone_is_refused(capsys, tmp_path, ppo):
+    kind = "stable_baselines3.common.running_mean_std\nRunningMeanStd"
+    state = b"}Vnormalize_obs\nI1\nsVnorm_obs\nI00\ns"
+    (tmp_path / "v.pkl").write_bytes(f"c{kind}\n".encode() + b")\x81" + state + b"b.")
+    (status, _, err), _ = policy(capsys, tmp_path, ppo, "--normalise", tmp_path / "v.pkl")
+    assert (status, len(err.splitlines())) == (2, 1)
 
 
 def test_what_does_not_fit_is_refused(capsys, tmp_path, one_thread, ppo):

@@ -1,6 +1,8 @@
 import subprocess
+import zipfile
 
 import numpy as np
+import pytest
 import torch
 
 from edge_runtime.util import UserError
@@ -33,6 +35,24 @@ def test_a_flipped_bit_of_a_checkpoint_is_refused_or_in_nothing_that_is_read(tmp
             assert torch.equal(found.pop("w"), weights)
             assert found == {"episode": 3}
     assert refused > 100
+
+
+def test_a_packed_checkpoint_is_refused_before_it_fills_the_memory(tmp_path):
+    path, packed = tmp_path / "c.pt", tmp_path / "packed.pt"
+    util.save_torch(path, {"episode": 3})
+    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as copy:
+        for name in whole.namelist():
+            copy.writestr(name, whole.read(name))
+    with pytest.raises(UserError):
+        util.load_torch(packed)
+
+
+def test_what_asks_for_more_than_the_limit_of_memory_fails_by_itself():
+    with util.limited_memory(64):
+        np.ones(1 << 20)
+        with pytest.raises(MemoryError):
+            np.ones(1 << 24)
+    np.ones(1 << 24)
 
 
 def test_a_revision_is_a_commit_dirty_where_files_differ(tmp_path):
