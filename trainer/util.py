@@ -137,14 +137,14 @@ def limited_memory(most_mib: int) -> Iterator[None]:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Be the only process of this machine that trains in a directory; UserError where it is not.
+    """Be the only process of this machine that works in a directory; UserError where it is not.
 
     A missing directory is made, and removed again if it stays empty.
     """
     made = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
     with held(directory) as mine:
         if not mine:
-            raise UserError(f"{directory} is being trained in by another process")
+            raise UserError(f"{directory} is in use by another process")
         for draft in directory.glob(f".{16 * '[0-9a-f]'}.tmp"):  # Of a writer that was killed
             draft.unlink(missing_ok=True)
         try:

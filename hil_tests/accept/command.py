@@ -6,6 +6,7 @@ With the report that file goes: the next call begins anew.
 
 from __future__ import annotations
 
+import fnmatch
 import shlex
 import sys
 import time
@@ -19,28 +20,37 @@ import msgspec
 
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.config import convert, load_config
-from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
+from edge_runtime.files import check_writable, write_atomic, write_json
 from edge_runtime.policy import MAX_POLICY_MIB, load_policy, policy_id_of
-from edge_runtime.util import UserError, read_bytes, read_json, read_toml
+from edge_runtime.util import (
+    UserError,
+    open_regular,
+    printable,
+    read_bytes,
+    read_json,
+    read_toml,
+)
 from edge_runtime.vehicles import vehicle_limits
 from hil_tests.accept import page
-from hil_tests.accept.checks import GATES, Check, Found, Job, table
+from hil_tests.accept.checks import GATES, ROWS, Check, Found, Job, table
 from hil_tests.accept.page import FAILED, NOT_TRIED, PASSED
 from hil_tests.envelope import UntoldError
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import load_driver
+from trainer.util import claimed
 
 REJECTED = 1  # Exit status
 UNFINISHED = "unfinished.json"
 SURE_S = 30.0  # After so long, this machine's speed counts as much as the table's times
 _KNOWN = read_toml(Path(__file__).with_name("accept.toml"), "settings")
 _KINDS: dict[type, Any] = {
-    int: Annotated[int, msgspec.Meta(ge=1)], float: Annotated[float, msgspec.Meta(ge=0.0)],
+    int: Annotated[int, msgspec.Meta(ge=1)], float: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)],
     str: str, list: list[str], dict: dict[str, Any],
 }  # fmt: skip
 _CONDITION: Any = Literal[tuple(CONDITIONS)]
+_SHARE: Any = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]  # No NaN either
 _FIELDS = {key: _KINDS[type(value)] for key, value in _KNOWN.items()}
-_FIELDS["success"] = dict[_CONDITION, float]
+_FIELDS |= {"success": dict[_CONDITION, _SHARE], "success_link": _SHARE, "success_vehicle": _SHARE}
 Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fields=True)
 """The keys of accept.toml, whose values have the types of the defaults there."""
 
@@ -49,14 +59,19 @@ Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fi
 def run(asked: Namespace) -> int:
     """Do what is not done yet, and write the report; return 0 where nothing failed, else 1."""
     job = prepare(asked)
-    rows, seconds = run_checks(job)
+    with claimed(job.path):
+        return judge(job)
+
+
+def judge(job: Job) -> int:
+    asked, (rows, seconds) = job.asked, run_checks(job)
     failed = [row for row in rows if row["result"] == FAILED]
     report: dict[str, Any] = {
         "verdict": "rejected" if failed else PASSED, "policy_id": job.policy_id,
-        "policy": asked.policy, "env": asked.env, "vehicle": job.config.vehicle,
+        "policy": printable(asked.policy), "env": asked.env, "vehicle": job.config.vehicle,
         "link": str(asked.link), "board": asked.board, "quick": asked.quick,
         "created": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
-        "command": f"python -m hil_tests {shlex.join(sys.argv[1:])}",
+        "command": printable(f"python -m hil_tests {shlex.join(sys.argv[1:])}"),
         "checks": [{key: row[key] for key in row if key != "data"} for row in rows],
         "data": {row["name"]: row["data"] for row in rows if row["data"]},
     }  # fmt: skip
@@ -73,11 +88,16 @@ def run(asked: Namespace) -> int:
 def load_settings(path: str | None, quick: bool) -> Any:
     """Read a file over the defaults. UserError for an unknown key, or a value out of range."""
     given = read_toml(path, "settings") if path else {}
-    changes = {**_KNOWN["quick"], **given.get("quick", {})} if quick else {}
     try:
-        return convert({**_KNOWN, **given, **changes}, Settings)
+        whole = convert({**_KNOWN, **given}, Settings)
+        changes = {**_KNOWN["quick"], **whole.quick}
+        quicker = convert({**_KNOWN, **given, **changes}, Settings)
+        for each in (*whole.faults, *quicker.faults):
+            if not fnmatch.filter([row.name for row in ROWS], each):
+                raise UserError(f"no fault is named {each!r}")
     except UserError as error:
         raise UserError(f"settings {path}: {error}") from None
+    return quicker if quick else whole
 
 
 def prepare(asked: Namespace) -> Job:
@@ -86,7 +106,10 @@ def prepare(asked: Namespace) -> Job:
     check_writable(f"{asked.out}/report.json")
     policy_id = policy_id_of(read_bytes(asked.policy, "policy file", MAX_POLICY_MIB))
     for path in (*settings.recordings, *([key] if key else [])):
-        read_bytes(path, "file", 1 << 12)
+        try:
+            open_regular(path).close()
+        except (OSError, ValueError) as error:
+            raise UserError(str(error)) from None
     flags = {"policy": asked.policy, "vehicle": asked.vehicle}
     config = load_config(settings.edge or None, flags, opens_link=False)
     if config.tls:
@@ -103,7 +126,6 @@ def prepare(asked: Namespace) -> Job:
         vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
     trust = ["--public-key", key] if key else []
     trust += ["--allow-unsigned"] if asked.allow_unsigned else []
-    make_directory(asked.out)
     return Job(asked, settings, Path(asked.out), policy_id, policy, refusal, config, trust)
 
 
@@ -111,7 +133,7 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
     """Do what is left of the table; return the rows, with `data` for the page, and the seconds."""
     place, checks = job.path / UNFINISHED, table(job)
     what = {name: str(value) for name, value in vars(job.asked).items()}
-    what |= {"policy_id": job.policy_id, "settings": str(job.settings)}
+    what |= {"policy_id": job.policy_id, "settings": str((job.settings, job.config, job.refusal))}
     what["checks"] = str([check.name for check in checks])
     known: dict[str, Any] = {}
     with suppress(UserError):
@@ -148,4 +170,6 @@ def attempt(check: Check, job: Job) -> dict[str, Any]:
         except UserError as error:
             result, why = FAILED, str(error)
     row = {"name": check.name, "asked": check.asked, "measured": found.measured}
-    return {**row, "result": result, "why": why, "data": found.data}
+    texts = {**row, "result": result, "why": why}
+    # A name or another program's words may hold what no XML can.
+    return {**{key: printable(text) for key, text in texts.items()}, "data": found.data}

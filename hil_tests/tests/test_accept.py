@@ -26,6 +26,7 @@ from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.testing.commands import exit_status, refusal
 from hil_tests.testing.drives import LEFT_TURN, read
 from hil_tests.testing.policies import public_pem, write_policy
+from trainer.util import claimed
 
 SHIPPED = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY), "--env", "left_turn")
 
@@ -85,12 +86,13 @@ def test_a_policy_slower_than_asked_is_rejected_and_not_driven(tmp_path, signed)
     assert {each["result"] for each in report["checks"][2:]} == {"not_tried"}
 
 
-@pytest.mark.parametrize("fails", [False, True])
-def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, signed, fails):
+@pytest.mark.parametrize("fails", ["", "-m edge_runtime nonsense", "-c print({})", "-c 1"])
+@pytest.mark.parametrize("board", ["phil@xavier", ""])
+def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, signed, board, fails):
     """The stand-in for ssh runs the command here, in place of on the board."""
     tools = {
         "ssh": f'echo "$@" > {tmp_path}/asked; for last; do :; done; cd {tmp_path}; sh -c "$last"',
-        "phil-edge": f'exec {sys.executable} -m edge_runtime {"nonsense" * fails} "$@"',
+        "phil-edge": f'exec {sys.executable} {fails or "-m edge_runtime"} "$@"',
     }
     for name, text in tools.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
@@ -98,7 +100,7 @@ def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, sig
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
     words = signed("p.onnx")
-    asked = Namespace(policy=words[1], board="phil@xavier")
+    asked = Namespace(policy=words[1], board=board)
     policy = load_policy(*words[1:4:2])
     ask = SimpleNamespace(board_command=str(tmp_path / "phil-edge"), inference_share=1.0)
     job: Any = SimpleNamespace(asked=asked, policy=policy, settings=ask, period_s=0.1, trust=[])
@@ -108,7 +110,7 @@ def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, sig
         return
     found = checks.inference(job)
     assert not found.wrong
-    assert "phil@xavier" in found.measured
+    assert board in found.measured
     assert "BatchMode=yes" in (tmp_path / "asked").read_text()
 
 
@@ -156,6 +158,29 @@ def test_other_settings_begin_anew(tmp_path, monkeypatch):
     assert exit_status(main, ["accept", "--out", str(tmp_path), *SHIPPED]) == 130
     assert accept(tmp_path, *SHIPPED, "--quick")[0] == 0
     assert done == [*"abab"]
+
+
+def test_hostile_words_are_text_in_all_three_files(tmp_path, monkeypatch):
+    words = "<script>\x07\x1b[2J\udcff&'\""
+    rows = [
+        Check(words, words, 1.0, lambda _, wrong=wrong: Found(words, wrong))
+        for wrong in ("", words)
+    ]
+    planted(monkeypatch, *rows, Check("c", "", 1.0, untold, words))
+    monkeypatch.setattr(sys, "argv", ["accept", words])
+    status, report, failed = accept(tmp_path, *SHIPPED)
+    assert (status, len(failed)) == (1, 1)
+    cases = ET.parse(tmp_path / "junit.xml").getroot().findall("testcase")
+    assert [each.get("name") for each in cases] == [each["name"] for each in report["checks"]]
+    html = (tmp_path / "report.html").read_text()
+    assert "<script" not in html
+    assert not {"\x07", "\x1b"} & {*html}
+
+
+def test_two_at_once_do_not_write_into_one_folder(tmp_path, capsys):
+    with claimed(tmp_path):
+        assert refusal(capsys, "accept", "--out", tmp_path, *SHIPPED, package="hil_tests")
+    assert not os.listdir(tmp_path)
 
 
 class Planted:
@@ -273,6 +298,11 @@ def test_the_page_needs_nothing_else_and_shows_the_failed_drives_first(tmp_path)
         ((), "rnus = 3"),
         ((), "runs = 0"),
         ((), "success = { sunny = 0.5 }"),
+        ((), "success = { nominal = nan }"),
+        ((), "success_link = 93.0"),
+        ((), "faults = ['edge_kiled']"),
+        ((), "quick = { tires = 3 }"),
+        (("--quick",), "quick = 3"),
         ((), "recordings = ['none.mcap']"),
         ((), "edge = 'none.toml'"),
         ((), "edge = 'EDGE'"),
