@@ -76,13 +76,14 @@ def test_after_a_stop_a_pedal_that_the_policy_does_not_have_is_nobodys():
 @given(
     policy=st.dictionaries(st.sampled_from(["pedal", "lamp"]), st.floats(-1, 0)),
     history=st.lists(st.booleans(), max_size=30),
-    stays=st.floats(0.26, 1.0),
+    beyond=st.floats(0.26, 1.0),
 )
 def test_a_pedal_that_stays_is_found_in_every_stop_and_one_that_obeys_in_none(
-    policy, history, stays
+    policy, history, beyond
 ):
     """Whether or not the policy has a pedal; what it asks for beside a stop may be any up to 0."""
-    watch, obeys = VehicleWatch(T, MockVehicle.limits), {"pedal": stays, "lamp": 0.0, **policy}
+    watch, stays = VehicleWatch(T, MockVehicle.limits), policy.get("pedal", -1.0) + beyond
+    obeys = {"pedal": stays, "lamp": 0.0, **policy}
     watch.begin(0.0)
     stop = [True] * round((LAG_S + DEVIATES_S) / TICK_S + 3)
     for tick, stops in enumerate([*history, *stop]):
@@ -95,14 +96,17 @@ def test_a_pedal_that_stays_is_found_in_every_stop_and_one_that_obeys_in_none(
 
 
 @pytest.mark.parametrize("wheel", ["steering", "front"])
-def test_a_stuck_wheel_is_found_beside_a_pedal_that_the_driver_judges(wheel):
+@pytest.mark.parametrize(("asked", "commanded_mps"), [({"pedal": 0.6}, 1.0), ({}, None)])
+def test_a_stuck_wheel_is_found_beside_a_pedal_that_is_the_drivers_or_nobodys(
+    wheel, asked, commanded_mps
+):
     watch = VehicleWatch(T, MockVehicle.limits)
     watch.begin(100.0)
     for tick in range(20):
         now_s = 100.0 + tick * TICK_S
-        watch.command({"pedal": 0.6, wheel: 0.5}, now_s)
-        action = {"pedal": 0.3, wheel: 0.0}
-        watch.report(VehicleReport(action, 1.0, False, [], commanded_speed_mps=1.0), now_s)
+        watch.command({**asked, wheel: 0.5}, now_s)
+        found = VehicleReport({"pedal": 0.3, wheel: 0.0}, 1.0, False, [])
+        watch.report(found._replace(commanded_speed_mps=commanded_mps), now_s)
     assert watch.fault(now_s) is Fault.STUCK
 
 
