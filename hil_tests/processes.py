@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import shlex
 import signal
@@ -24,6 +25,7 @@ PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what i
 PATIENCE_S = 30.0
 OPERATOR_LOOKS_EVERY_S = 0.5
 _LAST_WORDS_S = 1.0
+_PRCTL, _PR_SET_PDEATHSIG = ctypes.CDLL(None).prctl, 1
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
 
 
@@ -32,7 +34,7 @@ class CommandTimeoutError(UserError, TimeoutError):
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block.
+    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block, or with our thread.
 
     ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
     are the text of each stream. With ``ready``, a text, the constructor waits until that is
@@ -60,6 +62,7 @@ class Process:
             text=True,
             errors="surrogateescape",
             env={**os.environ, **(environment or {})},
+            preexec_fn=_end_with_us,
             **{**pipes, **options},
         )
         self.pid = self._process.pid
@@ -164,6 +167,11 @@ class Process:
             seen_s = time.monotonic()
             self._said[stream].append(line)
             self.lines.append((seen_s, line.rstrip()))
+
+
+def _end_with_us() -> None:
+    """Have the kernel end this process when its parent was killed: no edge runtime drives on."""
+    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 @contextlib.contextmanager

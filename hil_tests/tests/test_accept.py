@@ -162,10 +162,8 @@ def test_other_settings_begin_anew(tmp_path, monkeypatch):
 
 def test_hostile_words_are_text_in_all_three_files(tmp_path, monkeypatch):
     words = "<script>\x07\x1b[2J\udcff&'\""
-    rows = [
-        Check(words, words, 1.0, lambda _, wrong=wrong: Found(words, wrong))
-        for wrong in ("", words)
-    ]
+    ends = ((words, ""), (words, words))
+    rows = [Check(words, words, 1.0, partial(lambda end, _: Found(*end), end)) for end in ends]
     planted(monkeypatch, *rows, Check("c", "", 1.0, untold, words))
     monkeypatch.setattr(sys, "argv", ["accept", words])
     status, report, failed = accept(tmp_path, *SHIPPED)

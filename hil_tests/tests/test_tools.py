@@ -2,6 +2,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from edge_runtime.cli import ArgumentParser
 from edge_runtime.reach import free_endpoint
 from hil_tests import commands
 from hil_tests.__main__ import main
-from hil_tests.processes import POLICY, PUBLIC_KEY
+from hil_tests.processes import POLICY, PUBLIC_KEY, wait_until
 from hil_tests.testing.commands import exit_status
 from hil_tests.testing.drives import read, start_simulate
 
@@ -21,6 +22,25 @@ ROOT = Path(__file__).parents[2]
 
 
 VEHICLE = "hunter01"
+
+
+ALONE = """
+from hil_tests.processes import Process
+words = ("http.server", "0", "--bind", "127.0.0.1")
+with Process(*words, ready="Serving", environment={"PYTHONUNBUFFERED": "1"}) as process:
+    print(process.pid, flush=True)
+    process.wait(60)
+"""
+
+
+def test_who_is_killed_leaves_no_process_that_drives_on():
+    with subprocess.Popen([sys.executable, "-c", ALONE], cwd=ROOT, stdout=subprocess.PIPE) as us:
+        assert us.stdout is not None
+        words = Path(f"/proc/{int(us.stdout.readline())}/cmdline")
+        assert words.read_bytes()
+        us.kill()
+    # Nobody may have waited for it: then it is there, without words.
+    wait_until(lambda: not (words.exists() and words.read_bytes()), "its end")
 
 
 @pytest.mark.board
