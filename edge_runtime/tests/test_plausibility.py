@@ -63,13 +63,14 @@ def test_what_a_vehicle_may_report(asked, reported, newest, fault):
     assert watch.fault(now_s + TICK_S) is fault
 
 
-def test_after_a_stop_a_pedal_that_the_policy_does_not_have_is_nobodys():
-    watch = VehicleWatch(T, MockVehicle.limits)
+@pytest.mark.parametrize("lowest", [-1.0, 0.0])
+def test_after_a_stop_a_pedal_that_the_policy_does_not_have_is_nobodys(lowest):
+    watch = VehicleWatch(T, {"pedal": ActionLimit(lowest, 1.0)})
     watch.begin(100.0)
     for tick in range(40):
         now_s, stops = 100.0 + tick * TICK_S, tick < 20
         watch.command({"lamp": 0.0}, now_s, not stops)
-        watch.report(report(pedal=-1.0 if stops else 0.0, speed_mps=0.0), now_s)
+        watch.report(report(pedal=lowest if stops else 0.5, speed_mps=0.0), now_s)
         assert watch.fault(now_s) is None
 
 

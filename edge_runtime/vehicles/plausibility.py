@@ -130,8 +130,9 @@ class VehicleWatch:
         """
         self._drives = drives
         if not drives:
-            self._asked.note({PEDAL: -1.0, **action}, now_s)
-            action = {**action, PEDAL: -1.0}
+            lowest, _ = self._range(PEDAL)
+            self._asked.note({PEDAL: lowest, **action}, now_s)
+            action = {**action, PEDAL: lowest}
         self._asked.note(action, now_s)
 
     def report(self, report: VehicleReport, now_s: float) -> None:
