@@ -15,6 +15,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from itertools import chain, takewhile
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -36,7 +37,8 @@ from edge_runtime.vehicles import vehicle_limits
 from edge_runtime.wire import DRIVE, SAFE_STOP, Command, Rejection, State
 
 MOST_WAITING = 100  # Answers that wait for the driving policy's; a command may come late, or never
-NICE = 10  # Whatever drives on this machine comes first
+NICE = 10  # Whatever drives on this machine comes first, and is the last to end
+OOM_SCORE = Path("/proc/self/oom_score_adj")
 EXAMPLE = cli.examples(
     "python -m bridge shadow --policy next.onnx --serve --out runs/shadow.json",
     "python -m bridge shadow --policy next.onnx --from drive.mcap --out runs/shadow.json",
@@ -62,6 +64,7 @@ def run(arguments: Any) -> int:
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     config = load_config(arguments.config, {"policy": arguments.policy}, opens_link=False)
     shadow, stop = Shadow(policy, config), threading.Event()
+    OOM_SCORE.write_text("1000")  # Where memory ends, the kernel ends this process first
 
     def messages(all_heard: Iterator[Heard | None]) -> Iterator[Heard]:
         """Yield the drive with the shadow's answers, recorded; then tell the report."""

@@ -28,6 +28,14 @@ from hil_tests.testing.messages import BLACK, WHITE, frames, make_state
 from hil_tests.testing.policies import T, write_rover
 
 
+@pytest.fixture(autouse=True)
+def score(tmp_path_factory, monkeypatch):
+    """This process stays as important as it is."""
+    path = tmp_path_factory.mktemp("proc") / "oom_score_adj"
+    monkeypatch.setattr(bridge.shadow, "OOM_SCORE", path)
+    return path
+
+
 @pytest.fixture
 def hand(tmp_path):
     return Hand(tmp_path / "by_hand.mcap")
@@ -125,6 +133,12 @@ KINDS = {"hangs": "inference_too_long", "raises": "inference_failed", "nan": "ou
 
 def broken(kind, path):
     return type(kind, (Broken,), {"kind": kind})(*load_policy(path, allow_unsigned=True))
+
+
+def test_where_memory_ends_the_shadow_ends_before_what_drives(hand, tmp_path, score):
+    hand.drive(0, 3)
+    shadow(hand, make_policy(tmp_path))
+    assert score.read_text() == "1000"
 
 
 def test_a_network_that_hangs_costs_one_period_and_is_asked_again_when_it_has_ended(tmp_path):

@@ -87,7 +87,7 @@ def test_a_policy_slower_than_asked_is_rejected_and_not_driven(tmp_path, signed)
 
 
 @pytest.mark.parametrize("fails", ["", "-m edge_runtime nonsense", "-c print({})", "-c 1"])
-@pytest.mark.parametrize("board", ["phil@xavier", ""])
+@pytest.mark.parametrize("board", ["phil@xavier", "", "-oProxyCommand=touch pwned"])
 def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, signed, board, fails):
     """The stand-in for ssh runs the command here, in place of on the board."""
     tools = {
@@ -111,7 +111,9 @@ def test_the_board_measures_the_inference_time_by_ssh(tmp_path, monkeypatch, sig
     found = checks.inference(job)
     assert not found.wrong
     assert board in found.measured
-    assert "BatchMode=yes" in (tmp_path / "asked").read_text()
+    words_of_ssh = (tmp_path / "asked").read_text()
+    assert "BatchMode=yes" in words_of_ssh
+    assert f" -- {board} " in words_of_ssh
 
 
 def planted(monkeypatch, *rows):
