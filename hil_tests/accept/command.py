@@ -26,6 +26,7 @@ from edge_runtime.vehicles import vehicle_limits
 from hil_tests.accept import page
 from hil_tests.accept.checks import GATES, Check, Found, Job, table
 from hil_tests.accept.page import FAILED, NOT_TRIED, PASSED
+from hil_tests.campaign import choose
 from hil_tests.envelope import UntoldError
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import load_driver
@@ -39,8 +40,10 @@ _KINDS: dict[type, Any] = {
     str: str, list: list[str], dict: dict[str, Any],
 }  # fmt: skip
 _CONDITION: Any = Literal[tuple(CONDITIONS)]
+_SHARE = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _FIELDS = {key: _KINDS[type(value)] for key, value in _KNOWN.items()}
-_FIELDS["success"] = dict[_CONDITION, float]
+_FIELDS |= dict.fromkeys(("success_link", "success_vehicle"), _SHARE)
+_FIELDS["success"] = dict[_CONDITION, _SHARE]
 Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fields=True)
 """The keys of accept.toml, whose values have the types of the defaults there."""
 
@@ -71,11 +74,14 @@ def run(asked: Namespace) -> int:
 
 
 def load_settings(path: str | None, quick: bool) -> Any:
-    """Read a file over the defaults. UserError for an unknown key, or a value out of range."""
-    given = read_toml(path, "settings") if path else {}
-    changes = {**_KNOWN["quick"], **given.get("quick", {})} if quick else {}
+    """Read a file over the defaults. UserError for an unknown key or fault, or a wrong value."""
+    given = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
     try:
-        return convert({**_KNOWN, **given, **changes}, Settings)
+        settings = convert(given, Settings)
+        if quick:
+            settings = convert({**given, **_KNOWN["quick"], **settings.quick}, Settings)
+        choose(",".join(settings.faults), "faults")
+        return settings
     except UserError as error:
         raise UserError(f"settings {path}: {error}") from None
 
@@ -123,17 +129,23 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
     rows, took_s, table_s = known["rows"], SURE_S, SURE_S
     for check in checks[len(rows) :]:
         begun_s = time.monotonic()
-        gates = {row["name"] for row in rows if row["result"] == FAILED} & {*GATES}
-        why = f"it fails in: {', '.join(gates)}" if gates else check.skipped
+        why = barred(rows) or check.skipped
         rows.append(row := attempt(check._replace(skipped=why), job))
         known["seconds"] += (seconds := time.monotonic() - begun_s)
         write_json(place, known)
         if row["result"] != NOT_TRIED:
             took_s, table_s = took_s + seconds, table_s + check.takes_s
-            rest_s = sum(each.takes_s for each in checks[len(rows) :] if not each.skipped)
+            rest = [] if barred(rows) else checks[len(rows) :]
+            rest_s = sum(each.takes_s for each in rest if not each.skipped)
             told = f"{row['result']:<6}  {check.name}: {row['measured']}"
             print(f"{rest_s * took_s / table_s / 60.0:4.1f} min left  {told}", flush=True)
     return rows, known["seconds"]
+
+
+def barred(rows: list[dict[str, Any]]) -> str:
+    """Return why nothing more is tried; empty where it is."""
+    gates = [row["name"] for row in rows if row["result"] == FAILED and row["name"] in GATES]
+    return f"it fails in: {gates[0]}" if gates else ""
 
 
 def attempt(check: Check, job: Job) -> dict[str, Any]:
