@@ -2,6 +2,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from edge_runtime.cli import ArgumentParser
 from edge_runtime.reach import free_endpoint
 from hil_tests import commands
 from hil_tests.__main__ import main
-from hil_tests.processes import POLICY, PUBLIC_KEY
+from hil_tests.processes import POLICY, PUBLIC_KEY, wait_until
 from hil_tests.testing.commands import exit_status
 from hil_tests.testing.drives import read, start_simulate
 
@@ -105,3 +106,18 @@ def test_a_mistake_is_one_line_before_anything_is_done(words, tmp_path, capsys):
     assert exit_status(main, words.format(tmp=tmp_path).split()) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_processes_of_a_command_that_is_killed_end(tmp_path):
+    """SIGKILL leaves it no time to end them."""
+    (tmp_path / "sleeper.py").write_text("import time; print('ready', flush=True); time.sleep(60)")
+    starts = "from hil_tests.processes import Process; import time\n"
+    starts += "print(Process('sleeper', ready='ready').pid, flush=True); time.sleep(60)"
+    paths = {"PYTHONPATH": f"{ROOT}:{tmp_path}"}
+    command, pipe = [sys.executable, "-c", starts], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, text=True, env=os.environ | paths) as killed:
+        assert killed.stdout
+        pid = int(killed.stdout.readline())
+        killed.kill()
+    status = Path(f"/proc/{pid}/status")  # Where nobody waits for orphans, it stays a zombie.
+    wait_until(lambda: not status.exists() or "State:\tZ" in status.read_text(), "its end")
