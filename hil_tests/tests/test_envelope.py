@@ -156,7 +156,7 @@ def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch,
     write_figure(*figures[-1])
     with Image.open(out.with_suffix(".png")) as picture:
         assert picture.width > 1000
-    Drives.most = 20  # A complete one is found anew.
+    Drives.most = 16  # A complete one is found anew.
     assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
 
 
@@ -166,7 +166,7 @@ def test_an_unfinished_file_that_is_none_is_one_line_and_stays(
 ):
     monkeypatch.setattr(envelope, "Drivers", Drives)
     out = tmp_path / "e.json"
-    Drives.most = 20  # The perfect network and a part of the next
+    Drives.most = 16  # The perfect network and a part of the next
     assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
     part = json.loads(out.read_text())
     del part["tried"]
