@@ -127,25 +127,20 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
         for name in ("report.json", "junit.xml", "report.html"):
             (job.path / name).unlink(missing_ok=True)
     rows, took_s, table_s = known["rows"], SURE_S, SURE_S
-    for check in checks[len(rows) :]:
-        begun_s = time.monotonic()
-        why = barred(rows) or check.skipped
-        rows.append(row := attempt(check._replace(skipped=why), job))
+    while left := checks[len(rows) :]:
+        check, begun_s = left[0], time.monotonic()
+        rows.append(row := attempt(check, job))
+        if row["result"] == FAILED and check.name in GATES:
+            why = f"it fails in: {check.name}"
+            rows += [attempt(each._replace(skipped=why), job) for each in left[1:]]
         known["seconds"] += (seconds := time.monotonic() - begun_s)
         write_json(place, known)
         if row["result"] != NOT_TRIED:
             took_s, table_s = took_s + seconds, table_s + check.takes_s
-            rest = [] if barred(rows) else checks[len(rows) :]
-            rest_s = sum(each.takes_s for each in rest if not each.skipped)
+            rest_s = sum(each.takes_s for each in checks[len(rows) :] if not each.skipped)
             told = f"{row['result']:<6}  {check.name}: {row['measured']}"
             print(f"{rest_s * took_s / table_s / 60.0:4.1f} min left  {told}", flush=True)
     return rows, known["seconds"]
-
-
-def barred(rows: list[dict[str, Any]]) -> str:
-    """Return why nothing more is tried; empty where it is."""
-    gates = [row["name"] for row in rows if row["result"] == FAILED and row["name"] in GATES]
-    return f"it fails in: {gates[0]}" if gates else ""
 
 
 def attempt(check: Check, job: Job) -> dict[str, Any]:
