@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     env = "the environment that the model drives: scenario, gymnasium id or module:id"
     change = "action.N.stop (a number, or null to hold the last action), slew_per_s, unit, meaning"
-    model = "the model: ONNX in one file, or Stable-Baselines3's model.zip (SAC, TD3, PPO)"
+    model = "ONNX in one file, or Stable-Baselines3's model.zip (SAC, TD3, DDPG, PPO, A2C)"
     add("model", metavar="MODEL", type="path", help=model)
     add("--env", metavar="ENV", required=True, help=env)
     add("--out", metavar="POLICY.onnx", type="path", required=True, help="the policy file")

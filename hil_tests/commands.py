@@ -55,16 +55,18 @@ def accept(parser: argparse.ArgumentParser) -> None:
     add("--policy", required=True, metavar="P.onnx", type="path", help="policy file to judge")
     add_trust(parser)
     add("--env", required=True, help="scenario, gymnasium id or MODULE:ID")
-    driver = "its driver is tried and driven, as by `edge_runtime run`: lift the wheels"
+    driver = "its driver is tried and driven, as by `edge_runtime run`: lift the wheels (default: "
+    driver += "none)"
     add("--vehicle", metavar="NAME", help=driver)
     link = "the network that it is to drive over, such as 50ms+-10ms,loss=1%%"
     add("--link", metavar="SPEC", type=parse_spec, default="none", help=link)
-    board = "measure the inference time there, by ssh"
+    board = "measure the inference time there, by ssh (default: here)"
     add("--board", metavar="USER@HOST", help=board)
     settings = "thresholds (hil_tests/accept/accept.toml explains them)"
     add("--config", metavar="accept.toml", type="path", help=settings)
-    add("--quick", action="store_true", help="fewer drives and faults: minutes")
-    out = "folder of report.html, report.json and junit.xml; after ^C the same command goes on"
+    add("--quick", action="store_true", help="fewer drives and faults: 4 minutes, not 25")
+    out = "folder of report.html, report.json and junit.xml; after ^C the same command goes on; "
+    out += "exit status 1: rejected"
     add("--out", required=True, metavar="DIR", type="path", help=out)
 
 

@@ -19,9 +19,10 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from matplotlib.figure import Figure
+from msgspec import convert
 
 from bridge.network import LatencySpec, parse_spec
 from bridge.outcomes import GOAL, TIMEOUT, TRUNCATED, UNKNOWN, success_estimate
@@ -31,7 +32,7 @@ from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import UserError, read_json
 from trainer.environments import make_environment
 from trainer.evaluation import drive_episodes, load_driver, located, trained_in
-from trainer.util import cores, die_with_parent, kept, set_threads
+from trainer.util import cores, die_with_parent, fitting, kept, set_threads
 
 HOLDS, BREAKS, BETWEEN = "holds", "breaks", "between"
 CONFIDENCE = 0.95  # Of a statement about an axis
@@ -56,6 +57,17 @@ AXES = {
     "outage_s": (2.0, 0.05),  # Both ways at once, every 3 s
 }
 """Each axis's largest value, and its resolution."""
+
+
+class Tried(TypedDict):
+    """What was found of a network."""
+
+    verdict: str
+    drives: int
+    successes: int
+    at: dict[str, float]  # Its point, without zeros
+
+
 Point = Mapping[str, float]  # Axis -> value; 0 where it is missing
 Ray = Callable[[int], Point]  # The point of a step; 0 is a perfect network
 Drive = Callable[[LatencySpec, Sequence[int]], Sequence[bool]]
@@ -122,7 +134,7 @@ class Search:
         self, drive: Drive, promise: float, seed: int = 0, keep: Callable[[], None] = lambda: None
     ) -> None:
         self._drive, self._promise, self._seed, self._keep = drive, promise, seed, keep
-        self.tried: dict[str, dict[str, Any]] = {}
+        self.tried: dict[str, Tried] = {}
         self.edges: dict[str, dict[str, Any]] = {}
 
     def verdict(self, at: Point) -> str:
@@ -134,12 +146,13 @@ class Search:
                 first = self._seed + test.drives
                 for success in self._drive(spec, range(first, first + AT_ONCE)):
                     verdict = verdict or test.add(success)
-            found = {"verdict": verdict, "drives": test.drives, "successes": test.successes}
-            found["at"] = {name: value for name, value in at.items() if value}
-            self.tried[str(spec)] = found
+            where = {name: value for name, value in at.items() if value}
+            self.tried[str(spec)] = Tried(
+                verdict=verdict, drives=test.drives, successes=test.successes, at=where
+            )
             self._keep()
             print(f"{spec}: {verdict} ({test.successes} of {test.drives})", file=sys.stderr)
-        return str(self.tried[str(spec)]["verdict"])
+        return self.tried[str(spec)]["verdict"]
 
     def edge(self, ray: Ray, most: int) -> dict[str, Any]:
         """Return the largest step that holds, the smallest beyond it that breaks, both networks.
@@ -204,8 +217,12 @@ def run(arguments: argparse.Namespace) -> int:
         def drive(spec: LatencySpec, seeds: Sequence[int]) -> list[bool]:
             return [result.outcome == GOAL for result in drivers.drive(spec, seeds)]
 
+        def is_any() -> bool:
+            alone = search.tried.get(str(network({})))
+            return alone is not None and alone["verdict"] == HOLDS
+
         def keep(complete: bool = False) -> None:
-            if len(search.tried) < 2:  # It may fail without a network.
+            if not is_any():
                 return
             found = {"complete": complete, "edges": search.edges, "tried": search.tried}
             command = f"python -m hil_tests {shlex.join(sys.argv[1:])}"
@@ -214,13 +231,14 @@ def run(arguments: argparse.Namespace) -> int:
         search = Search(drive, arguments.promise, arguments.seed, keep)
         begun = read_json(out, "envelope") if Path(out).exists() else {}
         if begun.get("complete") is False and about.items() <= begun.items():
-            search.tried = begun["tried"]
+            with fitting(f"{out} is no envelope that could be gone on with: name another --out"):
+                search.tried = convert(begun["tried"], dict[str, Tried])
             print(f"goes on: {len(search.tried)} networks are known from {out}", file=sys.stderr)
         try:
             find_edges(search)
             keep(complete=True)
         finally:
-            if len(search.tried) > 1:
+            if is_any():
                 write_figure(draw_axes(_swept(about, search)), Path(out).with_suffix(".png"))
     for name, edge in search.edges.items():
         print(f"{name} holds up to {edge['limit']:g}, breaks at {edge['breaks_at']}")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,7 +25,8 @@ PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what i
 PATIENCE_S = 30.0
 OPERATOR_LOOKS_EVERY_S = 0.5
 _LAST_WORDS_S = 1.0
-_PRCTL, _PR_SET_PDEATHSIG = ctypes.CDLL(None).prctl, 1
+# Else an edge runtime, which waits for its simulator for ever, outlives a command that is killed.
+_ENDS_WITH_US = ["setpriv", "--pdeathsig", "TERM", "--"] if shutil.which("setpriv") else []
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
 
 
@@ -34,7 +35,8 @@ class CommandTimeoutError(UserError, TimeoutError):
 
 
 class Process:
-    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block, or with our thread.
+    """``python -m ARGUMENTS`` beside us. It ends with the ``with`` block, and
+    with the thread that started it.
 
     ``lines`` are its output of both streams with their monotonic times; ``output`` and ``errors``
     are the text of each stream. With ``ready``, a text, the constructor waits until that is
@@ -58,11 +60,10 @@ class Process:
         self._ended_by_us = False
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self._process: subprocess.Popen[str] = subprocess.Popen(
-            [python, "-m", *map(str, arguments)],
+            [*_ENDS_WITH_US, python, "-m", *map(str, arguments)],
             text=True,
             errors="surrogateescape",
             env={**os.environ, **(environment or {})},
-            preexec_fn=_end_with_us,
             **{**pipes, **options},
         )
         self.pid = self._process.pid
@@ -167,11 +168,6 @@ class Process:
             seen_s = time.monotonic()
             self._said[stream].append(line)
             self.lines.append((seen_s, line.rstrip()))
-
-
-def _end_with_us() -> None:
-    """Have the kernel end this process when its parent was killed: no edge runtime drives on."""
-    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 @contextlib.contextmanager

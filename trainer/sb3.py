@@ -114,7 +114,7 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
     other observations or actions than the environment's.
     """
     path, normaliser, done = Path(arguments.model), None, environment.action_space
-    what = f"model.zip of {LIBRARY} (SAC, TD3, PPO), or that library is not installed"
+    what = f"model.zip of {LIBRARY} (SAC, TD3, DDPG, PPO, A2C), or that library is not installed"
     with fitting(f"{path} is no {what}"):
         archive = zipfile.ZipFile(io.BytesIO(read_bytes(path, "model", MOST_MIB)))
         weights = load_torch(path, archive.read("policy.pth"))
@@ -123,7 +123,7 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
             if packed := data[name].get(":serialized:"):
                 data[name] = _read(base64.b64decode(packed))
         seen, acts = (_space(data[f"{each}_space"]) for each in ("observation", "action"))
-        kind, options, is_ppo = data["policy_class"], data["policy_kwargs"], "gae_lambda" in data
+        kind, options, on_policy = data["policy_class"], data["policy_kwargs"], "gae_lambda" in data
         options = {n: value for n, value in options.items() if not n.startswith("optimizer")}
         for name, each in {"policy_class": kind, **options}.items():
             if _Unknown in (type(each).__base__, getattr(each, "__base__", None)):
@@ -132,18 +132,22 @@ def read_model(arguments: argparse.Namespace, environment: Environment, task: Ta
         raise UserError(f"{path} acts in {acts}, {task.task} in {done}")
     if arguments.normalise:
         normaliser = read_normaliser(arguments.normalise)
-    elif is_ppo and data.get("_last_original_obs"):  # The others always have one.
+    elif on_policy and data.get("_last_original_obs"):  # The others always have one.
         raise UserError(f"{path} was trained behind a VecNormalize: add --normalise")
 
     from trainer.policy_file import LibraryPolicy, to_onnx  # It loads torch
 
     unfit = f"{path} does not fit {task.task}: it observes {seen}"
     with fitting(unfit):
-        options = {"use_sde": data["use_sde"], **options} if is_ppo else options
+        options = {"use_sde": data["use_sde"], **options} if on_policy else options
         policy = kind(seen, done, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
         network = LibraryPolicy(policy.eval(), normaliser, [*task.observation])
-        algorithm = kind.__module__.split(".")[1].replace("common", "ppo")
+        algorithm = kind.__module__.split(".")[1]
+        if on_policy:
+            algorithm = "ppo" if "clip_range" in data else "a2c"
+        elif data.get("target_noise_clip") == 0.0:  # Its targets are not smoothed.
+            algorithm = "ddpg"
         return Model(to_onnx(network, task), algorithm, fitting(unfit)(network.act))
 
 

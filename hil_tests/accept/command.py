@@ -6,7 +6,6 @@ With the report that file goes: the next call begins anew.
 
 from __future__ import annotations
 
-import fnmatch
 import shlex
 import sys
 import time
@@ -32,8 +31,9 @@ from edge_runtime.util import (
 )
 from edge_runtime.vehicles import vehicle_limits
 from hil_tests.accept import page
-from hil_tests.accept.checks import GATES, ROWS, Check, Found, Job, table
+from hil_tests.accept.checks import GATES, Check, Found, Job, table
 from hil_tests.accept.page import FAILED, NOT_TRIED, PASSED
+from hil_tests.campaign import choose
 from hil_tests.envelope import UntoldError
 from trainer.environments import CONDITIONS, make_environment
 from trainer.evaluation import load_driver
@@ -48,9 +48,10 @@ _KINDS: dict[type, Any] = {
     str: str, list: list[str], dict: dict[str, Any],
 }  # fmt: skip
 _CONDITION: Any = Literal[tuple(CONDITIONS)]
-_SHARE: Any = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]  # No NaN either
+_SHARE = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _FIELDS = {key: _KINDS[type(value)] for key, value in _KNOWN.items()}
-_FIELDS |= {"success": dict[_CONDITION, _SHARE], "success_link": _SHARE, "success_vehicle": _SHARE}
+_FIELDS |= dict.fromkeys(("success_link", "success_vehicle"), _SHARE)
+_FIELDS["success"] = dict[_CONDITION, _SHARE]
 Settings: Any = msgspec.defstruct("Settings", _FIELDS.items(), forbid_unknown_fields=True)
 """The keys of accept.toml, whose values have the types of the defaults there."""
 
@@ -86,18 +87,16 @@ def judge(job: Job) -> int:
 
 
 def load_settings(path: str | None, quick: bool) -> Any:
-    """Read a file over the defaults. UserError for an unknown key, or a value out of range."""
-    given = read_toml(path, "settings") if path else {}
+    """Read a file over the defaults. UserError for an unknown key or fault, or a wrong value."""
+    given = {**_KNOWN, **(read_toml(path, "settings") if path else {})}
     try:
-        whole = convert({**_KNOWN, **given}, Settings)
-        changes = {**_KNOWN["quick"], **whole.quick}
-        quicker = convert({**_KNOWN, **given, **changes}, Settings)
-        for each in (*whole.faults, *quicker.faults):
-            if not fnmatch.filter([row.name for row in ROWS], each):
-                raise UserError(f"no fault is named {each!r}")
+        settings = convert(given, Settings)
+        if quick:
+            settings = convert({**given, **_KNOWN["quick"], **settings.quick}, Settings)
+        choose(",".join(settings.faults), "faults")
+        return settings
     except UserError as error:
         raise UserError(f"settings {path}: {error}") from None
-    return quicker if quick else whole
 
 
 def prepare(asked: Namespace) -> Job:
@@ -143,11 +142,12 @@ def run_checks(job: Job) -> tuple[list[dict[str, Any]], float]:
         for name in ("report.json", "junit.xml", "report.html"):
             (job.path / name).unlink(missing_ok=True)
     rows, took_s, table_s = known["rows"], SURE_S, SURE_S
-    for check in checks[len(rows) :]:
-        begun_s = time.monotonic()
-        gates = {row["name"] for row in rows if row["result"] == FAILED} & {*GATES}
-        why = f"it fails in: {', '.join(gates)}" if gates else check.skipped
-        rows.append(row := attempt(check._replace(skipped=why), job))
+    while left := checks[len(rows) :]:
+        check, begun_s = left[0], time.monotonic()
+        rows.append(row := attempt(check, job))
+        if row["result"] == FAILED and check.name in GATES:
+            why = f"it fails in: {check.name}"
+            rows += [attempt(each._replace(skipped=why), job) for each in left[1:]]
         known["seconds"] += (seconds := time.monotonic() - begun_s)
         write_json(place, known)
         if row["result"] != NOT_TRIED:

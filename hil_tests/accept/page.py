@@ -49,21 +49,18 @@ def render(folder: Path, report: Mapping[str, Any]) -> str:
         autoescape=True, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     data = report["data"]
-    figures = [
-        draw_distance(axis, data.get(f"link: distance to the limit of {axis}")) for axis in AXES
-    ]
-    figures.append(draw_times(data.get(DRIVE)))
+    places = {f"link: distance to the limit of {axis}": axis for axis in AXES}
+    figures = [draw_distance(axis, data[name]) for name, axis in places.items() if name in data]
+    figures += [draw_times(data[DRIVE])] if DRIVE in data else []
     return templates.get_template("page.html.jinja").render(
         **report, took=timedelta(seconds=round(report["seconds"])),
-        figures=[svg(each) for each in figures if each], name=Path(report["policy"]).name,
+        figures=[*map(svg, figures)], name=Path(report["policy"]).name,
         strips=list(strips(folder / DRIVE_FILE, data[DRIVE]["outcomes"])) if DRIVE in data else [],
     )  # fmt: skip
 
 
-def draw_distance(axis: str, found: Mapping[str, Any] | None) -> Figure | None:
-    """Draw success against a setting of the network, with the declared link; None without data."""
-    if found is None:
-        return None
+def draw_distance(axis: str, found: Mapping[str, Any]) -> Figure:
+    """Draw success against a setting of the network, with the declared link."""
     figure, unit = Figure(figsize=(4.6, 3.0), layout="constrained"), AXES[axis][-1]
     panel, declared = figure.subplots(), found["declared"]
     at, shares = zip(*sorted((float(x), y) for x, y in found["points"].items()), strict=True)
@@ -79,10 +76,8 @@ def draw_distance(axis: str, found: Mapping[str, Any] | None) -> Figure | None:
     return figure
 
 
-def draw_times(found: Mapping[str, Any] | None) -> Figure | None:
-    """Draw how long the edge runtime took for its answers, against T; None without data."""
-    if found is None:
-        return None
+def draw_times(found: Mapping[str, Any]) -> Figure:
+    """Draw how long the edge runtime took for its answers, against T."""
     figure = Figure(figsize=(4.6, 3.0), layout="constrained")
     panel, period_ms = figure.subplots(), found["period_ms"]
     times_ms = np.maximum(found["edge_ms"], 0.01)

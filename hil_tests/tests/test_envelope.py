@@ -29,7 +29,7 @@ from hil_tests.envelope import (
     find_edges,
     network,
 )  # fmt: skip
-from hil_tests.testing.commands import call
+from hil_tests.testing.commands import call, refusal
 
 LIMITS = {"delay_ms": 300.0, "jitter_ms": 25.0, "tail_jitter_ms": 60.0, "loss_percent": 12.0,
           "burst_messages": 2.5, "outage_s": 0.5}  # fmt: skip
@@ -156,8 +156,23 @@ def test_what_was_found_before_an_interruption_is_kept_and_taken_up(monkeypatch,
     write_figure(*figures[-1])
     with Image.open(out.with_suffix(".png")) as picture:
         assert picture.width > 1000
-    Drives.most = 0  # A complete one is found anew.
+    Drives.most = 16  # A complete one is found anew.
     assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
+
+
+@pytest.mark.parametrize("spoilt", [{}, {"tried": {"none": {"verdict": "holds"}}}])
+def test_an_unfinished_file_that_is_none_is_one_line_and_stays(
+    monkeypatch, capsys, tmp_path, spoilt
+):
+    monkeypatch.setattr(envelope, "Drivers", Drives)
+    out = tmp_path / "e.json"
+    Drives.most = 16  # The perfect network and a part of the next
+    assert call(capsys, "envelope", "--out", out, package="hil_tests")[0] == 130
+    part = json.loads(out.read_text())
+    del part["tried"]
+    out.write_text(text := json.dumps(part | spoilt))
+    assert refusal(capsys, "envelope", "--out", out, package="hil_tests")
+    assert out.read_text() == text
 
 
 def test_bursts_come_on_top_of_the_loss():

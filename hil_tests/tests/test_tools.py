@@ -24,25 +24,6 @@ ROOT = Path(__file__).parents[2]
 VEHICLE = "hunter01"
 
 
-ALONE = """
-from hil_tests.processes import Process
-words = ("http.server", "0", "--bind", "127.0.0.1")
-with Process(*words, ready="Serving", environment={"PYTHONUNBUFFERED": "1"}) as process:
-    print(process.pid, flush=True)
-    process.wait(60)
-"""
-
-
-def test_who_is_killed_leaves_no_process_that_drives_on():
-    with subprocess.Popen([sys.executable, "-c", ALONE], cwd=ROOT, stdout=subprocess.PIPE) as us:
-        assert us.stdout is not None
-        words = Path(f"/proc/{int(us.stdout.readline())}/cmdline")
-        assert words.read_bytes()
-        us.kill()
-    # Nobody may have waited for it: then it is there, without words.
-    wait_until(lambda: not (words.exists() and words.read_bytes()), "its end")
-
-
 @pytest.mark.board
 @pytest.mark.timeout(600)
 def test_without_systemd_under_python38_it_installs_offline_and_drives(tmp_path):
@@ -125,3 +106,18 @@ def test_a_mistake_is_one_line_before_anything_is_done(words, tmp_path, capsys):
     assert exit_status(main, words.format(tmp=tmp_path).split()) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_processes_of_a_command_that_is_killed_end(tmp_path):
+    """SIGKILL leaves it no time to end them."""
+    (tmp_path / "sleeper.py").write_text("import time; print('ready', flush=True); time.sleep(60)")
+    starts = "from hil_tests.processes import Process; import time\n"
+    starts += "print(Process('sleeper', ready='ready').pid, flush=True); time.sleep(60)"
+    paths = {"PYTHONPATH": f"{ROOT}:{tmp_path}"}
+    command, pipe = [sys.executable, "-c", starts], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, text=True, env=os.environ | paths) as killed:
+        assert killed.stdout
+        pid = int(killed.stdout.readline())
+        killed.kill()
+    status = Path(f"/proc/{pid}/status")  # Where nobody waits for orphans, it stays a zombie.
+    wait_until(lambda: not status.exists() or "State:\tZ" in status.read_text(), "its end")

@@ -40,6 +40,16 @@ class Huge(Plain):
         return np.full(3, 1e6, np.float32)
 
 
+class Flat(Plain):
+    """Pays the same whatever is done."""
+
+    control_period_s = 0.1
+
+    def step(self, action: Any) -> Any:
+        seen, _, *end = super().step(action)
+        return seen, 0.0, *end
+
+
 class Tells(Plain):
     """Tells of its goals; every third seed comes to none."""
 
@@ -52,7 +62,7 @@ class Tells(Plain):
         return *seen, info
 
 
-register(Single, Wanders, Huge, Tells)
+register(Single, Wanders, Huge, Flat, Tells)
 
 
 def odd(name: str) -> str:

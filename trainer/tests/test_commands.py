@@ -10,6 +10,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from hil_tests.testing.commands import call, refusal
 from hil_tests.testing.policies import public_pem
+from trainer.tests.odd import odd
+from trainer.training.command import FINDS_NOTHING
 from trainer.training.config import RunConfig
 from trainer.training.metrics import read_metrics
 from trainer.util import save_torch
@@ -52,6 +54,14 @@ def test_bad_input_gets_one_line_and_status_2(words, said, capsys, tmp_path, mon
     Path("file").write_text("a file")
     assert said in refusal(capsys, *shlex.split(words.format(tmp=tmp_path)))
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_only_several_episodes_of_one_return_say_that_nothing_pays(capsys, tmp_path, episodes):
+    words = ("--scenario", odd("Flat"), "--algorithm", "per_td3")
+    status, _, err = call(capsys, "train", *words, "--out", tmp_path, "--episodes", episodes)
+    assert status == 0
+    assert (FINDS_NOTHING in err) == (episodes > 1)
 
 
 def test_evaluate_reports_what_the_contract_asks_for(capsys):

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -63,6 +63,8 @@ def policy(capsys, tmp_path, model, *options, env="Pendulum-v1"):
     [
         (SAC, {"policy_kwargs": {**SMALL}}),
         (TD3, {"policy_kwargs": {**SMALL}}),
+        (DDPG, {"policy_kwargs": {**SMALL}}),
+        (A2C, {"policy_kwargs": {**SMALL}}),
         (PPO, {"policy_kwargs": {**SMALL, "activation_fn": torch.nn.ReLU}}),
         (PPO, {"use_sde": True, "policy_kwargs": {**SMALL, "squash_output": True}}),
     ],

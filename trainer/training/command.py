@@ -238,7 +238,8 @@ def _train(
         def on_episode(metrics: EpisodeMetrics) -> None:
             nonlocal explored
             recent.append(metrics)
-            if not explored and training.progress >= config.learner.exploration_share:
+            ends = training.progress >= config.learner.exploration_share
+            if ends and not explored and len(recent) > 1:
                 explored = True
                 if len({row["episode_return"] for row in read_metrics(run_dir)}) == 1:
                     print(f"\n{FINDS_NOTHING}", file=sys.stderr)
