@@ -21,11 +21,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 
-from bridge.outcomes import GOAL
 from bridge.report import ProgressBar
 from edge_runtime.files import make_directory, write_json
 from edge_runtime.util import UserError, read_bytes, read_json
@@ -35,7 +33,6 @@ from trainer.environments import make_environment
 from trainer.evaluation import (
     BEST_FILE,
     CHECKPOINT_FILE,
-    constant_driver,
     drive_episodes,
     drive_together,
     load_actor,
@@ -281,7 +278,7 @@ def make_record(job: Job) -> Record:
         device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
         policy = str(job.run_dir)
     elif unit.algorithm == plan.CONSTANT:
-        own |= best_constant(unit.scenario, study)
+        own |= plan.BEST_CONSTANT[unit.scenario]
         policy = f"{evaluation.CONSTANT}{own['action']}"
     elif unit.algorithm == plan.HUMAN_MODEL:
         policy = str(job.human_model.parent)
@@ -313,28 +310,6 @@ def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
         tests += [(condition, *(_rounded(getattr(drive, name)) for name in records.DRIVEN))
                   for drive in drives]  # fmt: skip
     return pd.DataFrame(tests, columns=["condition", *records.DRIVEN])
-
-
-def best_constant(scenario: str, study: Study) -> dict[str, Any]:
-    """Return the constant action that is best on validation drives, and its success there.
-
-    Searched on two grids: from -1 to 1, then a step to either side of the best one.
-    """
-    envs = [make_environment(scenario) for _ in range(min(TOGETHER, study.search_runs))]
-    seeds = [util.episode_seed(0, util.Purpose.VALIDATION, run) for run in range(study.search_runs)]
-    worth: dict[float, tuple[float, float]] = {}
-
-    def search(low: float, high: float) -> float:
-        for action in np.linspace(low, high, study.search_points).round(3).tolist():
-            if action not in worth:
-                results = drive_together(envs, constant_driver(action).act_together, seeds)
-                success = np.mean([result.outcome == GOAL for result in results])
-                worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
-        return max(worth, key=lambda action: (*worth[action], -abs(action)))
-
-    coarse, reach = search(-1.0, 1.0), 2.0 / (study.search_points - 1)
-    best = search(max(coarse - reach, -1.0), min(coarse + reach, 1.0))
-    return {"action": best, "searched": len(worth), "search_success": worth[best][0]}
 
 
 def _computed_on(device: str) -> dict[str, Any]:
