@@ -203,9 +203,6 @@ def export(parser: argparse.ArgumentParser) -> None:
 )
 def bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
-    parser.add_argument(
-        "--quick", action="store_true", help="measure only a few rounds, for a rough look"
-    )
     add_threads(parser)
 
 
