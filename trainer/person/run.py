@@ -47,7 +47,7 @@ def training_with_person(
     """Open a run with a person as its guide; a resumed one stores what was recorded since."""
     check_settings(config)
     with ExitStack() as stack:
-        person = stack.enter_context(closing(web.open_cockpit(arguments)))
+        person = stack.enter_context(closing(web.open_cockpit(arguments, env)))
         make_directory(run_dir)
         delayed = behind_network(config, env)
         sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)

@@ -7,19 +7,20 @@ import argparse
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
 from bridge.outcomes import DISCARDED, FAILED, GOAL, RESTARTED, STOPPED, TRUNCATED, UNKNOWN, UNTOLD
+from bridge.report import EpisodeResult
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment, scenario_of
-from trainer.evaluation import load_driver, located, trained_in
+from trainer.evaluation import drive_episodes, load_driver, located, trained_in
 from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.person import (
@@ -151,9 +152,7 @@ class Sitting(Guide):
         self._step += 1
         return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
 
-    def record(
-        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
-    ) -> None:
+    def record(self, transition: Transition, _: Any, info: dict[str, Any]) -> None:
         """Keep a control period: the transition, and what the person did."""
         self.recorder.add(
             RecordedStep(
@@ -164,8 +163,8 @@ class Sitting(Guide):
                 seen=packed(transition.observation),
                 seen_next=packed(transition.next_observation),
                 action=self.applied,
-                human=transition.human,
-                first=intervention is not None and intervention.first,
+                human=self._intervention is not None,
+                first=self._intervention is not None and self._intervention.first,
                 reward=float(transition.reward),
                 terminated=transition.terminal,
                 truncated=transition.truncated,
@@ -283,6 +282,7 @@ class PacedEnvironment:
 
     def __init__(self, env: Any, sitting: Sitting) -> None:
         self.env, self.sitting = env, sitting
+        self.control_period_s: float = env.control_period_s
 
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed)
@@ -297,17 +297,32 @@ class PacedEnvironment:
         return observation, reward, terminated, truncated, info
 
 
+class SharedWheel(Driver):
+    """Drives as a policy, or nobody, does with the person beside it."""
+
+    def __init__(self, sitting: Sitting, policy: Driver | None) -> None:
+        self.sitting, self.policy = sitting, policy
+
+    def reset(self) -> None:
+        if self.policy is not None:
+            self.policy.reset()
+
+    def act(self, observation: Observation) -> Action:
+        action = None if self.policy is None else self.policy.act(observation)
+        self.sitting.watch(observation, action)
+        return vector(self.sitting.applied)
+
+
 def run(arguments: argparse.Namespace) -> int:
     set_threads(arguments.threads)
     arguments.policy = arguments.policy and located(arguments.policy)
     env, seed_of = _environment(arguments)
-    arguments.scenario = env.scenario  # By it the cockpit knows its keys.
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
-    with closing(env), closing(web.open_cockpit(arguments)) as person:
+    with closing(env), closing(web.open_cockpit(arguments, env)) as person:
         sitting = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
         with closing(sitting), quit_on_signals(sitting.quit):
             drive(sitting, policy, seed_of, arguments.episodes)
@@ -326,28 +341,17 @@ def drive(
     The policy drives until the person takes over; without one, the person drives alone.
     ``seed_of``: an episode's number over all sittings -> its seed.
     """
-    vehicle = PacedEnvironment(sitting.env, sitting)
-    number = sitting.recorder.sitting
-    while not sitting.stop and sitting.episode != episodes:
-        try:
-            observation, info = vehicle.reset(seed=seed_of((number << 32) + sitting.episode))
-        except GuideGone:
-            break
-        if policy is not None:
-            policy.reset()
-        ended = False
-        while not ended:
-            policy_action = None if policy is None else policy.act(observation)
-            intervention = sitting.watch(observation, policy_action)
-            action = vector(sitting.applied)
-            seen, reward, terminated, truncated, info = vehicle.step(action)
-            step = Transition(
-                observation, action, reward, seen, terminated, truncated,
-                intervention is not None, policy_action,
-            )  # fmt: skip
-            observation, ended = seen, terminated or truncated
-            sitting.record(step, intervention, info)
-        sitting.end_episode(info["outcome"])
+
+    def seeds() -> Iterator[int]:
+        while not sitting.stop and sitting.episode != episodes:
+            yield seed_of((sitting.recorder.sitting << 32) + sitting.episode)
+
+    def ended(result: EpisodeResult) -> None:
+        sitting.end_episode(result.outcome)
+
+    with suppress(GuideGone):
+        vehicle, driver = PacedEnvironment(sitting.env, sitting), SharedWheel(sitting, policy)
+        drive_episodes(vehicle, driver, seeds(), on_episode=ended, recorders=[sitting.record])
 
 
 def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
@@ -357,10 +361,7 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
         period_s = asked.policy and trained_in(asked.policy, asked.public_key)[1]
-        scenario = asked.scenario or "left_turn"
-        # Now: of some simulators only one may live, and this closes its own.
-        web.controls_of(scenario)
-        return make_environment(scenario, period_s=period_s), seed_of
+        return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario, "--scenario")
     name = scenario_of(asked.scenario or recorded.origin.environment)

@@ -17,7 +17,6 @@ import time
 import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -30,7 +29,6 @@ from PIL import Image
 from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
-from trainer.environments import make_environment
 from trainer.person import Amount, Input, Reading, Seat, View, amount
 
 PAGE = Path(__file__).parent / "page"
@@ -66,29 +64,25 @@ class Controls:
     names: tuple[str, ...]  # Of the actions
 
 
-@cache
-def controls_of(scenario: str) -> Controls:
+def controls_of(env: Any) -> Controls:
     """Return the controls of an environment; UserError where a person cannot drive it."""
-    with contextlib.closing(make_environment(scenario)) as env:
-        if not getattr(env, "can_be_seen", True):
-            raise UserError(f"a person cannot see {scenario}: it has no render() and no scene()")
-        if not env.keys:
-            raise UserError(f"a person cannot drive {scenario}: several actions, and no keys")
-        keys = {
-            name.lower().removeprefix("arrow").removeprefix("key"): amount(held - env.rest_action)
-            for name, held in env.keys.items()
-        }
-        rest, names = amount(env.rest_action), tuple(env.action_names)
-        controls = Controls(keys, rest, env.key_rate_per_s, names)
-    if taken := sorted(RESERVED & keys.keys()):
-        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which are the cockpit's")
-    return controls
+    if not getattr(env, "can_be_seen", True):
+        raise UserError(f"a person cannot see {env.scenario}: it has no render() and no scene()")
+    if not env.keys:
+        raise UserError(f"a person cannot drive {env.scenario}: several actions, and no keys")
+    keys = {
+        name.lower().removeprefix("arrow").removeprefix("key"): amount(held - env.rest_action)
+        for name, held in env.keys.items()
+    }
+    if taken := ", ".join(sorted(RESERVED & keys.keys())):
+        raise UserError(f"{env.scenario} is driven with {taken}, which are the cockpit's")
+    return Controls(keys, amount(env.rest_action), env.key_rate_per_s, tuple(env.action_names))
 
 
-def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
+def open_cockpit(arguments: argparse.Namespace, env: Any) -> Cockpit:
     """Serve the cockpit, print its address, and open it where there is a display."""
     host = arguments.host
-    cockpit = Cockpit(host, arguments.port, arguments.scenario)
+    cockpit = Cockpit(env, host, arguments.port)
     if host not in LOOPBACK:
         danger = "whoever reads this network's traffic can take the wheel; ssh -L is safer"
         print(f"warning: --host {host}: {danger}", file=sys.stderr)
@@ -117,8 +111,8 @@ class Cockpit:
     the server's thread. Raises UserError where the address cannot be listened on.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
-        self.controls = controls_of(scenario)
+    def __init__(self, env: Any, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.controls = controls_of(env)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
@@ -187,7 +181,7 @@ class Cockpit:
         await runner.cleanup()
 
     def _take_view(self, number: int, view: View) -> None:
-        self._newest = (number, encode_view(view, number))
+        self._newest = (number, encode_view(view, number, self.controls))
         for page in self._pages:
             page.wake.set()
 
@@ -296,13 +290,13 @@ def _encode(kind: str, **fields: Any) -> str:
     return _ENCODER.encode({"kind": kind, **fields}).decode()
 
 
-def encode_view(view: View, number: int) -> str:
+def encode_view(view: View, number: int, controls: Controls) -> str:
     """Encode view ``number``, from 1.
 
     ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` of a JPEG.
     """
     frames = None if view.frames is None else view.frames.tobytes()
-    fields = vars(view) | {"frames": frames, "controls": controls_of(view.scenario)}
+    fields = vars(view) | {"frames": frames, "controls": controls}
     if view.picture is not None:
         jpeg = io.BytesIO()
         Image.fromarray(view.picture).save(jpeg, "JPEG")
