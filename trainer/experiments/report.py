@@ -4,7 +4,7 @@
 is made of the numbers of a line's units in one task, one row a unit.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -104,16 +104,12 @@ def label(scene: tuple[str, str]) -> str:
     return letter if condition == "nominal" else f"{letter}-{condition[0].upper()}"
 
 
-def markdown(head: Iterable[str], rows: Iterable[Sequence[Any]]) -> str:
-    return "\n".join(markdown_table([*head], rows)).rstrip("\n")
-
-
 def table(records: Records, places: Iterable[tuple[str, Line]], columns: Mapping[str, Cell]) -> str:
     """Return a row for each task and line of which there is something."""
     found = ((task, line, records.of(task, line)) for task, line in places)
     rows = [(line.name, plan.words(task), *(cell(its) for cell in columns.values()))
             for task, line, its in found if len(its)]  # fmt: skip
-    return markdown(("", "scenario", *columns), rows)
+    return "\n".join(markdown_table(["", "scenario", *columns], rows)).rstrip("\n")
 
 
 def shown(cell: Cell, records: Records, task: str, line: Line) -> str:
@@ -212,19 +208,6 @@ def presets() -> list[tuple[str, Any, Any]]:
     """Return the settings that are not the paper's: name, ours, the paper's."""
     ours, printed = (flat(PRESETS[name]) for name in ("ours", "printed"))
     return [(name, ours[name], value) for name, value in printed.items() if value != ours[name]]
-
-
-def anchor(name: str) -> str:
-    """Return the link to the part of an experiment, as GitHub makes it."""
-    return f"{name} {EXPERIMENTS[name].title}".lower().replace(",", "").replace(" ", "-")
-
-
-def verdicts(claims: pd.DataFrame) -> list[Any]:
-    """Return how many claims hold, do not and are undecided; then the same of the policy alone."""
-    answers = ("yes", "no", "undecided")
-    found, alone = ([(claims[column] == answer).sum() for answer in answers]
-                    for column in ("holds", "holds_alone"))  # fmt: skip
-    return [*found, *(alone if any(alone) else ["", "", ""])]
 
 
 def tested(condition: str) -> Cell:

@@ -4,7 +4,7 @@ import argparse
 import copy
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import cache
@@ -42,9 +42,12 @@ SCRIPTED = (
 
 @contextmanager
 def training_with_person(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any
-) -> Iterator[tuple[TrainingRun, Sitting]]:
-    """Open a run with a person as its guide; a resumed one stores what was recorded since."""
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any, resume: bool
+) -> Iterator[tuple[TrainingRun, Callable[[], bool]]]:
+    """Open a run with a person as its guide; yield it, and what ends the sitting.
+
+    A resumed one stores what was recorded since.
+    """
     check_settings(config)
     with ExitStack() as stack:
         person = stack.enter_context(closing(web.open_cockpit(arguments, env)))
@@ -57,13 +60,13 @@ def training_with_person(
         stack.enter_context(closing(validation))
         vehicle = PacedEnvironment(delayed or env, sitting)
         parts = Parts(env, delayed, vehicle, sitting, learning, validation, [sitting.record])
-        training = TrainingRun(config, run_dir, arguments.resume, parts)
-        if arguments.resume:
+        training = TrainingRun(config, run_dir, resume, parts)
+        if resume:
             _recover(training, sitting)
         else:
             training.save()  # So that a run killed in its first episode can be resumed.
         sitting.episode = training.episode
-        yield training, sitting
+        yield training, sitting.quit
         print(sitting.summary(), file=sys.stderr)
 
 

@@ -267,9 +267,7 @@ def test_a_validation_only_because_a_run_ended_is_forgotten_when_it_goes_on(tmp_
     rows = train(odd("Tells"), **asked, resume=True).metrics
     due = rows.episode[rows.validation_success.notna()]
     assert 0 not in due.tolist()
-    best = json.loads((tmp_path / "report.json").read_text())["validation"]["best_at_step"]
-    (episode,) = rows.episode[rows.total_steps == best]
-    assert episode + 1 == load_torch(tmp_path / "best_actor.pt")["episode"]
+    assert load_torch(tmp_path / "best_actor.pt")["episode"] - 1 in due.tolist()
 
 
 def test_a_period_that_was_asked_for_is_that_of_all_that_follows(tmp_path):

@@ -57,13 +57,7 @@ from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import read_demonstrations
 from trainer.training.learning import LearningThread, diverged
-from trainer.training.metrics import (
-    REPORT_FILE,
-    EpisodeMetrics,
-    MetricsWriter,
-    read_metrics,
-    totals,
-)
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.util import Purpose, episode_seed, save_torch
 
 
@@ -311,9 +305,6 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-            rows, drives = read_metrics(self.run_dir), self.config.confirmation_runs
-            report = totals(rows, self.env.control_period_s, drives)
-            write_json(self.run_dir / REPORT_FILE, report)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
