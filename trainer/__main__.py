@@ -185,10 +185,7 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--key", metavar="KEY", help="private key (PEM) that signs the policy")
 
 
-@command(
-    "trainer.bench:run",
-    "python -m trainer bench --threads 2 --out b.json",
-)
+@command("trainer.bench:run", "python -m trainer bench --threads 2 --out b.json")
 def bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
     add_threads(parser)

@@ -108,7 +108,7 @@ def measure_training(run: TrainingRun) -> dict[str, float]:
 
     Returns seconds for 10,000 steps, scaled up: the wall-clock total, and its parts.
     """
-    while run.learning.added < run.config.learner.warmup_steps:
+    while run.learning.replay.added < run.config.learner.warmup_steps:
         run.advance()
     began_s = time.perf_counter()
     driven = [run.advance() for _ in range(ROUNDS // 2)]

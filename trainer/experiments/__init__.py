@@ -53,13 +53,10 @@ PAPER_TESTS = 50
 
 
 def words(name: str) -> str:
-    """Return a task or a setting as it is shown."""
     return name.replace("_", " ")
 
 
 class Line(NamedTuple):
-    """An algorithm in a setting."""
-
     algorithm: str
     setting: str = NORMAL
 
@@ -154,7 +151,6 @@ class Study:
     name: str = ""  # Of its page's template, and of its folders in ``results`` and ``runs``
 
     def of(self, task: str) -> Study:
-        """Return the study with what holds for one task."""
         return replace(self, **self.by_task.get(task, {}))
 
     def quick(self) -> Study:

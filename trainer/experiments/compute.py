@@ -61,8 +61,6 @@ NICENESS = 5  # Keeps the machine usable for others
 
 @dataclass(frozen=True)
 class Job:
-    """A unit to be computed."""
-
     unit: Unit
     store: Store
     stop_at_s: float = math.inf
@@ -79,7 +77,6 @@ class Job:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute, say how much is done, or report; return the exit status."""
     names, seeds = {*arguments.names}, arguments.seeds
     study = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
     alone = names - plan.EXPERIMENTS.keys()
@@ -217,7 +214,6 @@ def compute(job: Job) -> str:
 
 
 def run_config(job: Job) -> RunConfig:
-    """Return the settings of a unit's training."""
     values = job.store.study.config(job.unit)
     start, learner = PRESETS[values.pop("preset")], values.pop("learner")
     if job.unit.needs_human:

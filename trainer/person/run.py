@@ -30,7 +30,7 @@ from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics
-from trainer.training.run import Parts, Score, TrainingRun, Trials, Validation, behind_network
+from trainer.training.run import Score, TrainingRun, Trials, Validation
 from trainer.util import begin_process
 
 SCRIPTED = (
@@ -52,15 +52,14 @@ def training_with_person(
     with ExitStack() as stack:
         person = stack.enter_context(closing(web.open_cockpit(arguments, env)))
         make_directory(run_dir)
-        delayed = behind_network(config, env)
         sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
         validation = PersonValidation(config, run_dir, learning, sitting)
         stack.enter_context(closing(validation))
-        vehicle = PacedEnvironment(delayed or env, sitting)
-        parts = Parts(env, delayed, vehicle, sitting, learning, validation, [sitting.record])
-        training = TrainingRun(config, run_dir, resume, parts)
+        training = TrainingRun(config, run_dir, resume, env, sitting, learning, validation)
+        training.vehicle = PacedEnvironment(training.vehicle, sitting)
+        training.recorders.append(sitting.record)
         if resume:
             _recover(training, sitting)
         else:
@@ -114,7 +113,7 @@ class PersonValidation(Validation):
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        added, warmup = self.learning.added, self.config.learner.warmup_steps
+        added, warmup = self.learning.replay.added, self.config.learner.warmup_steps
         learned = f"not learning yet ({added} of {warmup} steps)"
         if not math.isnan(metrics.critic_loss):
             learned = f"critic loss {metrics.critic_loss:.3f}"
@@ -135,7 +134,6 @@ class PersonValidation(Validation):
                 print("validation left out", file=sys.stderr)
 
     def close(self) -> None:
-        """Kill the process: a person does not wait for it."""
         self.kill()
         self._process.shutdown(cancel_futures=True)
 

@@ -23,17 +23,7 @@ from trainer.environments import Adapted, make_environment, scenario_of
 from trainer.evaluation import drive_episodes, load_driver, located, trained_in
 from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention
 from trainer.learner.replay import Action, Observation, Transition
-from trainer.person import (
-    Amount,
-    Control,
-    Intent,
-    Reading,
-    TakeOver,
-    View,
-    amount,
-    vector,
-    web,
-)
+from trainer.person import Amount, Control, Intent, Reading, TakeOver, View, amount, vector, web
 from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
@@ -213,7 +203,6 @@ class Sitting(Guide):
         self.person.show(view)
 
     def summary(self) -> str:
-        """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
         listed = ", ".join(f"{count} {word}" for word, count in self.outcomes.items())

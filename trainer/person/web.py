@@ -55,8 +55,6 @@ _ENCODER = msgspec.json.Encoder(enc_hook=plain)
 
 @dataclass(frozen=True)
 class Controls:
-    """The keys of one environment."""
-
     keys: Mapping[str, Amount]
     """Key, in small letters as ``up`` or ``w`` -> what pressing it fully adds to ``rest``."""
     rest: Amount  # Hands off
@@ -95,8 +93,6 @@ def open_cockpit(arguments: argparse.Namespace, env: Any) -> Cockpit:
 
 @dataclass(eq=False)
 class Page:
-    """One open page."""
-
     socket: web.WebSocketResponse
     sent: int = 0  # Number of the newest view sent
     seen: int = 0  # Number of the newest view that it has drawn
@@ -123,7 +119,6 @@ class Cockpit:
         self._origin = f"http://{shown}:{self.port}"
         self.url = f"{self._origin}/{self._token}/"
         self._pages: list[Page] = []
-        self._shown = 0
         self._newest = (0, "")  # The newest view's number and message; pages get it when they can
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
@@ -145,8 +140,7 @@ class Cockpit:
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
-        self._shown += 1
-        self._tell(self._take_view, self._shown, view)
+        self._tell(self._take_view, view)
 
     def close(self) -> None:
         """Tell the pages that it is over, and end the thread; a second call does nothing."""
@@ -180,7 +174,8 @@ class Cockpit:
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
 
-    def _take_view(self, number: int, view: View) -> None:
+    def _take_view(self, view: View) -> None:
+        number = self._newest[0] + 1
         self._newest = (number, encode_view(view, number, self.controls))
         for page in self._pages:
             page.wake.set()

@@ -10,7 +10,7 @@ from highway_env.road.road import LaneIndex
 from highway_env.utils import wrap_to_pi
 
 from trainer.scenarios import Scene, base
-from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
+from trainer.scenarios.picture import Rasteriser, Rectangle
 
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
@@ -76,8 +76,6 @@ class LeftTurnPath:
 
 @dataclass(frozen=True)
 class LeftTurnConfig(base.ScenarioConfig):
-    """Numbers of the scenario, each with its reason where there is one."""
-
     scaled = "speed_weight"
     lane_width_m: float = 4.0
     straight_m: float = 10.0  # Path on the side road before the turn
@@ -250,14 +248,10 @@ class LeftTurnEnv(base.DrivingEnv):
         base.equip(cars, types)
         return cars
 
-    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
-        if any(overlap(ego, car) for car in cars):
-            return "collision"
+    def _outcome(self, ego: Rectangle) -> str | None:
         if self.distance_m >= self.config.goal_m:
             return "goal"
-        if abs(self._offset_m) > 0.5 * self.config.lane_width_m:
-            return "off_road"
-        return "timeout" if self.steps >= self.config.max_steps else None
+        return "off_road" if abs(self._offset_m) > 0.5 * self.config.lane_width_m else None
 
     def _reward(self, outcome: str | None) -> float:
         """Rate goal, failure, and the distance to the target speed (eq. 31)."""

@@ -320,7 +320,7 @@ class TestNumbers:
             fails = unit in ours and behind and unit.scenario == "congestion"
             return {"success": [1.0, 1.0, 0.0 if fails else 1.0, 1.0]}
 
-        monkeypatch.setattr(report, "RIVALS", ("hi_td3",))
+        monkeypatch.setattr(plan, "RIVALS", ("hi_td3",))
         found = leave(store, GOOD_UNITS, episodes=steps, tests=tests)
         assert report.default(found) == default
         assert report.less_in(report.pairs(found, "hi_td3")) == f"{cheaper} of 10"

@@ -212,7 +212,7 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurr
     for keep, reward in ((False, 9.0), (True, 3.0)):
         unhurried.add(transition(reward, human=True))
         unhurried.add(transition(reward + 1.0, terminal=True))
-        assert unhurried.added == 3
+        assert unhurried.replay.added == 3
         if not keep:
             threading.Timer(0.05, gate.open.set).start()
         unhurried.end_episode(0.0, keep)

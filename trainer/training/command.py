@@ -45,7 +45,7 @@ from trainer.training.config import (
 )
 from trainer.training.curves import write_learning_curve
 from trainer.training.metrics import EpisodeMetrics, metrics_table, read_metrics
-from trainer.training.run import TrainingRun, environment_of, make_parts
+from trainer.training.run import TrainingRun, environment_of
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
             began = training_with_person(how, config, run_dir, env, resume)
             training, quit_training = stack.enter_context(began)
         else:
-            training = TrainingRun(config, run_dir, resume, make_parts(config, run_dir, env))
+            training = TrainingRun(config, run_dir, resume, env)
             quit_training = partial(_quit, training)
         if on_step := vars(how).get("on_step"):
             training.recorders.append(on_step)
@@ -223,7 +223,7 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
         training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    print(f"{_summary(metrics_table(run_dir), config.confirmation_runs)}: {run_dir}")
+    print(f"{_summary(metrics_table(run_dir), config)}: {run_dir}")
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
@@ -239,7 +239,7 @@ def _quit(training: TrainingRun) -> bool:
     return True
 
 
-def _summary(rows: pd.DataFrame, confirming: int) -> str:
+def _summary(rows: pd.DataFrame, config: RunConfig) -> str:
     if rows.empty:
         return "no episodes"
     last, confirmed = rows.iloc[-1], rows.confirmed_success.max()
@@ -248,7 +248,8 @@ def _summary(rows: pd.DataFrame, confirming: int) -> str:
     said.append(f"{counted(last.total_takeovers, 'take-over')} with {last.total_human_s:.0f} s")
     said.append(counted(last.total_failures, "failure"))
     if confirmed == confirmed:  # Of the kept actor
-        share = success_estimate(round(confirmed * confirming), confirming).as_share()
+        count = config.confirmation_factor * config.evaluation_runs
+        share = success_estimate(round(confirmed * count), count).as_share()
         said.append(f"kept actor {share} %")
     return ", ".join(said)
 

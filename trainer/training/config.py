@@ -9,12 +9,7 @@ from typing import Any
 from bridge.network import parse_spec
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
-from trainer.learner.config import (
-    PRINTED_LEARNER,
-    LearnerConfig,
-    find_algorithm,
-    task_settings,
-)
+from trainer.learner.config import PRINTED_LEARNER, LearnerConfig, find_algorithm, task_settings
 from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
@@ -122,11 +117,6 @@ class RunConfig:
         if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
-
-    @property
-    def confirmation_runs(self) -> int:
-        """Episodes that an actor drives before it is kept."""
-        return self.confirmation_factor * self.evaluation_runs
 
     @property
     def kept_actor(self) -> str:

@@ -4,7 +4,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -62,7 +62,6 @@ from trainer.util import Purpose, episode_seed, save_torch
 
 
 def environment_of(config: RunConfig) -> Any:
-    """Make a run's environment."""
     return make_environment(
         config.scenario,
         printed_reward=config.printed_reward,
@@ -192,26 +191,6 @@ class Validation(Trials):
 NOBODY = Guide()
 
 
-@dataclass
-class Parts:
-    """What a run is made of; `make_parts` makes those of a run without a person."""
-
-    env: Any  # The environment itself: it is foreseen in
-    delayed: DelayedVehicle | None  # The environment behind the config's network, if any
-    vehicle: Any  # What the loop drives: one of these, perhaps in a wrapper
-    guide: Guide
-    learning: LearningThread
-    validation: Validation
-    recorders: list[Record] = field(default_factory=list)
-
-
-def make_parts(config: RunConfig, run_dir: Path, env: Any) -> Parts:
-    """Make the parts of a run with a scripted human, a human model, or nobody as its guide."""
-    delayed, learning = behind_network(config, env), LearningThread(config, env)
-    guide, validation = make_guide(config, env), Validation(config, run_dir, learning, env)
-    return Parts(env, delayed, delayed or env, guide, learning, validation)
-
-
 def behind_network(config: RunConfig, env: Any) -> DelayedVehicle | None:
     """Return a run's environment behind the run's network, if it has one."""
     if find_algorithm(config.algorithm).foresight:
@@ -244,14 +223,25 @@ class TrainingRun:
     """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
     def __init__(
-        self, config: RunConfig, run_dir: Path, resume: bool = False, parts: Parts | None = None
+        self,
+        config: RunConfig,
+        run_dir: Path,
+        resume: bool = False,
+        env: Any = None,
+        guide: Guide | None = None,
+        learning: LearningThread | None = None,
+        validation: Validation | None = None,
     ) -> None:
+        """Each part is by default the one that the config describes."""
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        parts = parts or make_parts(config, run_dir, environment_of(config))
-        self.env, self.delayed, self.vehicle = parts.env, parts.delayed, parts.vehicle
-        self.guide, self.learning, self.validation = parts.guide, parts.learning, parts.validation
-        self.recorders = parts.recorders
+        self.env = env or environment_of(config)  # It is foreseen in.
+        self.delayed = behind_network(config, self.env)
+        self.vehicle: Any = self.delayed or self.env  # What the loop drives
+        self.learning = learning or LearningThread(config, self.env)
+        self.guide = guide or make_guide(config, self.env)
+        self.validation = validation or Validation(config, run_dir, self.learning, self.env)
+        self.recorders: list[Record] = []
         self.act = self.delayed.behind(self._explore) if self.delayed else self._explore
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
         self.episode = self.steps = 0
@@ -380,7 +370,7 @@ class TrainingRun:
         asks = self.algorithm.asks and guide is not NOBODY
         doubt = self.learning.doubt(observation, policy_action) if asks else 0.0
         acted_s = time.perf_counter()
-        if self.learning.added >= self.config.learner.warmup_steps:
+        if self.learning.replay.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
         begun_s = time.perf_counter()
         intervention = guide.watch(observation, policy_action, doubt)
