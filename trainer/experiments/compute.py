@@ -30,14 +30,6 @@ from edge_runtime.util import UserError, read_bytes, read_json
 from trainer import evaluation, util
 from trainer import experiments as plan
 from trainer.environments import make_environment
-from trainer.evaluation import (
-    BEST_FILE,
-    CHECKPOINT_FILE,
-    drive_episodes,
-    drive_together,
-    load_actor,
-    load_driver,
-)
 from trainer.experiments import STUDIES, TASKS, Study, Unit, records, report
 from trainer.experiments.records import RECORD_FILE, Record, Store
 from trainer.human import MODEL_FILE
@@ -209,7 +201,7 @@ def compute(job: Job) -> str:
     make_directory(job.run_dir)
     write_json(job.run_dir / RECORD_FILE, make_record(job))
     # The actor stays, for export and for tests to come; what learning needs is large.
-    (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
+    (job.run_dir / evaluation.CHECKPOINT_FILE).unlink(missing_ok=True)
     return FINISHED
 
 
@@ -238,9 +230,9 @@ def _train(job: Job) -> bool:
     config, run_dir = run_config(job), job.run_dir
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
-    if over and was_validated(rows[-1]) and (run_dir / BEST_FILE).is_file():
+    if over and was_validated(rows[-1]) and (run_dir / evaluation.BEST_FILE).is_file():
         return True  # Trained before; the checkpoint may be gone already.
-    run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
+    run = TrainingRun(config, run_dir, resume=(run_dir / evaluation.CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
         if time.time() > job.stop_at_s:
@@ -263,7 +255,7 @@ def make_record(job: Job) -> Record:
         rows = pd.read_csv(job.run_dir / METRICS_FILE)
         tables["episodes"] = rows.rename(columns=RENAMED)[records.TABLES["episodes"]].map(_rounded)
         env = make_environment(TASKS[unit.scenario]["environment"])
-        tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
+        tested = evaluation.load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
         own |= {
             "period_s": env.control_period_s,
             "updates": int(rows.updates.iloc[-1]),
@@ -296,13 +288,13 @@ def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
     tests = []
     for condition in unit.conditions:
         env = make_environment(environment, condition)
-        driver: Any = load_driver(policy, env)[0]
+        driver: Any = evaluation.load_driver(policy, env)[0]
         if evaluation.is_expert(policy):  # It has a memory, and drives its own environment only.
-            drives = drive_episodes(env, driver, seeds, condition)
+            drives = evaluation.drive_episodes(env, driver, seeds, condition)
         else:
             more = range(min(TOGETHER, count) - 1)
             envs = [env, *(make_environment(environment, condition) for _ in more)]
-            drives = drive_together(envs, driver.act_together, seeds, condition)
+            drives = evaluation.drive_together(envs, driver.act_together, seeds, condition)
         tests += [(condition, *(_rounded(getattr(drive, name)) for name in records.DRIVEN))
                   for drive in drives]  # fmt: skip
     return pd.DataFrame(tests, columns=["condition", *records.DRIVEN])

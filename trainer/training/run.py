@@ -18,24 +18,9 @@ from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL, is_told
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
-from trainer import util
-from trainer.environments import (
-    DelayedVehicle,
-    check_foresight,
-    expert_of,
-    foresee,
-    make_environment,
-)
-from trainer.evaluation import (
-    BEST_FILE,
-    CHECKPOINT_FILE,
-    NO_NETWORK,
-    TogetherDriver,
-    drive_episodes,
-    drive_together,
-    is_expert,
-    load_driver,
-)
+from trainer import environments, evaluation, util
+from trainer.environments import DelayedVehicle
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, NO_NETWORK, TogetherDriver
 from trainer.human.guide import (
     ASKED,
     STUCK,
@@ -58,11 +43,10 @@ from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import read_demonstrations
 from trainer.training.learning import LearningThread, diverged
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
-from trainer.util import Purpose, episode_seed, save_torch
 
 
 def environment_of(config: RunConfig) -> Any:
-    return make_environment(
+    return environments.make_environment(
         config.scenario,
         printed_reward=config.printed_reward,
         period_s=config.period_s,
@@ -89,7 +73,7 @@ class Trials:
         self.config, self.network, self._env = config, parse_spec(config.latency), env
         count = config.evaluation_runs
         seeds = [
-            episode_seed(config.seed, Purpose.VALIDATION, run)
+            util.episode_seed(config.seed, util.Purpose.VALIDATION, run)
             for run in range(count * (1 + config.confirmation_factor))
         ]
         self._seeds, self._confirming = seeds[:count], seeds[count:]
@@ -111,8 +95,8 @@ class Trials:
 
     def _drive(self, driver: TogetherDriver, seeds: Sequence[int]) -> list[EpisodeResult]:
         if self.network == NO_NETWORK:
-            return drive_together(self.envs, driver.act_together, seeds)
-        return drive_episodes(self.envs[0], driver, seeds, latency=self.network)
+            return evaluation.drive_together(self.envs, driver.act_together, seeds)
+        return evaluation.drive_episodes(self.envs[0], driver, seeds, latency=self.network)
 
 
 class Validation(Trials):
@@ -168,7 +152,7 @@ class Validation(Trials):
             return
         if found >= self.best and confirmed >= self.confirmed:
             state = {**self.config.label(episode), "actor": actor.state_dict()}
-            save_torch(self.run_dir / BEST_FILE, state)
+            util.save_torch(self.run_dir / BEST_FILE, state)
             if due:
                 self.best, self.confirmed = found, confirmed
                 self._best_actor = copy.deepcopy(state)
@@ -185,7 +169,7 @@ class Validation(Trials):
         if self._best_actor is None:  # What is there was validated before it was due.
             (self.run_dir / BEST_FILE).unlink(missing_ok=True)
         else:
-            save_torch(self.run_dir / BEST_FILE, self._best_actor)
+            util.save_torch(self.run_dir / BEST_FILE, self._best_actor)
 
 
 NOBODY = Guide()
@@ -194,7 +178,7 @@ NOBODY = Guide()
 def behind_network(config: RunConfig, env: Any) -> DelayedVehicle | None:
     """Return a run's environment behind the run's network, if it has one."""
     if find_algorithm(config.algorithm).foresight:
-        check_foresight(env)
+        environments.check_foresight(env)
     network = parse_spec(config.latency)
     return None if network == NO_NETWORK else DelayedVehicle(env, network)
 
@@ -205,8 +189,9 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
     random = util.random_stream(config.seed, util.Purpose.GUIDANCE)
     if not row.guided:
         return Guide()
-    driver, _ = load_driver(config.human, env)
-    expert = expert_of(env, config.human if is_expert(config.human) else "expert")
+    driver, _ = evaluation.load_driver(config.human, env)
+    named = config.human if evaluation.is_expert(config.human) else "expert"
+    expert = environments.expert_of(env, named)
     attention, hands, period_s = None, None, env.control_period_s
     if config.late_to_s or config.missed_share:
         late_steps = config.late_from_s / period_s, config.late_to_s / period_s
@@ -380,7 +365,9 @@ class TrainingRun:
         if intervention is not None and self.delayed:
             self.delayed.release_brake()
         if intervention is not None and self.algorithm.foresight:
-            foreseen = foresee(self.env, observation, policy_action, self.algorithm.foresight)
+            foreseen = environments.foresee(
+                self.env, observation, policy_action, self.algorithm.foresight
+            )
         next_observation, reward, terminated, truncated, info = self.vehicle.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
