@@ -28,8 +28,8 @@ from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
 
-JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
+JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 
 
 class Pacer:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
@@ -17,7 +18,6 @@ from trainer.util import fitting
 
 NAN = float("nan")
 METRICS_FILE = "metrics.csv"
-WHOLE = ("episode", "total_steps", "interventions", "human_steps", "updates")
 LEARNED = (0.9, 0.98)
 """Success rates of the policy alone, in validation, whose cost is reported."""
 
@@ -66,7 +66,8 @@ class EpisodeMetrics:
     confirmed_reward: float = NAN
 
 
-NAMES = [f.name for f in fields(EpisodeMetrics)]
+KINDS: dict[str, Any] = {f.name: f.type for f in fields(EpisodeMetrics)}
+NAMES = [*KINDS]
 
 
 class MetricsWriter:
@@ -137,7 +138,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
         text = io.StringIO((whole + end).decode(), newline="")
         rows = list(csv.DictReader(text, strict=True))
         for number, row in enumerate(rows):
-            values = {name: _number(name, text) for name, text in row.items() if name != "outcome"}
+            values = {name: KINDS[name](text) for name, text in row.items()}
             if [*row] != NAMES or values["episode"] != number:
                 raise ValueError(row)
     return rows
@@ -145,12 +146,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
 def metrics_table(run_dir: Path) -> pd.DataFrame:
     """Return a run's rows as numbers, and the outcome as text."""
-    kinds = {name: str if name == "outcome" else int if name in WHOLE else float for name in NAMES}
-    return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(kinds)
-
-
-def _number(name: str, text: str) -> float:
-    return int(text) if name in WHOLE else float(text)
+    return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(KINDS)
 
 
 def was_validated(row: Mapping[str, str]) -> bool:
