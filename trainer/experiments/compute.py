@@ -36,7 +36,7 @@ from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
-from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, was_validated
+from trainer.training.metrics import METRICS_FILE, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import check_device, deadline_s
 
@@ -222,23 +222,14 @@ def run_config(job: Job) -> RunConfig:
 
 
 def _train(job: Job) -> bool:
-    """Train to the budget's end; return whether it was reached.
-
-    The run quits when time is out, and has no deadline in ``TrainingRun.train``: that one validates
-    once more when it stops, as no unbroken run does.
-    """
+    """Train to the budget's end; return whether it was reached."""
     config, run_dir = run_config(job), job.run_dir
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
-    if over and was_validated(rows[-1]) and (run_dir / evaluation.BEST_FILE).is_file():
+    if over and (run_dir / evaluation.BEST_FILE).is_file():
         return True  # Trained before; the checkpoint may be gone already.
     run = TrainingRun(config, run_dir, resume=(run_dir / evaluation.CHECKPOINT_FILE).is_file())
-
-    def after(metrics: EpisodeMetrics) -> None:
-        if time.time() > job.stop_at_s:
-            run.quitting = True
-
-    run.train(after)
+    run.train(deadline_s=time.monotonic() + job.stop_at_s - time.time())
     return run.over
 
 

@@ -314,24 +314,15 @@ def outcomes(records: Records) -> Mapping[str, Cell]:
 # Figures
 
 Draw = Callable[[Records], Figure]
-COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", "human_model": "C1"}
-OTHERS = ("C4", "C5", "C6", "C8", "C9", "black", "C1")
-"""For algorithms without a colour of their own, by their place in the figure."""
-MARKERS = {plan.NORMAL: "o", "one_frame": "D", "random": "^", "biased": "v"}
+LOOKS: Mapping[str, Any] = plan.DATA["looks"]
 CURVES = ((REWARD, TRAINING), (DISTANCE, TRAINING), (SUCCESS, ALONE), (DISTANCE, ALONE))
 TIME_S, LATERAL, LONGITUDINAL = data.ARRIVED_ONLY
-TITLES = {
-    REWARD: "reward",
-    DISTANCE: "surviving distance, m",
-    SUCCESS: "success",
-    TIME_S: "time to the goal, s",
-    LATERAL: "mean |lateral acceleration|, m/s²",
-    LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
-}
 
 
 def _look(line: Line, place: int) -> dict[str, Any]:
-    return {"color": COLOURS.get(line.algorithm, OTHERS[place % len(OTHERS)]), "label": line.name}
+    others = LOOKS["other_colours"]
+    colour = LOOKS["colours"].get(line.algorithm, others[place % len(others)])
+    return {"color": colour, "label": line.name}
 
 
 def draw_curves(name: str, records: Records) -> Figure:
@@ -340,7 +331,7 @@ def draw_curves(name: str, records: Records) -> Figure:
     panels = figure.subplots(2, len(CURVES), sharex="row").flat
     curves_of = product(plan.SCENARIOS, CURVES)
     for panel, (scenario, (metric, kind)) in zip(panels, curves_of, strict=True):
-        panel.set_title(f"{plan.words(scenario)}: {TITLES[metric]}, {kind}", fontsize=10)
+        panel.set_title(f"{plan.words(scenario)}: {LOOKS['titles'][metric]}, {kind}", fontsize=10)
         for place, line in enumerate(plan.EXPERIMENTS[name].lines):
             curves = records.curves(scenario, line, f"{metric} {kind}")
             # The printed reward is on another scale.
@@ -377,12 +368,12 @@ def draw_points(name: str, quantities: list[tuple[str, str]], records: Records) 
         panels, ((s, q) for row in quantities for s, q in zip(plan.SCENARIOS, row, strict=True)),
         strict=True,
     ):  # fmt: skip
-        panel.set_title(f"{plan.words(scenario)}: {TITLES[quantity]}", fontsize=10)
+        panel.set_title(f"{plan.words(scenario)}: {LOOKS['titles'][quantity]}", fontsize=10)
         for place, line in enumerate(lines):
             found = records.of(scenario, line)
             found = found.reindex(columns=[f"{quantity} {condition}" for condition in names])
             x = np.arange(len(names)) + 0.8 * (place + 0.5) / len(lines) - 0.4
-            marker = MARKERS[line.setting]
+            marker = LOOKS["markers"][line.setting]
             look = {"marker": marker, "ms": 5, "ls": "none", "capsize": 2, **_look(line, place)}
             panel.errorbar(x, found.mean(), found.std(), **look)
         panel.set_xticks(range(len(names)), names)

@@ -107,19 +107,17 @@ class PersonValidation(Validation):
     ) -> None:
         super().__init__(config, run_dir, learning, sitting.env)
         self.sitting, self._alone = sitting, ""  # Success of the policy alone, in words
-        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start_validating)
+        self._process = ProcessPoolExecutor(1, get_context("spawn"), begin_process, (NICENESS,))
         self._begun: tuple[Actor, int, Future[list[EpisodeResult]]] | None = None
         """What is being validated, after how many episodes, and its drives to come."""
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        added, warmup = self.learning.replay.added, self.config.learner.warmup_steps
-        learned = f"not learning yet ({added} of {warmup} steps)"
-        if not math.isnan(metrics.critic_loss):
-            learned = f"critic loss {metrics.critic_loss:.3f}"
         if not at_end:
             self._beside(metrics, episode, due)
-            self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}{self._alone}"
+            added, warmup = self.learning.replay.added, self.config.learner.warmup_steps
+            learned = "" if metrics.updates else f"not learning yet ({added} of {warmup} steps), "
+            self.sitting.progress = f"{learned}return {metrics.episode_return:.1f}{self._alone}"
             return
         every = self.config.evaluate_every_steps
         try:
@@ -134,12 +132,9 @@ class PersonValidation(Validation):
                 print("validation left out", file=sys.stderr)
 
     def close(self) -> None:
-        self.kill()
-        self._process.shutdown(cancel_futures=True)
-
-    def kill(self) -> None:
         for process in list((self._process._processes or {}).values()):
-            process.kill()
+            process.kill()  # A person does not wait for it.
+        self._process.shutdown(cancel_futures=True)
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
         """Take the validation that is done, into this episode's row, and begin one that is due."""
@@ -174,11 +169,6 @@ def _without_script() -> Iterator[None]:
         sys.modules["__main__"] = script
 
 
-def _start_validating() -> None:
-    begin_process(NICENESS)
-    torch.set_num_threads(1)
-
-
 _trials = cache(Trials)  # Of the one config
 
 
@@ -186,6 +176,7 @@ def _validate(
     config: RunConfig, weights: dict[str, NDArray[Any]], best: Score
 ) -> list[EpisodeResult]:
     """Drive the validation of an actor, in a process beside the person."""
+    torch.set_num_threads(1)
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)

@@ -66,11 +66,9 @@ class Run:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.seeds is None:
-        return INTERRUPTED if _run(arguments).interrupted else 0
-    if vars(arguments).get("human") in HUMANS:
+    if arguments.seeds and vars(arguments).get("human") in HUMANS:
         raise UserError("--seeds does not go with a person")
-    ends = list(_run_seeds(arguments))
+    ends = [*_run_seeds(arguments)] if arguments.seeds else [_run(arguments).interrupted]
     return INTERRUPTED if any(ends) else 0
 
 

@@ -3,7 +3,6 @@
 import csv
 import io
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -71,20 +70,13 @@ NAMES = [*KINDS]
 
 
 class MetricsWriter:
-    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T.
+    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T."""
 
-    ``undue``: it drops the last row's validation, too.
-    """
-
-    def __init__(
-        self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1, undue: bool = False
-    ) -> None:
+    def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
         path, self._period_s = run_dir / METRICS_FILE, period_s
         self._rows = read_metrics(run_dir)[:from_episode]
         if len(self._rows) < from_episode:
             raise UserError(f"{path} lacks episodes before the checkpoint: {from_episode}")
-        for row in self._rows[-1:] if undue else ():
-            row.update({n: "nan" for n in NAMES if n.startswith(("validation", "confirmed"))})
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
@@ -147,10 +139,6 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 def metrics_table(run_dir: Path) -> pd.DataFrame:
     """Return a run's rows as numbers, and the outcome as text."""
     return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(KINDS)
-
-
-def was_validated(row: Mapping[str, str]) -> bool:
-    return row["validation_reward"] != "nan"
 
 
 def is_reached(level: float, success: float) -> bool:

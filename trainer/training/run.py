@@ -113,29 +113,22 @@ class Validation(Trials):
         super().__init__(config, env)
         self.run_dir, self.learning = run_dir, learning
         self.best = self.confirmed = (-1.0, -math.inf)
-        """The kept actor's scores in both sets, as of the validations that were due."""
+        """The kept actor's scores in both sets."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
-        self.undue = False  # The last episode was validated only because the run ended there
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Validate after ``episode`` episodes where that is due, or at the end of a run.
+        """Validate after ``episode`` episodes where that is due.
 
-        A resumed run forgets a validation that was not ``due``: when a run was stopped must not
-        decide which actor it ends with.
+        ``at_end``, where a run is stopped, changes nothing: that must not decide which actor it
+        ends with after it was resumed.
         """
-        self.undue = at_end and not due
-        if due or (at_end and self.config.evaluate_every_steps):
+        if due:
             actor = getattr(self.learning.learner, self.config.kept_actor)
             driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
-            self.take(self.drive(driver, self.best), actor, metrics, episode, due)
+            self.take(self.drive(driver, self.best), actor, metrics, episode)
 
     def take(
-        self,
-        results: Sequence[EpisodeResult],
-        actor: Actor,
-        metrics: EpisodeMetrics,
-        episode: int,
-        due: bool = True,
+        self, results: Sequence[EpisodeResult], actor: Actor, metrics: EpisodeMetrics, episode: int
     ) -> None:
         """Enter an actor's drives into ``metrics``, and keep the actor if it is the best."""
         count = self.config.evaluation_runs
@@ -151,24 +144,21 @@ class Validation(Trials):
         elif self.config.confirmation_factor:
             return
         if found >= self.best and confirmed >= self.confirmed:
+            self.best, self.confirmed = found, confirmed
             state = {**self.config.label(episode), "actor": actor.state_dict()}
+            self._best_actor = copy.deepcopy(state)
             util.save_torch(self.run_dir / BEST_FILE, state)
-            if due:
-                self.best, self.confirmed = found, confirmed
-                self._best_actor = copy.deepcopy(state)
 
     def state_dict(self) -> dict[str, Any]:
         scores = {"best_validation": self.best, "best_confirmed": self.confirmed}
-        return {**scores, "best_actor": self._best_actor, "undue": self.undue}
+        return {**scores, "best_actor": self._best_actor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
         scores = (map(float, state[f"best_{name}"]) for name in ("validation", "confirmed"))
         self.best, self.confirmed = ((success, reward) for success, reward in scores)
-        self._best_actor, self.undue = state["best_actor"], state["undue"]
-        if self._best_actor is None:  # What is there was validated before it was due.
-            (self.run_dir / BEST_FILE).unlink(missing_ok=True)
-        else:
+        self._best_actor = state["best_actor"]
+        if self._best_actor is not None:
             util.save_torch(self.run_dir / BEST_FILE, self._best_actor)
 
 
@@ -253,23 +243,18 @@ class TrainingRun:
         if not self.over:  # Else another revision has trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
-        metrics_writer = MetricsWriter(
-            self.run_dir, self.episode, self.env.control_period_s, self.validation.undue
-        )
+        metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
                 before = self.steps
                 metrics = self.advance()
-                late = self.guide.stop or time.monotonic() > deadline_s
-                at_end = self.over or late
+                at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
                 self.found |= metrics.outcome == GOAL or not is_told([metrics.outcome])
                 self.found |= due and metrics.validation_success > 0.0
                 metrics_writer.add(metrics)
-                # Read once, so that every end has its checkpoint. Quitting adds no validation that
-                # is not due: a resumed run then has had the same ones.
-                ending = at_end or self.quitting
+                ending = at_end or self.quitting  # Read once, so that every end is saved.
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)

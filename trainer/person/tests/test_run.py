@@ -30,7 +30,8 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
     metrics = EpisodeMetrics(0, updates=1)
     for _ in range(2):
         validation._beside(metrics, 1, due=True)
-        validation.kill()
+        for process in (validation._process._processes or {}).values():
+            process.kill()
         if validation._begun:
             wait_until(validation._begun[2].done, "the answer's absence")
         validation._beside(metrics, 2, due=False)
