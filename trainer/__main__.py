@@ -8,7 +8,6 @@ import ast
 import inspect
 import re
 import sys
-import textwrap
 from itertools import pairwise
 from typing import Any
 
@@ -290,7 +289,7 @@ def add_fields(parser: Group, config: Any, **metavars: str) -> None:
 
 def meanings(config: type) -> dict[str, str]:
     """Return the first sentence of each field's docstring, by the field's name."""
-    (made,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    (made,) = ast.parse(inspect.getsource(config)).body
     assert isinstance(made, ast.ClassDef)
     found = {}
     for field, text in pairwise(made.body):

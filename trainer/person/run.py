@@ -34,8 +34,7 @@ from trainer.training.run import Score, TrainingRun, Trials, Validation
 from trainer.util import begin_process
 
 SCRIPTED = (
-    "guided_share", "guided_until_episode", "poor_guidance_share",
-    "late_to_s", "missed_share",
+    "guided_share", "guided_until_episode", "poor_guidance_share", "late_to_s", "missed_share",
 )  # fmt: skip
 """Settings of a scripted human."""
 
@@ -52,7 +51,7 @@ def training_with_person(
     with ExitStack() as stack:
         person = stack.enter_context(closing(web.open_cockpit(arguments, env)))
         make_directory(run_dir)
-        sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
+        sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
         validation = PersonValidation(config, run_dir, learning, sitting)

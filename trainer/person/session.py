@@ -57,19 +57,12 @@ class Pacer:
 class Sitting(Guide):
     """A person as a guide: waits for each control period, asks the hands, and shows what is.
 
-    ``env`` is the environment itself, ``recorder`` where the sitting is kept. ``alone``: nobody but
-    the person drives; ``speed``: simulated seconds in one of the person's.
+    ``env`` is the environment itself, ``recorder`` where the sitting is kept, ``speed`` simulated
+    seconds in one of the person's.
     """
 
-    def __init__(
-        self,
-        person: web.Cockpit,
-        env: Any,
-        recorder: Recorder,
-        alone: bool = False,
-        speed: float = 1.0,
-    ) -> None:
-        self.person, self.env, self.recorder, self.alone = person, env, recorder, alone
+    def __init__(self, person: web.Cockpit, env: Any, recorder: Recorder, speed: float) -> None:
+        self.person, self.env, self.recorder = person, env, recorder
         self.pacer = Pacer(env.control_period_s / speed)
         self.stop = self.closed = False
         self.episode = 0  # The number of the episode, or of the next one
@@ -91,7 +84,7 @@ class Sitting(Guide):
         self._policy_action: Amount | None = None
         self._intervention: Intervention | None = None
         self.applied: Amount = self._rest
-        self._control: Control = "human" if self.alone else "policy"
+        self._control: Control = "policy"
         self._restart = self._discard = False
         self._judged = ""  # The person's word on how the episode ended
 
@@ -312,7 +305,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
     with closing(env), closing(web.open_cockpit(arguments, env)) as person:
-        sitting = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
+        sitting = Sitting(person, env, Recorder(out), arguments.speed)
         with closing(sitting), quit_on_signals(sitting.quit):
             drive(sitting, policy, seed_of, arguments.episodes)
     print(sitting.summary())

@@ -140,9 +140,7 @@ MIXED: Mix = ((CAR, 0.4), (VAN, 0.2), (TRUCK, 0.2), (MOTORCYCLE, 0.2))
 
 
 def draw_types(mix: Mix, count: int, random: np.random.Generator) -> list[VehicleType]:
-    """Draw the types of ``count`` vehicles; a mix of one type draws nothing."""
-    if len(mix) == 1:
-        return [mix[0][0]] * count
+    """Draw the types of ``count`` vehicles."""
     chosen = random.choice(len(mix), size=count, p=[share for _, share in mix])
     return [mix[number][0] for number in chosen]
 
@@ -347,7 +345,6 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         raise NotImplementedError
 
     def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
-        """Move all vehicles by one step, the ego car as told."""
         for car in self.traffic:
             car.act()
         for car in self.traffic:
@@ -357,7 +354,6 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.steps += 1
 
     def _report(self) -> Step:
-        """Return the result of ``step``, after the vehicles have moved."""
         ego, cars = self._footprints()
         self.frames[0] = self.frames[1]
         self.frames[1] = self._frame(ego, cars)

@@ -86,7 +86,6 @@ REACH_M = 200.0  # How far the road goes on before start and goal
 def spawn_traffic(
     road: Road, ego: base.EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[base.TrafficVehicle]:
-    """Surround the ego car with cars ahead, beside and behind."""
     jam_mps = float(random.uniform(*config.jam_speed_mps))
     cars: list[base.TrafficVehicle] = []
     for lane in range(LANES):
@@ -184,7 +183,6 @@ class CongestionEnv(base.DrivingEnv):
         self._braking = pressed
 
     def step(self, action: base.Action) -> base.Step:
-        """Hold the steering angle for one control interval."""
         c = self.config
         self._last_steering = self._steering
         self._steering = min(max(float(action[0]), -1.0), 1.0)

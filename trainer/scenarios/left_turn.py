@@ -46,7 +46,6 @@ class LeftTurnPath:
         self.centre_y = self.start_y - straight_m
 
     def pose(self, s_m: float) -> Pose:
-        """Return the pose at arc length ``s_m``."""
         on_arc_m = s_m - self.straight_m
         if on_arc_m <= 0.0:
             return Pose(self.start_x, self.start_y - s_m, -0.5 * math.pi)
@@ -172,7 +171,6 @@ class LeftTurnEnv(base.DrivingEnv):
         }
 
     def step(self, action: base.Action) -> base.Step:
-        """Hold the pedal for one control interval."""
         c = self.config
         pedal = min(max(float(action[0]), -1.0), 1.0)
         acceleration_mps2 = pedal * (c.throttle_mps2 if pedal > 0 else c.brake_mps2)

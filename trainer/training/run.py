@@ -117,10 +117,9 @@ class Validation(Trials):
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Validate after ``episode`` episodes where that is due.
+        """Validate after ``episode`` episodes where that is ``due``.
 
-        ``at_end``, where a run is stopped, changes nothing: that must not decide which actor it
-        ends with after it was resumed.
+        Not where a run is stopped, ``at_end``: that must not decide which actor it ends with.
         """
         if due:
             actor = getattr(self.learning.learner, self.config.kept_actor)
@@ -165,14 +164,6 @@ class Validation(Trials):
 NOBODY = Guide()
 
 
-def behind_network(config: RunConfig, env: Any) -> DelayedVehicle | None:
-    """Return a run's environment behind the run's network, if it has one."""
-    if find_algorithm(config.algorithm).foresight:
-        environments.check_foresight(env)
-    network = parse_spec(config.latency)
-    return None if network == NO_NETWORK else DelayedVehicle(env, network)
-
-
 def make_guide(config: RunConfig, env: Any) -> Guide:
     """Make the human of a run as its config describes it."""
     row = find_algorithm(config.algorithm)
@@ -211,7 +202,10 @@ class TrainingRun:
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
         self.env = env or environment_of(config)  # It is foreseen in.
-        self.delayed = behind_network(config, self.env)
+        if self.algorithm.foresight:
+            environments.check_foresight(self.env)
+        network = parse_spec(config.latency)
+        self.delayed = None if network == NO_NETWORK else DelayedVehicle(self.env, network)
         self.vehicle: Any = self.delayed or self.env  # What the loop drives
         self.learning = learning or LearningThread(config, self.env)
         self.guide = guide or make_guide(config, self.env)
