@@ -159,10 +159,7 @@ COST: Mapping[str, Cell] = {
 COSTS: Mapping[str, Cell] = {
     **SPENT,
     f"episodes to {data.LEARNED:.0%}": until(data.LEARNED, "episodes"),
-    **{
-        f"take-overs to {level:.0%}": until(level, "takeovers")
-        for level in (data.LEARNED, data.WELL)
-    },
+    **{f"take-overs to {level:.0%}": until(level, "takeovers") for level in data.LEVELS},
     f"failed episodes to {data.LEARNED:.0%}": until(data.LEARNED, "failures"),
     "human s in all": estimate("human_s"),
     "failed episodes": estimate("failures"),
