@@ -9,7 +9,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo accept test test-ray test-board lint format bench \
-	bench-quick recording mutate lock clean
+	recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -53,9 +53,6 @@ bench: $(STAMP)  ## speed of learner, environments and training, as JSON in resu
 	for threads in 1 2; do \
 		$(BIN)/python -m trainer bench --threads $$threads --out $(BENCH)/threads_$$threads.json || exit; \
 	done
-
-bench-quick: $(STAMP)  ## a look at the same
-	$(BIN)/python -m trainer bench --quick --threads 1
 
 # One call for each policy; after ^C it goes on.
 ACCEPT := $(BIN)/python -m hil_tests accept --public-key results/policies/policy.pub \

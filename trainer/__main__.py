@@ -8,7 +8,6 @@ import ast
 import inspect
 import re
 import sys
-import textwrap
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +19,7 @@ from edge_runtime.cli import Subcommand, add_public_key, command, program, run_c
 from trainer import experiments as plan
 from trainer.environments import CONDITIONS
 from trainer.human import FIELDS, HumanModelConfig
-from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.learner.config import LearnerConfig
 from trainer.person import HUMANS, add_person
 from trainer.training.config import (
     CURVE_FILE,
@@ -48,16 +47,11 @@ def train(parser: argparse.ArgumentParser) -> None:
     what = parser.add_argument_group("what to train")
     add = what.add_argument
     add_scenario(what)
-    rows = f"learning algorithm: {', '.join(ALGORITHMS)}, a name from an installed package, or "
-    rows += "MODULE:ROW (trainer/README.md explains the names)"
-    add("--algorithm", default=DEFAULTS.algorithm, metavar="NAME", help=rows)
+    add_fields(what, DEFAULTS, algorithm="NAME")
     add_seed(what)
     several = "train a run for each seed, such as 1-5, side by side, in RUN_DIR/seed_N"
     add("--seeds", type=seeds, metavar="FIRST-LAST", help=several)
-    add_fields(what, DEFAULTS, *EXTENT)
-    judge = "who says whether an episode succeeded, where the environment does not: it takes the "
-    judge += "last observation, its info and the return, and returns True, False or None"
-    add("--success", default=DEFAULTS.success, metavar="MODULE:FUNCTION", help=judge)
+    add_fields(what, DEFAULTS, **dict.fromkeys(EXTENT, "N"), success="MODULE:FUNCTION")
     start = "settings to start from: this project's, or those printed in the paper"
     add("--preset", choices=list(PRESETS), default="ours", help=start)
     change = "change a setting; may be repeated; --set alone lists all settings with their "
@@ -72,14 +66,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     add_latency(what, "simulated network in training and validation")
     guide = parser.add_argument_group("who guides")
     whose = f"expert|MODULE:CLASS|HUMAN_DIR|{'|'.join(HUMANS)}"
-    known = "who takes over from the policy: the environment's scripted expert, your own expert as "
-    known += "MODULE:CLASS, a model trained by `trainer human`, or you, in the browser (web)"
-    guide.add_argument("--human", default=DEFAULTS.human, metavar=whose, help=known)
-    shown = "drives to learn from before the first step: a person's recordings, F.mcap of bridge "
-    shown += "record, or a LeRobot data set"
-    guide.add_argument(
-        "--demonstrations", default=DEFAULTS.demonstrations, metavar="PATH", help=shown
-    )
+    add_fields(guide, DEFAULTS, human=whose, demonstrations="PATH")
     add_person(parser)
     how = parser.add_argument_group("the run")
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
@@ -150,7 +137,7 @@ def human(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--out", required=True, metavar="HUMAN_DIR", type="path", help="directory of the model")
     add_seed(parser)
-    add_fields(parser, HumanModelConfig(), *FIELDS)
+    add_fields(parser, HumanModelConfig(), **dict.fromkeys(FIELDS, "N"))
     person = "imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
     person += "their directories, or such a training run (default: imitate the scripted expert)"
     add("--from", dest="recordings", nargs="+", metavar="RECORDING", type="path", help=person)
@@ -197,15 +184,9 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--key", metavar="KEY", help="private key (PEM) that signs the policy")
 
 
-@command(
-    "trainer.bench:run",
-    "python -m trainer bench --threads 2 --out b.json",
-)
+@command("trainer.bench:run", "python -m trainer bench --threads 2 --out b.json")
 def bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
-    parser.add_argument(
-        "--quick", action="store_true", help="measure only a few rounds, for a rough look"
-    )
     add_threads(parser)
 
 
@@ -294,12 +275,13 @@ def add_time_limit(parser: Group, what: str) -> None:
     parser.add_argument("--max-minutes", type=cli.positive_number, metavar="MIN", help=text)
 
 
-def add_fields(parser: Group, config: Any, *names: str) -> None:
+def add_fields(parser: Group, config: Any, **metavars: str) -> None:
     """Add an option for each named field of a config, which itself checks the ranges."""
     said = meanings(type(config))
-    for name in names:
+    for name, metavar in metavars.items():
         option, default = f"--{name.replace('_', '-')}", getattr(config, name)
-        how: dict[str, Any] = {"type": cli.not_negative, "default": default, "metavar": "N"}
+        kind = cli.not_negative if isinstance(default, int) else str
+        how: dict[str, Any] = {"type": kind, "default": default, "metavar": metavar}
         if isinstance(default, bool):
             how = {"action": "store_true"}
         parser.add_argument(option, help=said[name].removeprefix("whether "), **how)
@@ -307,7 +289,7 @@ def add_fields(parser: Group, config: Any, *names: str) -> None:
 
 def meanings(config: type) -> dict[str, str]:
     """Return the first sentence of each field's docstring, by the field's name."""
-    (made,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    (made,) = ast.parse(inspect.getsource(config)).body
     assert isinstance(made, ast.ClassDef)
     found = {}
     for field, text in pairwise(made.body):

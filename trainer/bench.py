@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,42 +17,44 @@ import torch
 from bridge.report import ProgressBar
 from edge_runtime.files import check_writable, write_json_out
 from trainer.environments import make_environment
-from trainer.learner.config import PHIL, LearnerConfig
-from trainer.learner.replay import ReplayBuffer, Transition
-from trainer.learner.td3 import TD3Learner
+from trainer.learner.config import LearnerConfig
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import RunConfig
+from trainer.training.learning import LearningThread
 from trainer.training.run import TrainingRun
 from trainer.util import processor_model, set_threads, source_revision
 
-ROUNDS, QUICK_ROUNDS = 20, 4
+ROUNDS = 20
 UPDATES, STEPS = 5, 200  # In a round; so many steps are about three episodes
-TRANSITIONS = 1000
-"""In the learner's buffer, instead of the paper's 100,000: drawing costs the same."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
 
 
 def run(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     set_threads(arguments.threads)
-    rounds = QUICK_ROUNDS if arguments.quick else ROUNDS
-    report = measure(rounds)
+    report = measure()
     write_json_out(arguments.out, report)
     print(json.dumps(report, indent=2))
     return 0
 
 
-def measure(rounds: int, batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
+def measure(batch_size: int = LearnerConfig.batch_size) -> dict[str, Any]:
     """Return the report: machine and versions, and the contract's three figures."""
-    with ProgressBar("bench", 2 + len(SCENARIOS)) as bar:
-        update_s = median_s(whole_update(batch_size), rounds, UPDATES)
-        bar.advance({"update": f"{1e3 * update_s:.1f} ms"})
+    learner = LearnerConfig(batch_size=batch_size, warmup_steps=batch_size)
+    with (
+        ProgressBar("bench", 2 + len(SCENARIOS)) as bar,
+        tempfile.TemporaryDirectory() as directory,
+    ):
+        run = TrainingRun(RunConfig(evaluate_every_steps=0, learner=learner), Path(directory))
+        with contextlib.closing(run.learning):
+            training = measure_training(run)
+            bar.advance({})
+            update_s = run.learning.in_thread(median_s, whole_update(run.learning), UPDATES)
+            bar.advance({"update": f"{1e3 * update_s:.1f} ms"})
         step_s = {}
         for name in SCENARIOS:
-            step_s[name] = median_s(steps_of(name), rounds, STEPS)
+            step_s[name] = median_s(steps_of(name), STEPS)
             bar.advance({name: f"{1 / step_s[name]:.0f} steps/s"})
-        training = measure_training(rounds // 2, batch_size)
-        bar.advance({})
     return {
         "machine": {"processor": processor_model(), "cores": os.cpu_count()},
         "threads": torch.get_num_threads(),
@@ -65,10 +67,10 @@ def measure(rounds: int, batch_size: int = LearnerConfig.batch_size) -> dict[str
     }
 
 
-def median_s(work: Callable[[], object], rounds: int, pieces: int) -> float:
+def median_s(work: Callable[[], object], pieces: int) -> float:
     """Return the median over rounds of a piece's seconds; one more round is not counted."""
     times = []
-    for _ in range(1 + rounds):
+    for _ in range(1 + ROUNDS):
         began_s = time.perf_counter()
         for _ in range(pieces):
             work()
@@ -76,39 +78,16 @@ def median_s(work: Callable[[], object], rounds: int, pieces: int) -> float:
     return float(np.median(times[1:]))
 
 
-def whole_update(batch_size: int) -> Callable[[], None]:
-    """Return an update of PHIL-TD3: drawing, learning, new priorities.
-
-    The observations are real, the rewards invented; the human acts in a fifth, about as in a
-    guided run.
-    """
-    random, replay = np.random.default_rng(0), ReplayBuffer(TRANSITIONS)
-    frames = _real_observations(make_environment("left_turn"), TRANSITIONS + 1)
-    for before, after in pairwise(frames):
-        action, human = random.uniform(-1, 1, 1).astype(np.float32), bool(random.random() < 0.2)
-        replay.add(Transition(before, action, random.normal(), after, False, human=human))
-    learner = TD3Learner(LearnerConfig(batch_size=batch_size), PHIL, seed=0)
+def whole_update(learning: LearningThread) -> Callable[[], None]:
+    """Return an update of PHIL-TD3 on what was driven: drawing, learning, new priorities."""
+    random, replay = np.random.default_rng(0), learning.replay
 
     def update() -> None:
-        batch = replay.sample(batch_size, random)
-        losses = learner.update(batch, 0.0)
+        batch = replay.sample(learning.config.batch_size, random)
+        losses = learning.learner.update(batch, 0.0)
         replay.update_priorities(batch.indices, losses.priorities)
 
     return update
-
-
-def _real_observations(env: Any, count: int) -> Any:
-    """Collect observations [count, ...] by driving with a pedal that wanders."""
-    random, pedal, over = np.random.default_rng(0), np.zeros(1, np.float32), True
-    seen: list[Any] = []
-    while len(seen) < count:
-        if over:
-            observation, _ = env.reset(seed=len(seen))
-        seen.append(observation)
-        pedal = np.clip(pedal + random.normal(0.0, 0.3, 1), -1, 1).astype(np.float32)
-        observation, _, *ends, _ = env.step(pedal)
-        over = any(ends)
-    return np.stack(seen)
 
 
 def steps_of(scenario: str) -> Callable[[], None]:
@@ -124,21 +103,16 @@ def steps_of(scenario: str) -> Callable[[], None]:
     return drive
 
 
-def measure_training(episodes: int, batch_size: int) -> dict[str, float]:
-    """Train PHIL-TD3 in the left turn with an update a step, without validation or checkpoint.
+def measure_training(run: TrainingRun) -> dict[str, float]:
+    """Train with an update a step, without validation or checkpoint.
 
     Returns seconds for 10,000 steps, scaled up: the wall-clock total, and its parts.
     """
-    learner = LearnerConfig(batch_size=batch_size, warmup_steps=batch_size)
-    with tempfile.TemporaryDirectory() as directory:
-        run = TrainingRun(RunConfig(evaluate_every_steps=0, learner=learner), Path(directory))
-        with contextlib.closing(run.learning):
-            while run.learning.added < learner.warmup_steps:
-                run.advance()
-            began_s = time.perf_counter()
-            driven = [run.advance() for _ in range(episodes)]
-            total_s = time.perf_counter() - began_s
-    seconds = {"total": total_s}
+    while run.learning.replay.added < run.config.learner.warmup_steps:
+        run.advance()
+    began_s = time.perf_counter()
+    driven = [run.advance() for _ in range(ROUNDS // 2)]
+    seconds = {"total": time.perf_counter() - began_s}
     seconds |= {name: sum(getattr(each, f"{name}_s") for each in driven) for name in PARTS}
     steps = sum(each.steps for each in driven)
     return {name: 1e4 / steps * value for name, value in seconds.items()}

@@ -286,19 +286,15 @@ class _ScaledExpert(Expert):
         self._env, self._own = env, own
 
     def reset(self) -> None:
-        """Forget the last episode."""
         getattr(self._own, "reset", lambda: None)()
 
     def act(self, observation: Any = None) -> Action:
-        """Return the expert's action, from the true state."""
         return inner(self._env.action_range, self._own.act())
 
     def wants_control(self, action: Action) -> Reason | None:
-        """Return why it would take over from ``action``, or None."""
         return self._own.wants_control(outer(self._env.action_range, action))
 
     def may_return(self) -> bool:
-        """Return whether it would give control back here."""
         return bool(getattr(self._own, "may_return", lambda: True)())
 
 

@@ -52,7 +52,6 @@ ActTogether = Callable[[Observation], Action]  # Many actions for many observati
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate and print the report; return the exit status."""
     check_writable(arguments.out)
     names = ("policy", "scenario", "runs", "seed", "condition", "latency", "public_key", "video",
              "rerun")  # fmt: skip
@@ -68,8 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The results of test episodes."""
-
     report: dict[str, Any]  # As ``trainer evaluate`` prints it
     episodes: list[EpisodeResult]
 
@@ -87,7 +84,6 @@ class Evaluation:
 
     @property
     def mean_return(self) -> float:
-        """Mean of the episodes' sums of rewards."""
         return float(self.report["episode_reward"]["mean"])
 
 

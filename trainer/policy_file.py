@@ -30,7 +30,6 @@ OPSET = 17  # The oldest onnxruntime that a board may have reads it
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export, check and sign; return the exit status."""
     names = ("out", "scenario", "key")
     made = export(arguments.run_dir, **{name: getattr(arguments, name) for name in names})
     signed = "signed" if arguments.key else "not signed"

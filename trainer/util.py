@@ -200,10 +200,7 @@ def kept(path: str) -> str:
 
 @cache
 def source_revision(directory: Path = Path(__file__).parent) -> str:
-    """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
-
-    As of the first call.
-    """
+    """Return a repository's commit, ``-dirty`` where files differ from it, or ``unknown``."""
     describe = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         done = subprocess.run(describe, cwd=directory, capture_output=True, text=True, check=True)

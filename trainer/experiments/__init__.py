@@ -36,6 +36,7 @@ FULL_PATH_M: Mapping[str, float] = {
 SCENARIOS = tuple(FULL_PATH_M)
 HUMAN_MODEL, CONSTANT = "human_model", "constant"
 """In an algorithm's place: the human model alone, or the best constant action."""
+BEST_CONSTANT: Mapping[str, Any] = DATA["best_constant"]
 HUMANS: Mapping[str, Any] = DATA["humans"]
 """Who guides in the table of human guidance."""
 SETTINGS: Mapping[str, Any] = {**HUMANS, **DATA["settings"]}
@@ -52,13 +53,10 @@ PAPER_TESTS = 50
 
 
 def words(name: str) -> str:
-    """Return a task or a setting as it is shown."""
     return name.replace("_", " ")
 
 
 class Line(NamedTuple):
-    """An algorithm in a setting."""
-
     algorithm: str
     setting: str = NORMAL
 
@@ -146,9 +144,6 @@ class Study:
     """Test drives in each scene, with the seeds 0, 1, ...: the paper's 50 first, then others."""
     checkpoint_every: int = 5
     """Episodes between two checkpoints: what a kill costs, not what a run gives."""
-    search_runs: int = 100
-    """Validation drives of each constant action in the search for the best one."""
-    search_points: int = 21  # Actions on each of the two grids of that search
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
     by_task: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -156,7 +151,6 @@ class Study:
     name: str = ""  # Of its page's template, and of its folders in ``results`` and ``runs``
 
     def of(self, task: str) -> Study:
-        """Return the study with what holds for one task."""
         return replace(self, **self.by_task.get(task, {}))
 
     def quick(self) -> Study:
@@ -190,7 +184,7 @@ class Study:
         scenario = TASKS[unit.scenario]["environment"]
         values = {"scenario": scenario, "algorithm": unit.algorithm, "human": human}
         if unit.algorithm == CONSTANT:
-            return {**values, "search": [here.search_runs, here.search_points]}
+            return {**values, "search": BEST_CONSTANT["search"]}
         if not unit.trained:
             return values
         is_tuned = unit.setting in HUMANS and unit.scenario in SCENARIOS

@@ -21,33 +21,22 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 
-from bridge.outcomes import GOAL
 from bridge.report import ProgressBar
 from edge_runtime.files import make_directory, write_json
 from edge_runtime.util import UserError, read_bytes, read_json
 from trainer import evaluation, util
 from trainer import experiments as plan
 from trainer.environments import make_environment
-from trainer.evaluation import (
-    BEST_FILE,
-    CHECKPOINT_FILE,
-    constant_driver,
-    drive_episodes,
-    drive_together,
-    load_actor,
-    load_driver,
-)
 from trainer.experiments import STUDIES, TASKS, Study, Unit, records, report
 from trainer.experiments.records import RECORD_FILE, Record, Store
 from trainer.human import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import bfloat16_is_faster
 from trainer.training.config import CONFIG_FILE, PRESETS, RunConfig
-from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, was_validated
+from trainer.training.metrics import METRICS_FILE, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import check_device, deadline_s
 
@@ -64,8 +53,6 @@ NICENESS = 5  # Keeps the machine usable for others
 
 @dataclass(frozen=True)
 class Job:
-    """A unit to be computed."""
-
     unit: Unit
     store: Store
     stop_at_s: float = math.inf
@@ -82,7 +69,6 @@ class Job:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute, say how much is done, or report; return the exit status."""
     names, seeds = {*arguments.names}, arguments.seeds
     study = next((study for name, study in STUDIES.items() if name in names), plan.PAPER)
     alone = names - plan.EXPERIMENTS.keys()
@@ -215,12 +201,11 @@ def compute(job: Job) -> str:
     make_directory(job.run_dir)
     write_json(job.run_dir / RECORD_FILE, make_record(job))
     # The actor stays, for export and for tests to come; what learning needs is large.
-    (job.run_dir / CHECKPOINT_FILE).unlink(missing_ok=True)
+    (job.run_dir / evaluation.CHECKPOINT_FILE).unlink(missing_ok=True)
     return FINISHED
 
 
 def run_config(job: Job) -> RunConfig:
-    """Return the settings of a unit's training."""
     values = job.store.study.config(job.unit)
     start, learner = PRESETS[values.pop("preset")], values.pop("learner")
     if job.unit.needs_human:
@@ -237,23 +222,14 @@ def run_config(job: Job) -> RunConfig:
 
 
 def _train(job: Job) -> bool:
-    """Train to the budget's end; return whether it was reached.
-
-    The run quits when time is out, and has no deadline in ``TrainingRun.train``: that one validates
-    once more when it stops, as no unbroken run does.
-    """
+    """Train to the budget's end; return whether it was reached."""
     config, run_dir = run_config(job), job.run_dir
     rows = read_metrics(run_dir)
     over = rows and int(rows[-1]["total_steps"]) >= config.steps
-    if over and was_validated(rows[-1]) and (run_dir / BEST_FILE).is_file():
+    if over and (run_dir / evaluation.BEST_FILE).is_file():
         return True  # Trained before; the checkpoint may be gone already.
-    run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
-
-    def after(metrics: EpisodeMetrics) -> None:
-        if time.time() > job.stop_at_s:
-            run.quitting = True
-
-    run.train(after)
+    run = TrainingRun(config, run_dir, resume=(run_dir / evaluation.CHECKPOINT_FILE).is_file())
+    run.train(deadline_s=time.monotonic() + job.stop_at_s - time.time())
     return run.over
 
 
@@ -270,7 +246,7 @@ def make_record(job: Job) -> Record:
         rows = pd.read_csv(job.run_dir / METRICS_FILE)
         tables["episodes"] = rows.rename(columns=RENAMED)[records.TABLES["episodes"]].map(_rounded)
         env = make_environment(TASKS[unit.scenario]["environment"])
-        tested = load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
+        tested = evaluation.load_actor(job.run_dir, env)[1]["episode"]  # counted from 1
         own |= {
             "period_s": env.control_period_s,
             "updates": int(rows.updates.iloc[-1]),
@@ -281,7 +257,7 @@ def make_record(job: Job) -> Record:
         device = read_json(job.run_dir / CONFIG_FILE, "settings")["device"]
         policy = str(job.run_dir)
     elif unit.algorithm == plan.CONSTANT:
-        own |= best_constant(unit.scenario, study)
+        own |= plan.BEST_CONSTANT[unit.scenario]
         policy = f"{evaluation.CONSTANT}{own['action']}"
     elif unit.algorithm == plan.HUMAN_MODEL:
         policy = str(job.human_model.parent)
@@ -303,38 +279,16 @@ def drive_tests(unit: Unit, policy: str, count: int) -> pd.DataFrame:
     tests = []
     for condition in unit.conditions:
         env = make_environment(environment, condition)
-        driver: Any = load_driver(policy, env)[0]
+        driver: Any = evaluation.load_driver(policy, env)[0]
         if evaluation.is_expert(policy):  # It has a memory, and drives its own environment only.
-            drives = drive_episodes(env, driver, seeds, condition)
+            drives = evaluation.drive_episodes(env, driver, seeds, condition)
         else:
             more = range(min(TOGETHER, count) - 1)
             envs = [env, *(make_environment(environment, condition) for _ in more)]
-            drives = drive_together(envs, driver.act_together, seeds, condition)
+            drives = evaluation.drive_together(envs, driver.act_together, seeds, condition)
         tests += [(condition, *(_rounded(getattr(drive, name)) for name in records.DRIVEN))
                   for drive in drives]  # fmt: skip
     return pd.DataFrame(tests, columns=["condition", *records.DRIVEN])
-
-
-def best_constant(scenario: str, study: Study) -> dict[str, Any]:
-    """Return the constant action that is best on validation drives, and its success there.
-
-    Searched on two grids: from -1 to 1, then a step to either side of the best one.
-    """
-    envs = [make_environment(scenario) for _ in range(min(TOGETHER, study.search_runs))]
-    seeds = [util.episode_seed(0, util.Purpose.VALIDATION, run) for run in range(study.search_runs)]
-    worth: dict[float, tuple[float, float]] = {}
-
-    def search(low: float, high: float) -> float:
-        for action in np.linspace(low, high, study.search_points).round(3).tolist():
-            if action not in worth:
-                results = drive_together(envs, constant_driver(action).act_together, seeds)
-                success = np.mean([result.outcome == GOAL for result in results])
-                worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
-        return max(worth, key=lambda action: (*worth[action], -abs(action)))
-
-    coarse, reach = search(-1.0, 1.0), 2.0 / (study.search_points - 1)
-    best = search(max(coarse - reach, -1.0), min(coarse + reach, 1.0))
-    return {"action": best, "searched": len(worth), "search_success": worth[best][0]}
 
 
 def _computed_on(device: str) -> dict[str, Any]:

@@ -91,8 +91,6 @@ def summarise_tests(scenario: str, drives: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Store:
-    """Where the units of a study are."""
-
     study: Study
     results: Path  # Directory of the tables and the page, to be committed
     runs: Path  # Directory of checkpoints, actors and new records, which is not
@@ -161,8 +159,6 @@ class Store:
 
 @dataclass
 class Records:
-    """The current records of a study."""
-
     study: Study
     tables: Mapping[str, pd.DataFrame]
     found: list[Unit]

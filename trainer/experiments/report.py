@@ -4,7 +4,7 @@
 is made of the numbers of a line's units in one task, one row a unit.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -22,44 +22,20 @@ from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer import experiments as plan
 from trainer.environments import CONDITIONS
-from trainer.experiments import (
-    EXPERIMENTS,
-    FULL_PATH_M,
-    GOOD,
-    HELPED,
-    HUMANS,
-    NORMAL,
-    RIVALS,
-    ROWS,
-    SCENARIOS,
-    TASKS,
-    Line,
-    words,
-)
+from trainer.experiments import Line
 from trainer.experiments import records as data
-from trainer.experiments.records import (
-    ALONE,
-    ARRIVED_ONLY,
-    DISTANCE,
-    LEARNED,
-    REWARD,
-    SUCCESS,
-    TRAINING,
-    WELL,
-    Records,
-    Store,
-)
+from trainer.experiments.records import ALONE, DISTANCE, REWARD, SUCCESS, TRAINING, Records, Store
 from trainer.learner.config import ALGORITHMS
 from trainer.training.config import PRESETS, flat
 
 Cell = Callable[[pd.DataFrame], str]
 PHIL = "phil_td3"
-PAIRS = len(SCENARIOS) * plan.DEFAULT_SEEDS
+PAIRS = len(plan.SCENARIOS) * plan.DEFAULT_SEEDS
 ENOUGH = 9  # Of these pairs: an equal row has so many by chance in one of 93 cases
 MOST_EPISODES = 100  # In which a row of the table of human guidance is to learn
-SCENES = [*product(SCENARIOS, CONDITIONS)]
+SCENES = [*product(plan.SCENARIOS, CONDITIONS)]
 PAPER_SCENES = [scene for scene in SCENES if scene[1] != "dense"]
-BESIDE = [Line(row, GOOD) for row in ROWS]
+BESIDE = [Line(row, plan.GOOD) for row in plan.ROWS]
 """The rows of the table of human guidance, beside the scripted expert."""
 OWN = {"model": Line("human_model", "model"), "slower": Line("expert", "slower")}
 """Humans who drive by themselves; the others are the expert, with a fault or without."""
@@ -104,16 +80,12 @@ def label(scene: tuple[str, str]) -> str:
     return letter if condition == "nominal" else f"{letter}-{condition[0].upper()}"
 
 
-def markdown(head: Iterable[str], rows: Iterable[Sequence[Any]]) -> str:
-    return "\n".join(markdown_table([*head], rows)).rstrip("\n")
-
-
 def table(records: Records, places: Iterable[tuple[str, Line]], columns: Mapping[str, Cell]) -> str:
     """Return a row for each task and line of which there is something."""
     found = ((task, line, records.of(task, line)) for task, line in places)
     rows = [(line.name, plan.words(task), *(cell(its) for cell in columns.values()))
             for task, line, its in found if len(its)]  # fmt: skip
-    return markdown(("", "scenario", *columns), rows)
+    return "\n".join(markdown_table(["", "scenario", *columns], rows)).rstrip("\n")
 
 
 def shown(cell: Cell, records: Records, task: str, line: Line) -> str:
@@ -149,7 +121,6 @@ def until(level: float, what: str) -> Cell:
 
 
 def mean(column: str, digits: int = 0, factor: float = 1.0) -> Cell:
-    """Show the mean of the seeds."""
     return lambda rows: f"{(factor * rows[column]).mean():,.{digits}f}"
 
 
@@ -168,12 +139,12 @@ def estimate(column: str, digits: int = 0, factor: float = 1.0) -> Cell:
     return cell
 
 
-S_TO_LEARNED, S_LEARNED = f"human s to {LEARNED:.0%}", f"human_s_to_{LEARNED:.0%}"
+S_TO_LEARNED, S_LEARNED = f"human s to {data.LEARNED:.0%}", f"human_s_to_{data.LEARNED:.0%}"
 SPENT: Mapping[str, Cell] = {
     "seeds": lambda rows: f"{len(rows)}",
-    f"steps to {LEARNED:.0%}": until(LEARNED, "steps"),
-    S_TO_LEARNED: until(LEARNED, "human_s"),
-    f"human s to {WELL:.0%}": until(WELL, "human_s"),
+    f"steps to {data.LEARNED:.0%}": until(data.LEARNED, "steps"),
+    S_TO_LEARNED: until(data.LEARNED, "human_s"),
+    f"human s to {data.WELL:.0%}": until(data.WELL, "human_s"),
 }
 COST: Mapping[str, Cell] = {
     **SPENT,
@@ -187,9 +158,9 @@ COST: Mapping[str, Cell] = {
 """Columns of the paper's experiments."""
 COSTS: Mapping[str, Cell] = {
     **SPENT,
-    f"episodes to {LEARNED:.0%}": until(LEARNED, "episodes"),
-    **{f"take-overs to {level:.0%}": until(level, "takeovers") for level in (LEARNED, WELL)},
-    f"failed episodes to {LEARNED:.0%}": until(LEARNED, "failures"),
+    f"episodes to {data.LEARNED:.0%}": until(data.LEARNED, "episodes"),
+    **{f"take-overs to {level:.0%}": until(level, "takeovers") for level in data.LEVELS},
+    f"failed episodes to {data.LEARNED:.0%}": until(data.LEARNED, "failures"),
     "human s in all": estimate("human_s"),
     "failed episodes": estimate("failures"),
 }
@@ -214,19 +185,6 @@ def presets() -> list[tuple[str, Any, Any]]:
     return [(name, ours[name], value) for name, value in printed.items() if value != ours[name]]
 
 
-def anchor(name: str) -> str:
-    """Return the link to the part of an experiment, as GitHub makes it."""
-    return f"{name} {EXPERIMENTS[name].title}".lower().replace(",", "").replace(" ", "-")
-
-
-def verdicts(claims: pd.DataFrame) -> list[Any]:
-    """Return how many claims hold, do not and are undecided; then the same of the policy alone."""
-    answers = ("yes", "no", "undecided")
-    found, alone = ([(claims[column] == answer).sum() for answer in answers]
-                    for column in ("holds", "holds_alone"))  # fmt: skip
-    return [*found, *(alone if any(alone) else ["", "", ""])]
-
-
 def tested(condition: str) -> Cell:
     """Show the success under a condition, and in brackets that on the paper's seeds."""
     paper = mean(f"paper_success {condition}", 0, 100.0)
@@ -249,18 +207,17 @@ def seconds(rows: pd.DataFrame) -> str:
 
 
 def cost(records: Records) -> str:
-    """Return the table of what each line's trainings cost."""
     lines = [line for row in records.study.rows if row.seeds for line in row.lines]
-    return table(records, ((task, line) for line in lines for task in SCENARIOS), COST)
+    return table(records, ((task, line) for line in lines for task in plan.SCENARIOS), COST)
 
 
 # The fair table of human guidance
 
 
-def pairs(records: Records, row: str, tasks: Iterable[str] = SCENARIOS) -> pd.DataFrame:
+def pairs(records: Records, row: str, tasks: Iterable[str] = plan.SCENARIOS) -> pd.DataFrame:
     """Return the human's seconds until a row and PHIL-TD3 had learned, pair by pair of seeds."""
     found = records.numbers[records.numbers.seed <= plan.DEFAULT_SEEDS]
-    found = found[found.scenario.isin([*tasks]) & (found.setting == GOOD)]
+    found = found[found.scenario.isin([*tasks]) & (found.setting == plan.GOOD)]
     found = found.pivot(index=["scenario", "seed"], columns="algorithm", values=S_LEARNED)
     return found.reindex(columns=[row, PHIL]).dropna().set_axis(["own", "phil"], axis=1)
 
@@ -277,10 +234,8 @@ def over(records: Records, rows: pd.DataFrame, other: Line, column: str) -> Esti
 
 
 def beside_phil(records: Records) -> Mapping[str, Cell]:
-    """Return the columns of a row less PHIL-TD3."""
-
     def points(rows: pd.DataFrame) -> str:
-        return over(records, rows, Line(PHIL, GOOD), "success nominal").times(100.0).text(1)
+        return over(records, rows, Line(PHIL, plan.GOOD), "success nominal").times(100.0).text(1)
 
     def of(rows: pd.DataFrame) -> pd.DataFrame:
         return pairs(records, rows.algorithm.iloc[0], [rows.scenario.iloc[0]])
@@ -299,18 +254,18 @@ def default(records: Records) -> str | int:
 
     Where pairs are missing, instead how many there are of one row.
     """
-    found = {row: pairs(records, row) for row in RIVALS}
+    found = {row: pairs(records, row) for row in plan.RIVALS}
     if (fewest := min(map(len, found.values()))) < PAIRS:
         return fewest
 
     def takes_its_place(row: str) -> bool:
-        behind = (over(records, records.of(scenario, Line(row, GOOD)), Line(PHIL, GOOD),
+        behind = (over(records, records.of(scenario, Line(row, plan.GOOD)), Line(PHIL, plan.GOOD),
                        f"success {condition}").high < 0.0
                   for scenario, condition in PAPER_SCENES)  # fmt: skip
         return (found[row].own < found[row].phil).sum() >= ENOUGH and not any(behind)
 
     better = {row: found[row].own.quantile(interpolation="higher")
-              for row in filter(takes_its_place, RIVALS)}  # fmt: skip
+              for row in filter(takes_its_place, plan.RIVALS)}  # fmt: skip
     return Line(min(better, key=better.__getitem__, default=PHIL)).name
 
 
@@ -318,19 +273,19 @@ def late(records: Records) -> list[str]:
     """Return which rows get there in good time in every seed of none of our scenes."""
 
     def in_time(task: str, line: Line) -> bool:
-        return records.of(task, line)[f"episodes_to_{LEARNED:.0%}"].max() <= MOST_EPISODES
+        return records.of(task, line)[f"episodes_to_{data.LEARNED:.0%}"].max() <= MOST_EPISODES
 
-    return [line.name for line in BESIDE if not any(in_time(task, line) for task in SCENARIOS)]
+    return [line.name for line in BESIDE if not any(in_time(task, line) for task in plan.SCENARIOS)]
 
 
 def forgives(records: Records) -> tuple[list[str], list[str]]:
     """Return which rows succeed beside each human in the left turn, and which beside some not."""
     good, less = list[str](), list[str]()
-    for row in HELPED:
-        found = {human: records.of("left_turn", Line(row, human)) for human in HUMANS}
+    for row in plan.HELPED:
+        found = {human: records.of("left_turn", Line(row, human)) for human in plan.HUMANS}
         shares = {human: 100.0 * its["success nominal"].mean() for human, its in found.items()}
         low = [f"{plan.words(human)} {share:.1f}" for human, share in shares.items()
-               if share < 100.0 * LEARNED]  # fmt: skip
+               if share < 100.0 * data.LEARNED]  # fmt: skip
         if low:
             less.append(f"{Line(row).name} ({', '.join(low)})")
         elif any(map(len, found.values())):
@@ -344,7 +299,7 @@ def outcomes(records: Records) -> Mapping[str, Cell]:
     def less_the_humans(rows: pd.DataFrame) -> str:
         trained = rows.algorithm.iloc[0] in ALGORITHMS
         human = OWN.get(rows.setting.iloc[0]) if trained else None
-        return over(records, rows, human or Line("expert", GOOD), "reward nominal").text(2)
+        return over(records, rows, human or Line("expert", plan.GOOD), "reward nominal").text(2)
 
     return {
         **{f"{condition}, %": share(condition) for condition in CONDITIONS},
@@ -356,43 +311,35 @@ def outcomes(records: Records) -> Mapping[str, Cell]:
 # Figures
 
 Draw = Callable[[Records], Figure]
-COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", "human_model": "C1"}
-OTHERS = ("C4", "C5", "C6", "C8", "C9", "black", "C1")
-"""For algorithms without a colour of their own, by their place in the figure."""
-MARKERS = {NORMAL: "o", "one_frame": "D", "random": "^", "biased": "v"}
+LOOKS: Mapping[str, Any] = plan.DATA["looks"]
 CURVES = ((REWARD, TRAINING), (DISTANCE, TRAINING), (SUCCESS, ALONE), (DISTANCE, ALONE))
-TIME_S, LATERAL, LONGITUDINAL = ARRIVED_ONLY
-TITLES = {
-    REWARD: "reward",
-    DISTANCE: "surviving distance, m",
-    SUCCESS: "success",
-    TIME_S: "time to the goal, s",
-    LATERAL: "mean |lateral acceleration|, m/s²",
-    LONGITUDINAL: "mean |longitudinal acceleration|, m/s²",
-}
+TIME_S, LATERAL, LONGITUDINAL = data.ARRIVED_ONLY
 
 
 def _look(line: Line, place: int) -> dict[str, Any]:
-    return {"color": COLOURS.get(line.algorithm, OTHERS[place % len(OTHERS)]), "label": line.name}
+    others = LOOKS["other_colours"]
+    colour = LOOKS["colours"].get(line.algorithm, others[place % len(others)])
+    return {"color": colour, "label": line.name}
 
 
 def draw_curves(name: str, records: Records) -> Figure:
     """Draw a row a scenario: training episodes with the human's help, then the policy alone."""
     figure = Figure(figsize=(16.0, 6.8), layout="constrained")
     panels = figure.subplots(2, len(CURVES), sharex="row").flat
-    for panel, (scenario, (metric, kind)) in zip(panels, product(SCENARIOS, CURVES), strict=True):
-        panel.set_title(f"{words(scenario)}: {TITLES[metric]}, {kind}", fontsize=10)
-        for place, line in enumerate(EXPERIMENTS[name].lines):
+    curves_of = product(plan.SCENARIOS, CURVES)
+    for panel, (scenario, (metric, kind)) in zip(panels, curves_of, strict=True):
+        panel.set_title(f"{plan.words(scenario)}: {LOOKS['titles'][metric]}, {kind}", fontsize=10)
+        for place, line in enumerate(plan.EXPERIMENTS[name].lines):
             curves = records.curves(scenario, line, f"{metric} {kind}")
             # The printed reward is on another scale.
             if len(curves) and (metric, line.setting) != (REWARD, "printed"):
-                style = "-" if line.setting == NORMAL else "--"
+                style = "-" if line.setting == plan.NORMAL else "--"
                 x, look = records.grid(scenario), _look(line, place)
                 mean, std = curves.mean(axis=0), curves.std(axis=0, ddof=min(len(curves) - 1, 1))
                 panel.plot(x, mean, style, lw=1.8, **look)
                 panel.fill_between(x, mean - std, mean + std, color=look["color"], alpha=0.15, lw=0)
         if metric != REWARD:
-            best = 1.0 if metric == SUCCESS else FULL_PATH_M[scenario]
+            best = 1.0 if metric == SUCCESS else plan.FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")
             panel.set_ylim(top=1.05 * best)
         panel.grid(alpha=0.3)
@@ -411,19 +358,19 @@ def draw_points(name: str, quantities: list[tuple[str, str]], records: Records) 
 
     ``quantities``: for each row of panels one in the left turn, one in the congestion.
     """
-    lines, names = EXPERIMENTS[name].lines, list(CONDITIONS)
+    lines, names = plan.EXPERIMENTS[name].lines, list(CONDITIONS)
     figure = Figure(figsize=(15.0, 1.8 + 2.8 * len(quantities)), layout="constrained")
-    panels = figure.subplots(len(quantities), len(SCENARIOS), squeeze=False).flat
+    panels = figure.subplots(len(quantities), len(plan.SCENARIOS), squeeze=False).flat
     for panel, (scenario, quantity) in zip(
-        panels, ((s, q) for row in quantities for s, q in zip(SCENARIOS, row, strict=True)),
+        panels, ((s, q) for row in quantities for s, q in zip(plan.SCENARIOS, row, strict=True)),
         strict=True,
     ):  # fmt: skip
-        panel.set_title(f"{words(scenario)}: {TITLES[quantity]}", fontsize=10)
+        panel.set_title(f"{plan.words(scenario)}: {LOOKS['titles'][quantity]}", fontsize=10)
         for place, line in enumerate(lines):
             found = records.of(scenario, line)
             found = found.reindex(columns=[f"{quantity} {condition}" for condition in names])
             x = np.arange(len(names)) + 0.8 * (place + 0.5) / len(lines) - 0.4
-            marker = MARKERS[line.setting]
+            marker = LOOKS["markers"][line.setting]
             look = {"marker": marker, "ms": 5, "ls": "none", "capsize": 2, **_look(line, place)}
             panel.errorbar(x, found.mean(), found.std(), **look)
         panel.set_xticks(range(len(names)), names)
@@ -435,9 +382,9 @@ def draw_points(name: str, quantities: list[tuple[str, str]], records: Records) 
 
 def draw_guidance(records: Records) -> Figure:
     """Draw a panel a task, a dot a seed: the human's seconds until a row learned, its success."""
-    figure = Figure(figsize=(3.3 * len(TASKS) + 1.5, 7.0), layout="constrained")
-    panels = figure.subplots(2, len(TASKS), sharey=True)
-    heights = dict(zip(ROWS, -np.arange(len(ROWS)), strict=True))
+    figure = Figure(figsize=(3.3 * len(plan.TASKS) + 1.5, 7.0), layout="constrained")
+    panels = figure.subplots(2, len(plan.TASKS), sharey=True)
+    heights = dict(zip(plan.ROWS, -np.arange(len(plan.ROWS)), strict=True))
 
     def dots(panel: Axes, row: str, values: Any, middle: float) -> None:
         height, colour = heights[row], "C3" if row == "phil_td3" else "C0"
@@ -445,28 +392,28 @@ def draw_guidance(records: Records) -> Figure:
         panel.plot(values, places, "o", ms=4, alpha=0.55, mew=0, color=colour)
         panel.plot([middle] * 2, [height - 0.35, height + 0.35], lw=2, color=colour)
 
-    for (above, below), task in zip(panels.T, TASKS, strict=True):
-        found = {row: records.of(task, Line(row, GOOD)) for row in ROWS}
-        learned = {row: found[row][f"human_s_to_{LEARNED:.0%}"] for row in HELPED}
-        finite = [s for row in HELPED for s in learned[row] if s < np.inf]
+    for (above, below), task in zip(panels.T, plan.TASKS, strict=True):
+        found = {row: records.of(task, Line(row, plan.GOOD)) for row in plan.ROWS}
+        learned = {row: found[row][f"human_s_to_{data.LEARNED:.0%}"] for row in plan.HELPED}
+        finite = [s for row in plan.HELPED for s in learned[row] if s < np.inf]
         most = max(finite, default=1.0)
         never = 1.15 * most
-        for row in ROWS:
+        for row in plan.ROWS:
             success = 100.0 * found[row]["success nominal"]
             dots(below, row, success, success.mean())
-            if row in HELPED:
+            if row in plan.HELPED:
                 cut = learned[row].clip(upper=never)
                 dots(above, row, cut, cut.quantile(interpolation="higher"))
         above.axvline(1.08 * most, color="0.6", lw=0.8, ls=":")
         above.text(never, 0.8, "never", ha="center", fontsize=8)
-        above.set(title=words(task), xlim=(0.0, 1.25 * most))
-        above.set_xlabel(f"seconds of the human until {LEARNED:.0%} alone", fontsize=9)
+        above.set(title=plan.words(task), xlim=(0.0, 1.25 * most))
+        above.set_xlabel(f"seconds of the human until {data.LEARNED:.0%} alone", fontsize=9)
         below.set(xlim=(-4.0, 104.0))
         below.set_xlabel("success, nominal tests, %", fontsize=9)
     for panel in panels.flat:
         panel.grid(alpha=0.3)
-        panel.set_yticks(list(heights.values()), [Line(row).name for row in ROWS], fontsize=8)
-        panel.set_ylim(heights[ROWS[-1]] - 0.6, 1.6)
+        panel.set_yticks(list(heights.values()), [Line(row).name for row in plan.ROWS], fontsize=8)
+        panel.set_ylim(heights[plan.ROWS[-1]] - 0.6, 1.6)
     return figure
 
 

@@ -156,25 +156,16 @@ class LeftTurnHuman(Expert):
         self.going = False
         self.standing_steps = self.open_steps = 0
 
-    def would_go(self) -> bool:
-        """Whether a driver who stands here would start now."""
-        return self.crossing.clear(self.HORIZON_S, self.START_MARGIN_M, self.GO)
-
     def act(self, observation: Observation | None = None) -> NDArray[np.float32]:
         """Return the expert's pedal, float32 [1], from the true state, not the picture."""
-        if self._beyond_return():
-            self.going = True
+        stopping_m = self.env.ego.speed**2 / (2.0 * self.env.config.brake_mps2)
+        if self.env.distance_m + stopping_m > self.POINT_OF_NO_RETURN_M:
+            self.going = True  # Even full brake would leave the nose in the lane.
         else:
             margin_m = self.KEEP_MARGIN_M if self.going else self.START_MARGIN_M
             self.going = self.crossing.clear(self.HORIZON_S, margin_m, self.GO)
         go = min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
         return np.array([go if self.going else self._wait()], dtype=np.float32)
-
-    def _beyond_return(self) -> bool:
-        """Whether even full brake would leave the nose in the lane."""
-        env = self.env
-        stopping_m = env.ego.speed**2 / (2.0 * env.config.brake_mps2)
-        return env.distance_m + stopping_m > self.POINT_OF_NO_RETURN_M
 
     def _wait(self) -> float:
         """Slow down with the distance to the line, and stand there."""
@@ -190,7 +181,8 @@ class LeftTurnHuman(Expert):
         standing = self.env.ego.speed < self.STANDING_MPS
         self.standing_steps = self.standing_steps + 1 if standing else 0
         waiting = self.standing_steps > self.STANDING_STEPS
-        self.open_steps = self.open_steps + 1 if waiting and self.would_go() else 0
+        is_open = waiting and self.crossing.clear(self.HORIZON_S, self.START_MARGIN_M, self.GO)
+        self.open_steps = self.open_steps + 1 if is_open else 0
         if not self._leaves_a_way_out(pedal):
             return "collision"
         if self._stops_in_the_lane(pedal):

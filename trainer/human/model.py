@@ -54,15 +54,12 @@ class HumanModel(Driver):
 
     @property
     def demonstrations(self) -> int:
-        """Number of the human's steps that it has seen."""
         return len(self._actions)
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
-        """Predict the human's action, float32 [action size]."""
         return self.actor.act(observation[None])[0]
 
     def add(self, observation: NDArray[Any], action: NDArray[np.float32]) -> None:
-        """Add one step of the human's to the data."""
         seen = observation[-self.config.frames :] if self._pictures else observation
         self._observations.append(seen.copy())
         self._actions.append(np.asarray(action, dtype=np.float32))

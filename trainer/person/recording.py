@@ -65,17 +65,13 @@ class RecordedStep(msgspec.Struct, frozen=True):
     def next_observation(self) -> NDArray[Any]:
         return _unpacked(self.seen_next)
 
-    @property
-    def foreseen(self) -> tuple[NDArray[Any], ...]:
-        """``Transition.foreseen``: the observation, and those of ``ahead``."""
-        return tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
-
     def transition(self, penalised: bool = False) -> Transition:
         """Return what was stored of the step; a learner's penalty is not recorded."""
         overruled = None if self.policy_action is None else vector(self.policy_action)
+        foreseen = tuple(map(_unpacked, (self.seen, *self.ahead))) if self.ahead else ()
         return Transition(
             self.observation, vector(self.action), self.reward, self.next_observation,
-            self.terminated, self.truncated, self.human, overruled, penalised, self.foreseen,
+            self.terminated, self.truncated, self.human, overruled, penalised, foreseen,
         )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import argparse
 import copy
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import cache
@@ -30,40 +30,41 @@ from trainer.person.session import PacedEnvironment, Sitting
 from trainer.training.config import DEFAULTS, RunConfig
 from trainer.training.learning import NICENESS, LearningThread, UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics, read_metrics
-from trainer.training.run import Parts, Score, TrainingRun, Trials, Validation, behind_network
+from trainer.training.run import Score, TrainingRun, Trials, Validation
 from trainer.util import begin_process
 
 SCRIPTED = (
-    "guided_share", "guided_until_episode", "poor_guidance_share",
-    "late_to_s", "missed_share",
+    "guided_share", "guided_until_episode", "poor_guidance_share", "late_to_s", "missed_share",
 )  # fmt: skip
 """Settings of a scripted human."""
 
 
 @contextmanager
 def training_with_person(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any
-) -> Iterator[tuple[TrainingRun, Sitting]]:
-    """Open a run with a person as its guide; a resumed one stores what was recorded since."""
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path, env: Any, resume: bool
+) -> Iterator[tuple[TrainingRun, Callable[[], bool]]]:
+    """Open a run with a person as its guide; yield it, and what ends the sitting.
+
+    A resumed one stores what was recorded since.
+    """
     check_settings(config)
     with ExitStack() as stack:
-        person = stack.enter_context(closing(web.open_cockpit(arguments)))
+        person = stack.enter_context(closing(web.open_cockpit(arguments, env)))
         make_directory(run_dir)
-        delayed = behind_network(config, env)
-        sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), speed=arguments.speed)
+        sitting = Sitting(person, env, Recorder(run_dir / DIRECTORY), arguments.speed)
         stack.enter_context(closing(sitting))
         learning = UnhurriedLearning(config, env)
         validation = PersonValidation(config, run_dir, learning, sitting)
         stack.enter_context(closing(validation))
-        vehicle = PacedEnvironment(delayed or env, sitting)
-        parts = Parts(env, delayed, vehicle, sitting, learning, validation, [sitting.record])
-        training = TrainingRun(config, run_dir, arguments.resume, parts)
-        if arguments.resume:
+        training = TrainingRun(config, run_dir, resume, env, sitting, learning, validation)
+        training.vehicle = PacedEnvironment(training.vehicle, sitting)
+        training.recorders.append(sitting.record)
+        if resume:
             _recover(training, sitting)
         else:
             training.save()  # So that a run killed in its first episode can be resumed.
         sitting.episode = training.episode
-        yield training, sitting
+        yield training, sitting.quit
         print(sitting.summary(), file=sys.stderr)
 
 
@@ -105,19 +106,17 @@ class PersonValidation(Validation):
     ) -> None:
         super().__init__(config, run_dir, learning, sitting.env)
         self.sitting, self._alone = sitting, ""  # Success of the policy alone, in words
-        self._process = ProcessPoolExecutor(1, get_context("spawn"), _start_validating)
+        self._process = ProcessPoolExecutor(1, get_context("spawn"), begin_process, (NICENESS,))
         self._begun: tuple[Actor, int, Future[list[EpisodeResult]]] | None = None
         """What is being validated, after how many episodes, and its drives to come."""
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
         """Tell the person what was learned, and validate; a person does not wait for it."""
-        added, warmup = self.learning.added, self.config.learner.warmup_steps
-        learned = f"not learning yet ({added} of {warmup} steps)"
-        if not math.isnan(metrics.critic_loss):
-            learned = f"critic loss {metrics.critic_loss:.3f}"
         if not at_end:
             self._beside(metrics, episode, due)
-            self.sitting.progress = f"{learned}, return {metrics.episode_return:.1f}{self._alone}"
+            added, warmup = self.learning.replay.added, self.config.learner.warmup_steps
+            learned = "" if metrics.updates else f"not learning yet ({added} of {warmup} steps), "
+            self.sitting.progress = f"{learned}return {metrics.episode_return:.1f}{self._alone}"
             return
         every = self.config.evaluate_every_steps
         try:
@@ -132,13 +131,9 @@ class PersonValidation(Validation):
                 print("validation left out", file=sys.stderr)
 
     def close(self) -> None:
-        """Kill the process: a person does not wait for it."""
-        self.kill()
-        self._process.shutdown(cancel_futures=True)
-
-    def kill(self) -> None:
         for process in list((self._process._processes or {}).values()):
-            process.kill()
+            process.kill()  # A person does not wait for it.
+        self._process.shutdown(cancel_futures=True)
 
     def _beside(self, metrics: EpisodeMetrics, episode: int, due: bool) -> None:
         """Take the validation that is done, into this episode's row, and begin one that is due."""
@@ -173,11 +168,6 @@ def _without_script() -> Iterator[None]:
         sys.modules["__main__"] = script
 
 
-def _start_validating() -> None:
-    begin_process(NICENESS)
-    torch.set_num_threads(1)
-
-
 _trials = cache(Trials)  # Of the one config
 
 
@@ -185,6 +175,7 @@ def _validate(
     config: RunConfig, weights: dict[str, NDArray[Any]], best: Score
 ) -> list[EpisodeResult]:
     """Drive the validation of an actor, in a process beside the person."""
+    torch.set_num_threads(1)
     trials = _trials(config)
     env = trials.envs[0]
     actor = Actor(env.action_space.shape[0], config.learner.frames, env.observation_space)

@@ -7,38 +7,29 @@ import argparse
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bridge.fork import ForkedEnvironment, find_fork
 from bridge.outcomes import DISCARDED, FAILED, GOAL, RESTARTED, STOPPED, TRUNCATED, UNKNOWN, UNTOLD
+from bridge.report import EpisodeResult
 from edge_runtime.cli import quit_on_signals
 from edge_runtime.files import check_writable
 from edge_runtime.util import UserError
 from trainer.environments import Adapted, make_environment, scenario_of
-from trainer.evaluation import load_driver, located, trained_in
+from trainer.evaluation import drive_episodes, load_driver, located, trained_in
 from trainer.human.guide import BY_PERSON, Driver, Guide, GuideGone, Intervention
 from trainer.learner.replay import Action, Observation, Transition
-from trainer.person import (
-    Amount,
-    Control,
-    Intent,
-    Reading,
-    TakeOver,
-    View,
-    amount,
-    vector,
-    web,
-)
+from trainer.person import Amount, Control, Intent, Reading, TakeOver, View, amount, vector, web
 from trainer.person.recording import RecordedStep, Recorder, packed
 from trainer.scenarios import SCENARIOS
 from trainer.util import Purpose, episode_seed, set_threads
 
-JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 REST_S = 1.0  # Between two episodes: time to see how it ended, and to take the hands to rest
+JUDGE_S = 3.0  # The same, where the person may say whether it succeeded
 
 
 class Pacer:
@@ -66,19 +57,12 @@ class Pacer:
 class Sitting(Guide):
     """A person as a guide: waits for each control period, asks the hands, and shows what is.
 
-    ``env`` is the environment itself, ``recorder`` where the sitting is kept. ``alone``: nobody but
-    the person drives; ``speed``: simulated seconds in one of the person's.
+    ``env`` is the environment itself, ``recorder`` where the sitting is kept, ``speed`` simulated
+    seconds in one of the person's.
     """
 
-    def __init__(
-        self,
-        person: web.Cockpit,
-        env: Any,
-        recorder: Recorder,
-        alone: bool = False,
-        speed: float = 1.0,
-    ) -> None:
-        self.person, self.env, self.recorder, self.alone = person, env, recorder, alone
+    def __init__(self, person: web.Cockpit, env: Any, recorder: Recorder, speed: float) -> None:
+        self.person, self.env, self.recorder = person, env, recorder
         self.pacer = Pacer(env.control_period_s / speed)
         self.stop = self.closed = False
         self.episode = 0  # The number of the episode, or of the next one
@@ -100,7 +84,7 @@ class Sitting(Guide):
         self._policy_action: Amount | None = None
         self._intervention: Intervention | None = None
         self.applied: Amount = self._rest
-        self._control: Control = "human" if self.alone else "policy"
+        self._control: Control = "policy"
         self._restart = self._discard = False
         self._judged = ""  # The person's word on how the episode ended
 
@@ -151,9 +135,7 @@ class Sitting(Guide):
         self._step += 1
         return (STOPPED if self.stop else RESTARTED) if self._to_end else ""
 
-    def record(
-        self, transition: Transition, intervention: Intervention | None, info: dict[str, Any]
-    ) -> None:
+    def record(self, transition: Transition, _: Any, info: dict[str, Any]) -> None:
         """Keep a control period: the transition, and what the person did."""
         self.recorder.add(
             RecordedStep(
@@ -164,8 +146,8 @@ class Sitting(Guide):
                 seen=packed(transition.observation),
                 seen_next=packed(transition.next_observation),
                 action=self.applied,
-                human=transition.human,
-                first=intervention is not None and intervention.first,
+                human=self._intervention is not None,
+                first=self._intervention is not None and self._intervention.first,
                 reward=float(transition.reward),
                 terminated=transition.terminal,
                 truncated=transition.truncated,
@@ -214,7 +196,6 @@ class Sitting(Guide):
         self.person.show(view)
 
     def summary(self) -> str:
-        """Return a line that sums up the sitting."""
         if not self.recorder.index:
             return "nothing was driven, and nothing recorded"
         listed = ", ".join(f"{count} {word}" for word, count in self.outcomes.items())
@@ -283,6 +264,7 @@ class PacedEnvironment:
 
     def __init__(self, env: Any, sitting: Sitting) -> None:
         self.env, self.sitting = env, sitting
+        self.control_period_s: float = env.control_period_s
 
     def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed)
@@ -297,18 +279,33 @@ class PacedEnvironment:
         return observation, reward, terminated, truncated, info
 
 
+class SharedWheel(Driver):
+    """Drives as a policy, or nobody, does with the person beside it."""
+
+    def __init__(self, sitting: Sitting, policy: Driver | None) -> None:
+        self.sitting, self.policy = sitting, policy
+
+    def reset(self) -> None:
+        if self.policy is not None:
+            self.policy.reset()
+
+    def act(self, observation: Observation) -> Action:
+        action = None if self.policy is None else self.policy.act(observation)
+        self.sitting.watch(observation, action)
+        return vector(self.sitting.applied)
+
+
 def run(arguments: argparse.Namespace) -> int:
     set_threads(arguments.threads)
     arguments.policy = arguments.policy and located(arguments.policy)
     env, seed_of = _environment(arguments)
-    arguments.scenario = env.scenario  # By it the cockpit knows its keys.
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
     out = Path(arguments.out)
     check_writable(out / "sitting")  # Before a browser opens.
-    with closing(env), closing(web.open_cockpit(arguments)) as person:
-        sitting = Sitting(person, env, Recorder(out), alone=policy is None, speed=arguments.speed)
+    with closing(env), closing(web.open_cockpit(arguments, env)) as person:
+        sitting = Sitting(person, env, Recorder(out), arguments.speed)
         with closing(sitting), quit_on_signals(sitting.quit):
             drive(sitting, policy, seed_of, arguments.episodes)
     print(sitting.summary())
@@ -326,28 +323,17 @@ def drive(
     The policy drives until the person takes over; without one, the person drives alone.
     ``seed_of``: an episode's number over all sittings -> its seed.
     """
-    vehicle = PacedEnvironment(sitting.env, sitting)
-    number = sitting.recorder.sitting
-    while not sitting.stop and sitting.episode != episodes:
-        try:
-            observation, info = vehicle.reset(seed=seed_of((number << 32) + sitting.episode))
-        except GuideGone:
-            break
-        if policy is not None:
-            policy.reset()
-        ended = False
-        while not ended:
-            policy_action = None if policy is None else policy.act(observation)
-            intervention = sitting.watch(observation, policy_action)
-            action = vector(sitting.applied)
-            seen, reward, terminated, truncated, info = vehicle.step(action)
-            step = Transition(
-                observation, action, reward, seen, terminated, truncated,
-                intervention is not None, policy_action,
-            )  # fmt: skip
-            observation, ended = seen, terminated or truncated
-            sitting.record(step, intervention, info)
-        sitting.end_episode(info["outcome"])
+
+    def seeds() -> Iterator[int]:
+        while not sitting.stop and sitting.episode != episodes:
+            yield seed_of((sitting.recorder.sitting << 32) + sitting.episode)
+
+    def ended(result: EpisodeResult) -> None:
+        sitting.end_episode(result.outcome)
+
+    with suppress(GuideGone):
+        vehicle, driver = PacedEnvironment(sitting.env, sitting), SharedWheel(sitting, policy)
+        drive_episodes(vehicle, driver, seeds(), on_episode=ended, recorders=[sitting.record])
 
 
 def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
@@ -357,10 +343,7 @@ def _environment(asked: argparse.Namespace) -> tuple[Any, Callable[[int], int]]:
             raise UserError("--at, --episode and --vehicle-id need a recording: --from F.mcap")
         seed_of = partial(episode_seed, asked.seed, Purpose.SITTINGS)
         period_s = asked.policy and trained_in(asked.policy, asked.public_key)[1]
-        scenario = asked.scenario or "left_turn"
-        # Now: of some simulators only one may live, and this closes its own.
-        web.controls_of(scenario)
-        return make_environment(scenario, period_s=period_s), seed_of
+        return make_environment(asked.scenario or "left_turn", period_s=period_s), seed_of
     recorded, step = find_fork(asked.recording, asked)
     own = recorded.environment(asked.scenario, "--scenario")
     name = scenario_of(asked.scenario or recorded.origin.environment)

@@ -17,7 +17,6 @@ import time
 import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -30,7 +29,6 @@ from PIL import Image
 from bridge.messages import plain
 from bridge.rerun import BY_NAME, has_display, shades
 from edge_runtime.util import UserError
-from trainer.environments import make_environment
 from trainer.person import Amount, Input, Reading, Seat, View, amount
 
 PAGE = Path(__file__).parent / "page"
@@ -57,8 +55,6 @@ _ENCODER = msgspec.json.Encoder(enc_hook=plain)
 
 @dataclass(frozen=True)
 class Controls:
-    """The keys of one environment."""
-
     keys: Mapping[str, Amount]
     """Key, in small letters as ``up`` or ``w`` -> what pressing it fully adds to ``rest``."""
     rest: Amount  # Hands off
@@ -66,29 +62,25 @@ class Controls:
     names: tuple[str, ...]  # Of the actions
 
 
-@cache
-def controls_of(scenario: str) -> Controls:
+def controls_of(env: Any) -> Controls:
     """Return the controls of an environment; UserError where a person cannot drive it."""
-    with contextlib.closing(make_environment(scenario)) as env:
-        if not getattr(env, "can_be_seen", True):
-            raise UserError(f"a person cannot see {scenario}: it has no render() and no scene()")
-        if not env.keys:
-            raise UserError(f"a person cannot drive {scenario}: several actions, and no keys")
-        keys = {
-            name.lower().removeprefix("arrow").removeprefix("key"): amount(held - env.rest_action)
-            for name, held in env.keys.items()
-        }
-        rest, names = amount(env.rest_action), tuple(env.action_names)
-        controls = Controls(keys, rest, env.key_rate_per_s, names)
-    if taken := sorted(RESERVED & keys.keys()):
-        raise UserError(f"{scenario} is driven with {', '.join(taken)}, which are the cockpit's")
-    return controls
+    if not getattr(env, "can_be_seen", True):
+        raise UserError(f"a person cannot see {env.scenario}: it has no render() and no scene()")
+    if not env.keys:
+        raise UserError(f"a person cannot drive {env.scenario}: several actions, and no keys")
+    keys = {
+        name.lower().removeprefix("arrow").removeprefix("key"): amount(held - env.rest_action)
+        for name, held in env.keys.items()
+    }
+    if taken := ", ".join(sorted(RESERVED & keys.keys())):
+        raise UserError(f"{env.scenario} is driven with {taken}, which are the cockpit's")
+    return Controls(keys, amount(env.rest_action), env.key_rate_per_s, tuple(env.action_names))
 
 
-def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
+def open_cockpit(arguments: argparse.Namespace, env: Any) -> Cockpit:
     """Serve the cockpit, print its address, and open it where there is a display."""
     host = arguments.host
-    cockpit = Cockpit(host, arguments.port, arguments.scenario)
+    cockpit = Cockpit(env, host, arguments.port)
     if host not in LOOPBACK:
         danger = "whoever reads this network's traffic can take the wheel; ssh -L is safer"
         print(f"warning: --host {host}: {danger}", file=sys.stderr)
@@ -101,8 +93,6 @@ def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
 
 @dataclass(eq=False)
 class Page:
-    """One open page."""
-
     socket: web.WebSocketResponse
     sent: int = 0  # Number of the newest view sent
     seen: int = 0  # Number of the newest view that it has drawn
@@ -117,8 +107,8 @@ class Cockpit:
     the server's thread. Raises UserError where the address cannot be listened on.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
-        self.controls = controls_of(scenario)
+    def __init__(self, env: Any, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.controls = controls_of(env)
         self.seat = Seat(self.controls.rest)
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
@@ -129,7 +119,6 @@ class Cockpit:
         self._origin = f"http://{shown}:{self.port}"
         self.url = f"{self._origin}/{self._token}/"
         self._pages: list[Page] = []
-        self._shown = 0
         self._newest = (0, "")  # The newest view's number and message; pages get it when they can
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
@@ -151,8 +140,7 @@ class Cockpit:
         return self.seat.poll(now_s)
 
     def show(self, view: View) -> None:
-        self._shown += 1
-        self._tell(self._take_view, self._shown, view)
+        self._tell(self._take_view, view)
 
     def close(self) -> None:
         """Tell the pages that it is over, and end the thread; a second call does nothing."""
@@ -186,8 +174,9 @@ class Cockpit:
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
 
-    def _take_view(self, number: int, view: View) -> None:
-        self._newest = (number, encode_view(view, number))
+    def _take_view(self, view: View) -> None:
+        number = self._newest[0] + 1
+        self._newest = (number, encode_view(view, number, self.controls))
         for page in self._pages:
             page.wake.set()
 
@@ -296,13 +285,13 @@ def _encode(kind: str, **fields: Any) -> str:
     return _ENCODER.encode({"kind": kind, **fields}).decode()
 
 
-def encode_view(view: View, number: int) -> str:
+def encode_view(view: View, number: int, controls: Controls) -> str:
     """Encode view ``number``, from 1.
 
     ``frames`` become base64 of [2, 45, 80] bytes, ``picture`` of a JPEG.
     """
     frames = None if view.frames is None else view.frames.tobytes()
-    fields = vars(view) | {"frames": frames, "controls": controls_of(view.scenario)}
+    fields = vars(view) | {"frames": frames, "controls": controls}
     if view.picture is not None:
         jpeg = io.BytesIO()
         Image.fromarray(view.picture).save(jpeg, "JPEG")

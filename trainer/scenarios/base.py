@@ -24,8 +24,8 @@ from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 from trainer.learner.replay import FRAMES_LAYOUT, Action, Observation
-from trainer.scenarios import Scene
-from trainer.scenarios.picture import BODY, COLUMNS, ROWS, Rasteriser, Rectangle, draw_scene
+from trainer.scenarios import Scene, picture
+from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle, overlap
 
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 Range = tuple[float, float]
@@ -140,9 +140,7 @@ MIXED: Mix = ((CAR, 0.4), (VAN, 0.2), (TRUCK, 0.2), (MOTORCYCLE, 0.2))
 
 
 def draw_types(mix: Mix, count: int, random: np.random.Generator) -> list[VehicleType]:
-    """Draw the types of ``count`` vehicles; a mix of one type draws nothing."""
-    if len(mix) == 1:
-        return [mix[0][0]] * count
+    """Draw the types of ``count`` vehicles."""
     chosen = random.choice(len(mix), size=count, p=[share for _, share in mix])
     return [mix[number][0] for number in chosen]
 
@@ -305,7 +303,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def render(self) -> NDArray[np.uint8]:
         """Draw the scene from above for a person, uint8 [height, width, 3]."""
-        return draw_scene(self.scene())
+        return picture.draw_scene(self.scene())
 
     def scene(self) -> dict[str, Any]:
         """Describe the scene for viewers, in plain lists and numbers."""
@@ -339,15 +337,14 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """Draw the policy's picture, uint8 [45, 80], from the footprints of ego car and traffic."""
         return self.rasteriser.frame(cars, ego)
 
-    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
-        """Return how the episode has ended, or None, from the same footprints."""
+    def _outcome(self, ego: Rectangle) -> str | None:
+        """Return "goal" or "off_road" where the ego car, of this footprint, is there."""
         raise NotImplementedError
 
     def _reward(self, outcome: str | None) -> float:
         raise NotImplementedError
 
     def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
-        """Move all vehicles by one step, the ego car as told."""
         for car in self.traffic:
             car.act()
         for car in self.traffic:
@@ -357,11 +354,12 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         self.steps += 1
 
     def _report(self) -> Step:
-        """Return the result of ``step``, after the vehicles have moved."""
         ego, cars = self._footprints()
         self.frames[0] = self.frames[1]
         self.frames[1] = self._frame(ego, cars)
-        outcome = self._outcome(ego, cars)
+        outcome = "collision" if any(overlap(ego, car) for car in cars) else self._outcome(ego)
+        if outcome is None and self.steps >= self.config.max_steps:
+            outcome = "timeout"
         terminated = outcome == "goal" or outcome in FAILURES
         info = self._info(outcome)
         return self.frames.copy(), self._reward(outcome), terminated, outcome == "timeout", info
@@ -379,7 +377,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """Describe the scene's vehicles, the ego car first."""
         cars: list[EgoVehicle | TrafficVehicle] = [self.ego, *self.traffic]
         return [
-            dict(zip(BODY, footprint(car), strict=True))
+            dict(zip(picture.BODY, footprint(car), strict=True))
             | {"id": number, "speed_mps": float(car.speed), "ego": number == 0}
             for number, car in enumerate(cars)
         ]

@@ -11,13 +11,11 @@ from highway_env.road.road import Road
 from numpy.typing import NDArray
 
 from trainer.scenarios import Scene, base
-from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
+from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle
 
 
 @dataclass(frozen=True)
 class CongestionConfig(base.ScenarioConfig):
-    """Numbers of the scenario, each with its reason."""
-
     scaled = "steer_weight"
     max_steps: int = 300  # At 4 m/s the goal takes 200
     lane_width_m: float = 3.5
@@ -88,7 +86,6 @@ REACH_M = 200.0  # How far the road goes on before start and goal
 def spawn_traffic(
     road: Road, ego: base.EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[base.TrafficVehicle]:
-    """Surround the ego car with cars ahead, beside and behind."""
     jam_mps = float(random.uniform(*config.jam_speed_mps))
     cars: list[base.TrafficVehicle] = []
     for lane in range(LANES):
@@ -186,7 +183,6 @@ class CongestionEnv(base.DrivingEnv):
         self._braking = pressed
 
     def step(self, action: base.Action) -> base.Step:
-        """Hold the steering angle for one control interval."""
         c = self.config
         self._last_steering = self._steering
         self._steering = min(max(float(action[0]), -1.0), 1.0)
@@ -248,17 +244,13 @@ class CongestionEnv(base.DrivingEnv):
         cars = [shape._replace(x=shape.x - ego.x) for shape in cars]
         return self.rasteriser.frame(cars, ego._replace(x=0.0))
 
-    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
-        if any(overlap(ego, car) for car in cars):
-            return "collision"
+    def _outcome(self, ego: Rectangle) -> str | None:
         reach_m = 0.5 * (
             ego.length * abs(math.sin(ego.heading)) + ego.width * abs(math.cos(ego.heading))
         )
         if abs(ego.y) + reach_m > 0.5 * self.road_width_m:
             return "off_road"
-        if self.distance_m >= self.config.goal_m:
-            return "goal"
-        return "timeout" if self.steps >= self.config.max_steps else None
+        return "goal" if self.distance_m >= self.config.goal_m else None
 
     def _reward(self, outcome: str | None) -> float:
         """Rate goal, failure, and the change of the steering (eq. 32)."""

@@ -10,7 +10,7 @@ from highway_env.road.road import LaneIndex
 from highway_env.utils import wrap_to_pi
 
 from trainer.scenarios import Scene, base
-from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
+from trainer.scenarios.picture import Rasteriser, Rectangle
 
 LANE_REACH_M = 100.0  # How far the main road goes on to either side
 SIDE_ROAD_M = 40.0
@@ -46,7 +46,6 @@ class LeftTurnPath:
         self.centre_y = self.start_y - straight_m
 
     def pose(self, s_m: float) -> Pose:
-        """Return the pose at arc length ``s_m``."""
         on_arc_m = s_m - self.straight_m
         if on_arc_m <= 0.0:
             return Pose(self.start_x, self.start_y - s_m, -0.5 * math.pi)
@@ -76,8 +75,6 @@ class LeftTurnPath:
 
 @dataclass(frozen=True)
 class LeftTurnConfig(base.ScenarioConfig):
-    """Numbers of the scenario, each with its reason where there is one."""
-
     scaled = "speed_weight"
     lane_width_m: float = 4.0
     straight_m: float = 10.0  # Path on the side road before the turn
@@ -174,7 +171,6 @@ class LeftTurnEnv(base.DrivingEnv):
         }
 
     def step(self, action: base.Action) -> base.Step:
-        """Hold the pedal for one control interval."""
         c = self.config
         pedal = min(max(float(action[0]), -1.0), 1.0)
         acceleration_mps2 = pedal * (c.throttle_mps2 if pedal > 0 else c.brake_mps2)
@@ -250,14 +246,10 @@ class LeftTurnEnv(base.DrivingEnv):
         base.equip(cars, types)
         return cars
 
-    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
-        if any(overlap(ego, car) for car in cars):
-            return "collision"
+    def _outcome(self, ego: Rectangle) -> str | None:
         if self.distance_m >= self.config.goal_m:
             return "goal"
-        if abs(self._offset_m) > 0.5 * self.config.lane_width_m:
-            return "off_road"
-        return "timeout" if self.steps >= self.config.max_steps else None
+        return "off_road" if abs(self._offset_m) > 0.5 * self.config.lane_width_m else None
 
     def _reward(self, outcome: str | None) -> float:
         """Rate goal, failure, and the distance to the target speed (eq. 31)."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bridge.network import parse_spec
-from trainer.environments import DelayedVehicle
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import FRAMES_LAYOUT
@@ -17,7 +15,7 @@ from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import read_metrics
-from trainer.training.run import Parts, TrainingRun, Validation
+from trainer.training.run import TrainingRun, Validation
 
 POLICY, HUMAN = 0.25, -0.5
 BATCH = 4
@@ -106,14 +104,10 @@ def scripted_run(run_dir, config=CONFIG, length=1, outcome="goal", human_steps=(
     """A run that keeps what it ``stored``, and the (indices, priorities) that it was given
     (``learned``) and wrote back (``written``)."""
     env = ScriptedEnv(length, outcome)
-    spec = parse_spec(config.latency)
-    delayed = DelayedVehicle(env, spec) if config.latency != "none" else None
     learning = LearningThread(config, env)
     validation = Validation(config, run_dir, learning, env)
     guide = ScriptedGuide(human_steps, reason)
-    run: Any = TrainingRun(
-        config, run_dir, parts=Parts(env, delayed, delayed or env, guide, learning, validation)
-    )
+    run: Any = TrainingRun(config, run_dir, False, env, guide, learning, validation)
     run.stored, run.learned, run.written = [], [], []
     add, write = learning.replay.add, learning.replay.update_priorities
 

@@ -149,7 +149,7 @@ def store(learning: LearningThread, rewards: list[float]) -> None:
         seen, after = random.normal(5.0, 0.5, (2, 3)).astype(np.float32)
         terminal = step == len(rewards) - 1
         learning.add(Transition(seen, np.zeros(1, np.float32), reward, after, terminal))
-        if learning.added >= 20:
+        if learning.replay.added >= 20:
             learning.begin(0.0)
             learning.finish()
     learning.end_episode(0.0)

@@ -6,12 +6,12 @@ from trainer.scenarios import SCENARIOS
 
 
 def test_the_report_holds_the_three_figures_and_their_parts(capsys, tmp_path, monkeypatch):
-    for name, small in {"TRANSITIONS": 20, "QUICK_ROUNDS": 2, "UPDATES": 1, "STEPS": 10}.items():
+    for name, small in {"ROUNDS": 2, "UPDATES": 1, "STEPS": 10}.items():
         monkeypatch.setattr(bench, name, small)
     whole = bench.measure
-    monkeypatch.setattr(bench, "measure", lambda rounds: whole(rounds, batch_size=4))
+    monkeypatch.setattr(bench, "measure", lambda: whole(batch_size=4))
     out = tmp_path / "b.json"
-    status, said, _ = call(capsys, "bench", "--quick", "--threads", "1", "--out", str(out))
+    status, said, _ = call(capsys, "bench", "--threads", "1", "--out", str(out))
     assert status == 0
     report = json.loads(out.read_text())
     assert {"machine", "torch", "source_revision"} <= set(report)

@@ -62,7 +62,7 @@ def test_sittings_fill_the_replay_before_the_first_step(tmp_path):
     record(tmp_path / "sittings", steps)
     config = RunConfig(demonstrations=str(tmp_path / "sittings"))
     run = TrainingRun(config, tmp_path / "run")
-    assert run.learning.added == 4
+    assert run.learning.replay.added == 4
     assert run.learning.replay.human_count == 2
     run.learning.close()
 

@@ -1,18 +1,12 @@
 import csv
+import math
 from pathlib import Path
 
 import pytest
 
-from bridge.outcomes import success_estimate
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import refusal
-from trainer.training.metrics import (
-    NAMES,
-    EpisodeMetrics,
-    MetricsWriter,
-    read_metrics,
-    totals,
-)
+from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
 HEAD = ",".join(NAMES) + "\r\n"
@@ -25,6 +19,7 @@ def write(run_dir, lines):
 def row(episode, names=NAMES, **changes):
     whole = {"total_steps": "75", "updates": "75", "human_steps": "3", "interventions": "1"}
     known = {"episode": str(episode), "outcome": "goal", **whole}
+    known |= dict.fromkeys(("steps", "total_takeovers", "total_failures"), "1")
     values = {**dict.fromkeys(names, "1.5"), **known, **changes}
     return ",".join(values[name] for name in names)
 
@@ -75,31 +70,16 @@ def test_anything_else_is_refused_in_a_line_that_names_it(content, capsys, tmp_p
     assert (path / "metrics.csv").read_bytes() == content
 
 
-def test_a_run_is_summed_up():
-    names = ("total_steps", "updates", "outcome", "validation_success", "validation_reward")
-    same = {
-        "human_steps": "3",
-        "interventions": "1",
-        "confirmed_success": "nan",
-        "confirmed_reward": "nan",
-    }
-    rows = [dict(zip(names, values.split(), strict=True)) | same for values in (
-        "20 0 collision nan nan", "90 50 goal 0.5 1", "150 110 timeout 0.9 2",
-        "210 170 collision 0.9 1", "280 240 goal 0.8 1",
-    )]  # fmt: skip
-    assert totals(rows, 0.1) == {
-        "episodes": 5, "steps": 280, "updates": 240,
-        "human_steps": 15, "human_s": 1.5, "takeovers": 5,
-        "failures": {"collision": 2, "timeout": 1},
-        "validation": {"best": 0.9, "best_at_step": 150, "last": 0.8},
-        "until": {"0.9": {"steps": 150, "human_steps": 9, "human_s": 0.9, "takeovers": 3,
-                          "failures": {"collision": 1, "timeout": 1}}, "0.98": None},
-    }  # fmt: skip
-    assert totals([], 0.1) == {}
-    # The last is the best in validation, the second is kept.
-    seconds = ("nan nan", "0.25 1", "0.75 0", "0.5 9", "nan nan")
-    rows = [each | dict(zip(("confirmed_success", "confirmed_reward"), second.split(), strict=True))
-            for each, second in zip(rows, seconds, strict=True)]  # fmt: skip
-    found = totals(rows, 0.1, confirming=40)["validation"]
-    assert found["best_at_step"] == 150
-    assert found["confirmed"] == success_estimate(30, 40)._asdict()
+def test_a_row_holds_the_totals_so_far(tmp_path):
+    writer, found = MetricsWriter(tmp_path, period_s=0.1), []
+    for episode, (outcome, success) in enumerate((
+        ("collision", math.nan), ("goal", 0.5), ("timeout", 0.9), ("collision", 0.9), ("goal", 0.8)
+    )):  # fmt: skip
+        told = EpisodeMetrics(episode, outcome=outcome, human_steps=3, interventions=1)
+        told.validation_success = success
+        writer.add(told)
+        found.append((told.total_human_s, told.total_takeovers, told.total_failures))
+    assert found == [(0.3, 1, 1), (0.6, 2, 1), (0.9, 3, 2), (1.2, 4, 3), (1.5, 5, 3)]
+    until = [(row["human_s_to_90"], row["human_s_to_98"]) for row in read_metrics(tmp_path)]
+    assert until == [("nan", "nan")] * 2 + [("0.9", "nan")] * 3
+    writer.close()

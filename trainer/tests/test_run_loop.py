@@ -212,7 +212,7 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(unhurr
     for keep, reward in ((False, 9.0), (True, 3.0)):
         unhurried.add(transition(reward, human=True))
         unhurried.add(transition(reward + 1.0, terminal=True))
-        assert unhurried.added == 3
+        assert unhurried.replay.added == 3
         if not keep:
             threading.Timer(0.05, gate.open.set).start()
         unhurried.end_episode(0.0, keep)
@@ -228,9 +228,9 @@ def drives(successes: int, failures: int) -> list[Any]:
     return [SimpleNamespace(outcome=each, reward=0.0, distance_m=0.0) for each in outcomes]
 
 
-def take_drives(validation, results, episode: int, due: bool = True) -> EpisodeMetrics:
+def take_drives(validation, results, episode: int) -> EpisodeMetrics:
     actor: Any = SimpleNamespace(state_dict=lambda: {"number": torch.tensor(episode)})
-    validation.take(results, actor, metrics := EpisodeMetrics(episode), episode, due)
+    validation.take(results, actor, metrics := EpisodeMetrics(episode), episode)
     return metrics
 
 
@@ -262,25 +262,18 @@ def test_only_an_actor_no_worse_than_the_kept_one_drives_the_second_set():
         assert len(trials.drive(None, best)) == len({*driven}) == count
 
 
-@given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=12), st.data())
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=12), st.data())
 def test_when_a_run_was_stopped_does_not_decide_which_actor_it_ends_with(scores, data):
-    """Each episode: the success that a validation finds, and whether a validation is due."""
-
-    def judge(validation, episode, score, due):
-        take_drives(validation, drives(score, 3 - score), episode, due)
-
+    """Each episode: the success that a validation finds."""
     with tempfile.TemporaryDirectory() as folder:
         kept = {}
         for name, stops in (("unbroken", False), ("stopped", True)):
             run_dir = Path(folder, name)
             run_dir.mkdir()
             validation = Validation(CONFIG, run_dir, cast(Any, None))
-            for episode, (score, due) in enumerate(scores):
-                if due:
-                    judge(validation, episode, score, due=True)
+            for episode, score in enumerate(scores):
+                take_drives(validation, drives(score, 3 - score), episode)
                 if stops and data.draw(st.booleans()):
-                    if not due:  # A run that stops validates what it leaves behind.
-                        judge(validation, episode, score, due=False)
                     state, validation = (
                         validation.state_dict(),
                         Validation(CONFIG, run_dir, cast(Any, None)),

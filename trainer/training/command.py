@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 
-from bridge.outcomes import GOAL, Estimate
+from bridge.outcomes import GOAL, success_estimate
 from bridge.report import ProgressBar
 from edge_runtime.cli import INTERRUPTED, quit_on_signals
 from edge_runtime.util import UserError, counted, name_in_file, read_json
@@ -44,19 +44,13 @@ from trainer.training.config import (
     settings_in,
 )
 from trainer.training.curves import write_learning_curve
-from trainer.training.metrics import (
-    REPORT_FILE,
-    EpisodeMetrics,
-    metrics_table,
-    read_metrics,
-)
-from trainer.training.run import TrainingRun, environment_of, make_parts
+from trainer.training.metrics import EpisodeMetrics, metrics_table, read_metrics
+from trainer.training.run import TrainingRun, environment_of
 
 FINDS_NOTHING = (
     "every episode has had the same return so far: there is nothing to learn from. A human, or more"
     " noise (--set exploration_initial=1 --set exploration_final=0.5), may find what pays"
 )
-
 
 @dataclass(frozen=True)
 class Run:
@@ -76,11 +70,9 @@ class Run:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.seeds is None:
-        return INTERRUPTED if _run(arguments).interrupted else 0
-    if vars(arguments).get("human") in HUMANS:
+    if arguments.seeds and vars(arguments).get("human") in HUMANS:
         raise UserError("--seeds does not go with a person")
-    ends = list(_run_seeds(arguments))
+    ends = [*_run_seeds(arguments)] if arguments.seeds else [_run(arguments).interrupted]
     return INTERRUPTED if any(ends) else 0
 
 
@@ -173,29 +165,24 @@ def train(
 
 def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     """Train with these settings; ``how`` holds the options that do not decide the result."""
-    human = values.get("human", DEFAULTS.human)
-    if human == PERSON:  # As a run's own config says
-        human = HUMANS[0]
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
-    values["human"] = PERSON if human in HUMANS else located(human)
+    human = values.get("human", DEFAULTS.human)
+    # A run's own config says ``person``.
+    values["human"] = PERSON if human in (*HUMANS, PERSON) else located(human)
     if demonstrations := values.get("demonstrations"):
         values["demonstrations"] = os.path.abspath(demonstrations)
     values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
     config = make_config(preset, values)
     util.check_device(config.device)
     run_dir = (_new_directory(config) if how.out is None else Path(how.out)).absolute()
-    person = argparse.Namespace(
-        human=human, scenario=config.scenario, host=how.host, port=how.port, speed=how.speed
-    )
     with (
         util.claimed(run_dir),
         util.limited_threads(config.threads),
         closing(environment_of(config)) as env,
     ):
         config = make_config(preset, values, env)
-        person.resume = check_directory(run_dir, config, how.resume)
-        return _train(person, config, run_dir, env, how)
+        return _train(config, run_dir, env, how)
 
 
 def _new_directory(config: RunConfig) -> Path:
@@ -204,25 +191,16 @@ def _new_directory(config: RunConfig) -> Path:
     return next(path for path in paths if not path.exists())
 
 
-def _train(
-    person: argparse.Namespace,
-    config: RunConfig,
-    run_dir: Path,
-    env: Any,
-    how: argparse.Namespace,
-) -> Run:
-    end_s = util.deadline_s(how.max_minutes)
+def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) -> Run:
+    end_s, resume = util.deadline_s(how.max_minutes), check_directory(run_dir, config, how.resume)
     with ExitStack() as stack:
-        training: TrainingRun
-        if person.human in HUMANS:
+        if config.human == PERSON:
             from trainer.person.run import training_with_person
 
-            began = training_with_person(person, config, run_dir, env)
-            training, sitting = stack.enter_context(began)
-            quit_training = sitting.quit
+            began = training_with_person(how, config, run_dir, env, resume)
+            training, quit_training = stack.enter_context(began)
         else:
-            parts = make_parts(config, run_dir, env)
-            training = TrainingRun(config, run_dir, person.resume, parts)
+            training = TrainingRun(config, run_dir, resume, env)
             quit_training = partial(_quit, training)
         if on_step := vars(how).get("on_step"):
             training.recorders.append(on_step)
@@ -254,7 +232,7 @@ def _train(
         training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    print(f"{_summary(read_json(run_dir / REPORT_FILE, 'report'))}: {run_dir}")
+    print(f"{_summary(metrics_table(run_dir), config)}: {run_dir}")
     interrupted = training.quitting and not training.over
     if interrupted:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
@@ -270,14 +248,18 @@ def _quit(training: TrainingRun) -> bool:
     return True
 
 
-def _summary(found: Mapping[str, Any]) -> str:
-    if not found:
+def _summary(rows: pd.DataFrame, config: RunConfig) -> str:
+    if rows.empty:
         return "no episodes"
-    amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
-    human = f"{counted(found['takeovers'], 'take-over')} with {found['human_s']:.0f} s"
-    said = [*amounts, human, counted(sum(found["failures"].values()), "failure")]
-    if confirmed := found["validation"].get("confirmed"):
-        said.append(f"kept actor {Estimate(**confirmed).as_share()} %")
+    last, confirmed = rows.iloc[-1], rows.confirmed_success.max()
+    amounts = {"episode": len(rows), "step": last.total_steps, "update": last.updates}
+    said = [counted(count, name) for name, count in amounts.items()]
+    said.append(f"{counted(last.total_takeovers, 'take-over')} with {last.total_human_s:.0f} s")
+    said.append(counted(last.total_failures, "failure"))
+    if confirmed == confirmed:  # Of the kept actor
+        count = config.confirmation_factor * config.evaluation_runs
+        share = success_estimate(round(confirmed * count), count).as_share()
+        said.append(f"kept actor {share} %")
     return ", ".join(said)
 
 

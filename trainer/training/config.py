@@ -9,12 +9,7 @@ from typing import Any
 from bridge.network import parse_spec
 from edge_runtime.manifest import MAX_PERIOD_S, MIN_PERIOD_S
 from edge_runtime.util import UserError
-from trainer.learner.config import (
-    PRINTED_LEARNER,
-    LearnerConfig,
-    find_algorithm,
-    task_settings,
-)
+from trainer.learner.config import PRINTED_LEARNER, LearnerConfig, find_algorithm, task_settings
 from trainer.util import FROM_ONE, SHARE, check_ranges
 
 MOST_THREADS = 1024
@@ -49,14 +44,17 @@ class RunConfig:
 
     scenario: str = "left_turn"
     algorithm: str = "phil_td3"
+    """Learning algorithm: phil_td3, ia_td3, hi_td3, rd2_td3, rd2_phil, per_td3, another row of
+    trainer/README.md, one of an installed package, or ``MODULE:ROW``."""
     seed: int = 0
     episodes: int = 400
     """Maximum number of training episodes (table A5: 400)."""
     steps: int = 0
     """Stop after this many environment steps, at the end of the running episode; 0: no limit."""
     human: str = "expert"
-    """The guide: the word expert, ``module:Class`` of another expert, a human model's directory, or
-    the word person."""
+    """Who takes over from the policy: the environment's scripted expert, your own expert as
+    ``MODULE:CLASS``, a model trained by `trainer human`, or you, in the browser (web). A run's own
+    config then says ``person``."""
     guided_share: float = 1.0
     """Share of the episodes in which the human watches (the authors' code: a third in the left
     turn)."""
@@ -99,9 +97,11 @@ class RunConfig:
     """Processor threads of the learner; 0: PyTorch's default. Another number sums in another order,
     and gives other weights."""
     demonstrations: str = ""
-    """Path of drives that fill the replay before the first step; empty: none."""
+    """Drives to learn from before the first step: a person's recordings, F.mcap of bridge record,
+    or a LeRobot data set."""
     success: str = ""
-    """``module:function`` that says whether an episode succeeded; empty: the environment does."""
+    """Who says whether an episode succeeded, where the environment does not: it takes the last
+    observation, its info and the return, and returns True, False or None."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
     def __post_init__(self) -> None:
@@ -117,11 +117,6 @@ class RunConfig:
         if self.guided_until_episode and episode >= self.guided_until_episode:
             return False
         return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
-
-    @property
-    def confirmation_runs(self) -> int:
-        """Episodes that an actor drives before it is kept."""
-        return self.confirmation_factor * self.evaluation_runs
 
     @property
     def kept_actor(self) -> str:

@@ -81,11 +81,6 @@ class LearningThread:
         """Whether observations and rewards are scaled by what the warm-up has seen."""
         self._forget_losses()
 
-    @property
-    def added(self) -> int:
-        """Transitions stored since the run began."""
-        return self.replay.added
-
     def act(self, observation: Observation) -> Action:
         return self.in_thread(self.learner.actor.act, observation[None])[0]
 
@@ -238,7 +233,8 @@ class UnhurriedLearning(LearningThread):
         super().__init__(config, env)
         self._actor = copy.deepcopy(self.learner.actor).eval()
         self._kept: list[Transition] = []
-        self.in_thread(_step_aside)
+        # That thread alone
+        self.in_thread(lambda: os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS))
 
     def act(self, observation: Observation) -> Action:
         return self._actor.act(observation[None])[0]
@@ -274,7 +270,6 @@ class UnhurriedLearning(LearningThread):
         self._actor.load_state_dict(self.learner.actor.state_dict())
 
     def settle(self) -> None:
-        """Wait for the update that is under way."""
         # In short waits: a signal that another thread took does not wake the main thread.
         while not self._tidy():
             time.sleep(0.002)
@@ -287,7 +282,3 @@ class UnhurriedLearning(LearningThread):
             super().finish()
             self._actor.load_state_dict(self.learner.actor.state_dict())
         return True
-
-
-def _step_aside() -> None:
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

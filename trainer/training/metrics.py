@@ -2,10 +2,7 @@
 
 import csv
 import io
-import math
 import os
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -13,14 +10,13 @@ from typing import Any
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.outcomes import GOAL, Estimate, failed, settled, success_estimate
+from bridge.outcomes import GOAL, failed, settled
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer.util import fitting
 
 NAN = float("nan")
-METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
-WHOLE = ("episode", "total_steps", "interventions", "human_steps", "updates")
+METRICS_FILE = "metrics.csv"
 LEARNED = (0.9, 0.98)
 """Success rates of the policy alone, in validation, whose cost is reported."""
 
@@ -69,24 +65,18 @@ class EpisodeMetrics:
     confirmed_reward: float = NAN
 
 
-NAMES = [f.name for f in fields(EpisodeMetrics)]
+KINDS: dict[str, Any] = {f.name: f.type for f in fields(EpisodeMetrics)}
+NAMES = [*KINDS]
 
 
 class MetricsWriter:
-    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T.
+    """Appends rows; a resumed run first drops the rows after its checkpoint. ``period_s`` is T."""
 
-    ``undue``: it drops the last row's validation, too.
-    """
-
-    def __init__(
-        self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1, undue: bool = False
-    ) -> None:
+    def __init__(self, run_dir: Path, from_episode: int = 0, period_s: float = 0.1) -> None:
         path, self._period_s = run_dir / METRICS_FILE, period_s
         self._rows = read_metrics(run_dir)[:from_episode]
         if len(self._rows) < from_episode:
             raise UserError(f"{path} lacks episodes before the checkpoint: {from_episode}")
-        for row in self._rows[-1:] if undue else ():
-            row.update({n: "nan" for n in NAMES if n.startswith(("validation", "confirmed"))})
         text = io.StringIO()
         writer = csv.DictWriter(text, NAMES)
         writer.writeheader()
@@ -98,14 +88,20 @@ class MetricsWriter:
 
     def add(self, metrics: EpisodeMetrics) -> None:
         """Write one episode's row, with the totals so far."""
-        self._rows.append({name: str(value) for name, value in asdict(metrics).items()})
-        so_far = totals(self._rows, self._period_s)
-        metrics.total_human_s, metrics.total_takeovers = so_far["human_s"], so_far["takeovers"]
-        metrics.total_failures = sum(so_far["failures"].values())
+        rows = [*self._rows, asdict(metrics)]
+        human_steps, takeovers = (sum(int(row[name]) for row in rows)
+                                  for name in ("human_steps", "interventions"))  # fmt: skip
+        metrics.total_human_s = round(human_steps * self._period_s, 6)
+        metrics.total_takeovers = takeovers
+        metrics.total_failures = sum(map(failed, settled(row["outcome"] for row in rows)))
+        rows[-1] = asdict(metrics)
         metrics.human_s_to_90, metrics.human_s_to_98 = (
-            until["human_s"] if until else NAN for until in so_far["until"].values()
-        )
+            next((float(row["total_human_s"]) for row in rows
+                  if is_reached(level, float(row["validation_success"]))), NAN)
+            for level in LEARNED
+        )  # fmt: skip
         row = asdict(metrics)
+        self._rows.append(row.copy())
         self._csv.writerow(row)
         self._file.flush()
         os.fsync(self._file.fileno())  # No power cut leaves a checkpoint without its rows.
@@ -134,7 +130,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
         text = io.StringIO((whole + end).decode(), newline="")
         rows = list(csv.DictReader(text, strict=True))
         for number, row in enumerate(rows):
-            values = {name: _number(name, text) for name, text in row.items() if name != "outcome"}
+            values = {name: KINDS[name](text) for name, text in row.items()}
             if [*row] != NAMES or values["episode"] != number:
                 raise ValueError(row)
     return rows
@@ -142,79 +138,9 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
 def metrics_table(run_dir: Path) -> pd.DataFrame:
     """Return a run's rows as numbers, and the outcome as text."""
-    kinds = {name: str if name == "outcome" else int if name in WHOLE else float for name in NAMES}
-    return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(kinds)
-
-
-def _number(name: str, text: str) -> float:
-    return int(text) if name in WHOLE else float(text)
-
-
-def was_validated(row: Mapping[str, str]) -> bool:
-    return row["validation_reward"] != "nan"
+    return pd.DataFrame(read_metrics(run_dir), columns=NAMES).astype(KINDS)
 
 
 def is_reached(level: float, success: float) -> bool:
     """Return whether a success rate reaches a level, up to rounding."""
     return success >= level - 1e-9
-
-
-def spent(rows: Sequence[Mapping[str, str]], period_s: float) -> dict[str, Any]:
-    """Sum up what episodes cost: steps, the human's effort, failures by outcome."""
-    human_steps = sum(int(row["human_steps"]) for row in rows)
-    failures = Counter(filter(failed, settled(row["outcome"] for row in rows)))
-    return {
-        "steps": int(rows[-1]["total_steps"]) if rows else 0,
-        "human_steps": human_steps,
-        "human_s": round(human_steps * period_s, 6),
-        "takeovers": sum(int(row["interventions"]) for row in rows),
-        "failures": dict(sorted(failures.items())),
-    }
-
-
-def _scores(rows: Sequence[Mapping[str, str]], kind: str) -> list[tuple[float, float, int]]:
-    """Return the success, return and row number of each validation, or each confirmed one."""
-    success, reward = (f"{kind}_{name}" for name in ("success", "reward"))
-    scores = [(float(row[success]), float(row[reward]), n) for n, row in enumerate(rows)]
-    # Unknown successes are all alike.
-    return [(0.0 if math.isnan(s) else s, r, n) for s, r, n in scores if not math.isnan(r)]
-
-
-def totals(
-    rows: Sequence[Mapping[str, str]], period_s: float, confirming: int = 0
-) -> dict[str, Any]:
-    """Sum up what a run cost and what it reached, from its rows; empty without rows.
-
-    ``failures``: training episodes, with the human's help, that missed the goal, by outcome.
-    ``validation``: best and last success rate, None where it is unknown, and the environment steps
-    before the best; in the second set, of ``confirming`` drives, the kept actor's rate with its
-    interval.
-    ``until``: what was spent until the policy alone first reached each of ``LEARNED``, or None.
-    """
-    if not rows:
-        return {}
-    measured = _scores(rows, "validation")
-    validation: dict[str, Any] = {}
-    if measured:
-        kept = max(_scores(rows, "confirmed") or measured)  # Of equal ones the last
-        share, _, number = kept
-        known = rows[number]["validation_success"] != "nan" or None
-        validation = {
-            "best": known and float(rows[number]["validation_success"]),
-            "best_at_step": int(rows[number]["total_steps"]),
-            "last": known and measured[-1][0],
-        }
-        if confirming and known:
-            estimate = success_estimate(round(share * confirming), confirming)
-            validation["confirmed"] = dict(zip(Estimate._fields, estimate, strict=True))
-    until = {}
-    for level in LEARNED:
-        there = [number for success, _, number in measured if is_reached(level, success)]
-        until[f"{level:g}"] = spent(rows[: there[0] + 1], period_s) if there else None
-    return {
-        "episodes": len(rows),
-        "updates": int(rows[-1]["updates"]),
-        **spent(rows, period_s),
-        "validation": validation,
-        "until": until,
-    }

@@ -4,7 +4,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,24 +18,9 @@ from bridge.network import parse_spec
 from bridge.outcomes import DISCARDED, GOAL, is_told
 from bridge.report import EpisodeResult
 from edge_runtime.files import write_json
-from trainer import util
-from trainer.environments import (
-    DelayedVehicle,
-    check_foresight,
-    expert_of,
-    foresee,
-    make_environment,
-)
-from trainer.evaluation import (
-    BEST_FILE,
-    CHECKPOINT_FILE,
-    NO_NETWORK,
-    TogetherDriver,
-    drive_episodes,
-    drive_together,
-    is_expert,
-    load_driver,
-)
+from trainer import environments, evaluation, util
+from trainer.environments import DelayedVehicle
+from trainer.evaluation import BEST_FILE, CHECKPOINT_FILE, NO_NETWORK, TogetherDriver
 from trainer.human.guide import (
     ASKED,
     STUCK,
@@ -57,19 +42,11 @@ from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
 from trainer.training.demonstrations import read_demonstrations
 from trainer.training.learning import LearningThread, diverged
-from trainer.training.metrics import (
-    REPORT_FILE,
-    EpisodeMetrics,
-    MetricsWriter,
-    read_metrics,
-    totals,
-)
-from trainer.util import Purpose, episode_seed, save_torch
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 
 
 def environment_of(config: RunConfig) -> Any:
-    """Make a run's environment."""
-    return make_environment(
+    return environments.make_environment(
         config.scenario,
         printed_reward=config.printed_reward,
         period_s=config.period_s,
@@ -96,7 +73,7 @@ class Trials:
         self.config, self.network, self._env = config, parse_spec(config.latency), env
         count = config.evaluation_runs
         seeds = [
-            episode_seed(config.seed, Purpose.VALIDATION, run)
+            util.episode_seed(config.seed, util.Purpose.VALIDATION, run)
             for run in range(count * (1 + config.confirmation_factor))
         ]
         self._seeds, self._confirming = seeds[:count], seeds[count:]
@@ -118,8 +95,8 @@ class Trials:
 
     def _drive(self, driver: TogetherDriver, seeds: Sequence[int]) -> list[EpisodeResult]:
         if self.network == NO_NETWORK:
-            return drive_together(self.envs, driver.act_together, seeds)
-        return drive_episodes(self.envs[0], driver, seeds, latency=self.network)
+            return evaluation.drive_together(self.envs, driver.act_together, seeds)
+        return evaluation.drive_episodes(self.envs[0], driver, seeds, latency=self.network)
 
 
 class Validation(Trials):
@@ -136,29 +113,21 @@ class Validation(Trials):
         super().__init__(config, env)
         self.run_dir, self.learning = run_dir, learning
         self.best = self.confirmed = (-1.0, -math.inf)
-        """The kept actor's scores in both sets, as of the validations that were due."""
+        """The kept actor's scores in both sets."""
         self._best_actor: dict[str, Any] | None = None  # As in its file; None before the first one
-        self.undue = False  # The last episode was validated only because the run ended there
 
     def after(self, metrics: EpisodeMetrics, episode: int, due: bool, at_end: bool) -> None:
-        """Validate after ``episode`` episodes where that is due, or at the end of a run.
+        """Validate after ``episode`` episodes where that is ``due``.
 
-        A resumed run forgets a validation that was not ``due``: when a run was stopped must not
-        decide which actor it ends with.
+        Not where a run is stopped, ``at_end``: that must not decide which actor it ends with.
         """
-        self.undue = at_end and not due
-        if due or (at_end and self.config.evaluate_every_steps):
+        if due:
             actor = getattr(self.learning.learner, self.config.kept_actor)
             driver = TogetherDriver(partial(self.learning.in_thread, actor.act))
-            self.take(self.drive(driver, self.best), actor, metrics, episode, due)
+            self.take(self.drive(driver, self.best), actor, metrics, episode)
 
     def take(
-        self,
-        results: Sequence[EpisodeResult],
-        actor: Actor,
-        metrics: EpisodeMetrics,
-        episode: int,
-        due: bool = True,
+        self, results: Sequence[EpisodeResult], actor: Actor, metrics: EpisodeMetrics, episode: int
     ) -> None:
         """Enter an actor's drives into ``metrics``, and keep the actor if it is the best."""
         count = self.config.evaluation_runs
@@ -174,56 +143,25 @@ class Validation(Trials):
         elif self.config.confirmation_factor:
             return
         if found >= self.best and confirmed >= self.confirmed:
+            self.best, self.confirmed = found, confirmed
             state = {**self.config.label(episode), "actor": actor.state_dict()}
-            save_torch(self.run_dir / BEST_FILE, state)
-            if due:
-                self.best, self.confirmed = found, confirmed
-                self._best_actor = copy.deepcopy(state)
+            self._best_actor = copy.deepcopy(state)
+            util.save_torch(self.run_dir / BEST_FILE, state)
 
     def state_dict(self) -> dict[str, Any]:
         scores = {"best_validation": self.best, "best_confirmed": self.confirmed}
-        return {**scores, "best_actor": self._best_actor, "undue": self.undue}
+        return {**scores, "best_actor": self._best_actor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up ``state_dict``, and write its best actor again."""
         scores = (map(float, state[f"best_{name}"]) for name in ("validation", "confirmed"))
         self.best, self.confirmed = ((success, reward) for success, reward in scores)
-        self._best_actor, self.undue = state["best_actor"], state["undue"]
-        if self._best_actor is None:  # What is there was validated before it was due.
-            (self.run_dir / BEST_FILE).unlink(missing_ok=True)
-        else:
-            save_torch(self.run_dir / BEST_FILE, self._best_actor)
+        self._best_actor = state["best_actor"]
+        if self._best_actor is not None:
+            util.save_torch(self.run_dir / BEST_FILE, self._best_actor)
 
 
 NOBODY = Guide()
-
-
-@dataclass
-class Parts:
-    """What a run is made of; `make_parts` makes those of a run without a person."""
-
-    env: Any  # The environment itself: it is foreseen in
-    delayed: DelayedVehicle | None  # The environment behind the config's network, if any
-    vehicle: Any  # What the loop drives: one of these, perhaps in a wrapper
-    guide: Guide
-    learning: LearningThread
-    validation: Validation
-    recorders: list[Record] = field(default_factory=list)
-
-
-def make_parts(config: RunConfig, run_dir: Path, env: Any) -> Parts:
-    """Make the parts of a run with a scripted human, a human model, or nobody as its guide."""
-    delayed, learning = behind_network(config, env), LearningThread(config, env)
-    guide, validation = make_guide(config, env), Validation(config, run_dir, learning, env)
-    return Parts(env, delayed, delayed or env, guide, learning, validation)
-
-
-def behind_network(config: RunConfig, env: Any) -> DelayedVehicle | None:
-    """Return a run's environment behind the run's network, if it has one."""
-    if find_algorithm(config.algorithm).foresight:
-        check_foresight(env)
-    network = parse_spec(config.latency)
-    return None if network == NO_NETWORK else DelayedVehicle(env, network)
 
 
 def make_guide(config: RunConfig, env: Any) -> Guide:
@@ -232,8 +170,9 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
     random = util.random_stream(config.seed, util.Purpose.GUIDANCE)
     if not row.guided:
         return Guide()
-    driver, _ = load_driver(config.human, env)
-    expert = expert_of(env, config.human if is_expert(config.human) else "expert")
+    driver, _ = evaluation.load_driver(config.human, env)
+    named = config.human if evaluation.is_expert(config.human) else "expert"
+    expert = environments.expert_of(env, named)
     attention, hands, period_s = None, None, env.control_period_s
     if config.late_to_s or config.missed_share:
         late_steps = config.late_from_s / period_s, config.late_to_s / period_s
@@ -250,14 +189,28 @@ class TrainingRun:
     """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
     def __init__(
-        self, config: RunConfig, run_dir: Path, resume: bool = False, parts: Parts | None = None
+        self,
+        config: RunConfig,
+        run_dir: Path,
+        resume: bool = False,
+        env: Any = None,
+        guide: Guide | None = None,
+        learning: LearningThread | None = None,
+        validation: Validation | None = None,
     ) -> None:
+        """Each part is by default the one that the config describes."""
         self.config, self.run_dir = config, run_dir
         self.algorithm = find_algorithm(config.algorithm)
-        parts = parts or make_parts(config, run_dir, environment_of(config))
-        self.env, self.delayed, self.vehicle = parts.env, parts.delayed, parts.vehicle
-        self.guide, self.learning, self.validation = parts.guide, parts.learning, parts.validation
-        self.recorders = parts.recorders
+        self.env = env or environment_of(config)  # It is foreseen in.
+        if self.algorithm.foresight:
+            environments.check_foresight(self.env)
+        network = parse_spec(config.latency)
+        self.delayed = None if network == NO_NETWORK else DelayedVehicle(self.env, network)
+        self.vehicle: Any = self.delayed or self.env  # What the loop drives
+        self.learning = learning or LearningThread(config, self.env)
+        self.guide = guide or make_guide(config, self.env)
+        self.validation = validation or Validation(config, run_dir, self.learning, self.env)
+        self.recorders: list[Record] = []
         self.act = self.delayed.behind(self._explore) if self.delayed else self._explore
         self.exploration = util.random_stream(config.seed, util.Purpose.EXPLORATION)
         self.episode = self.steps = 0
@@ -284,23 +237,18 @@ class TrainingRun:
         if not self.over:  # Else another revision has trained it.
             about = {**asdict(self.config), "source_revision": util.source_revision()}
             write_json(self.run_dir / CONFIG_FILE, about)
-        metrics_writer = MetricsWriter(
-            self.run_dir, self.episode, self.env.control_period_s, self.validation.undue
-        )
+        metrics_writer = MetricsWriter(self.run_dir, self.episode, self.env.control_period_s)
         try:
             while not self.over:
                 before = self.steps
                 metrics = self.advance()
-                late = self.guide.stop or time.monotonic() > deadline_s
-                at_end = self.over or late
+                at_end = self.over or self.guide.stop or time.monotonic() > deadline_s
                 due = self._due(before)
                 self.validation.after(metrics, self.episode, due, at_end)
                 self.found |= metrics.outcome == GOAL or not is_told([metrics.outcome])
                 self.found |= due and metrics.validation_success > 0.0
                 metrics_writer.add(metrics)
-                # Read once, so that every end has its checkpoint. Quitting adds no validation that
-                # is not due: a resumed run then has had the same ones.
-                ending = at_end or self.quitting
+                ending = at_end or self.quitting  # Read once, so that every end is saved.
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)
@@ -311,9 +259,6 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
-            rows, drives = read_metrics(self.run_dir), self.config.confirmation_runs
-            report = totals(rows, self.env.control_period_s, drives)
-            write_json(self.run_dir / REPORT_FILE, report)
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
@@ -389,7 +334,7 @@ class TrainingRun:
         asks = self.algorithm.asks and guide is not NOBODY
         doubt = self.learning.doubt(observation, policy_action) if asks else 0.0
         acted_s = time.perf_counter()
-        if self.learning.added >= self.config.learner.warmup_steps:
+        if self.learning.replay.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
         begun_s = time.perf_counter()
         intervention = guide.watch(observation, policy_action, doubt)
@@ -399,7 +344,9 @@ class TrainingRun:
         if intervention is not None and self.delayed:
             self.delayed.release_brake()
         if intervention is not None and self.algorithm.foresight:
-            foreseen = foresee(self.env, observation, policy_action, self.algorithm.foresight)
+            foreseen = environments.foresee(
+                self.env, observation, policy_action, self.algorithm.foresight
+            )
         next_observation, reward, terminated, truncated, info = self.vehicle.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()

@@ -8,6 +8,7 @@ from contextlib import closing
 import pytest
 
 from hil_tests.testing.commands import call
+from trainer.environments import make_environment
 from trainer.person import web
 from trainer.person.tests.browser import READY, find_chromium, first_view, open_browser, until
 from trainer.person.web import Cockpit
@@ -65,7 +66,7 @@ def sit_down(monkeypatch, tmp_path, capsys, one_thread):
 
     def sit_down(person, *command):
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(web, "open_cockpit", lambda arguments: person)
+        monkeypatch.setattr(web, "open_cockpit", lambda *_: person)
         return call(capsys, *command, "--speed", "1000")
 
     return sit_down
@@ -73,7 +74,7 @@ def sit_down(monkeypatch, tmp_path, capsys, one_thread):
 
 @pytest.fixture
 def cockpit():
-    with closing(Cockpit()) as cockpit:
+    with closing(Cockpit(make_environment("left_turn"))) as cockpit:
         yield cockpit
 
 

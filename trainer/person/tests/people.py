@@ -66,8 +66,8 @@ def wish(*wishes) -> Reading:
 QUIT = wish("quit")
 
 
-def make_sitting(directory: Path, person: Any, alone: bool = False) -> Sitting:
-    return Sitting(person, make_environment("left_turn"), Recorder(directory), alone, QUICK)
+def make_sitting(directory: Path, person: Any) -> Sitting:
+    return Sitting(person, make_environment("left_turn"), Recorder(directory), QUICK)
 
 
 def record(directory: Path, steps: Iterable[RecordedStep]) -> Path:

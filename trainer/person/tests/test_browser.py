@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from trainer.environments import make_environment
 from trainer.person.tests.browser import (
     LIVE,
     OVER,
@@ -16,6 +17,7 @@ from trainer.person.tests.browser import (
     until,
 )
 from trainer.person.tests.people import LET_GO
+from trainer.person.web import controls_of
 
 pytestmark = pytest.mark.usefixtures("opened")
 
@@ -127,6 +129,7 @@ async def test_a_gamepad_takes_over_by_its_button_unless_hidden_and_a_wheel_by_m
     await browser.evaluate("delete pads[0]")
     await reads(cockpit, lambda r: r == LET_GO)
     # In the congestion, which is steered; the wheel's choices are kept.
+    cockpit.controls = controls_of(make_environment("congestion"))
     cockpit.show(first_view("congestion"))
     await until(browser, LEVEL)
     wheel = f"plug('G29', '', [-0.25, 0, 1, 1], {[0.0] * 24})"

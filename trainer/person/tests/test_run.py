@@ -19,7 +19,7 @@ from trainer.tests.loops import ScriptedEnv
 from trainer.training.config import RunConfig
 from trainer.training.learning import UnhurriedLearning
 from trainer.training.metrics import EpisodeMetrics
-from trainer.training.run import Parts, TrainingRun, Validation
+from trainer.training.run import TrainingRun, Validation
 
 
 def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_either(
@@ -30,7 +30,8 @@ def test_a_validation_whose_process_is_killed_is_let_be_and_the_next_is_none_eit
     metrics = EpisodeMetrics(0, updates=1)
     for _ in range(2):
         validation._beside(metrics, 1, due=True)
-        validation.kill()
+        for process in (validation._process._processes or {}).values():
+            process.kill()
         if validation._begun:
             wait_until(validation._begun[2].done, "the answer's absence")
         validation._beside(metrics, 2, due=False)
@@ -60,8 +61,8 @@ def recovered(tmp_path, steps, **settings: Any) -> TrainingRun:
     sitting: Any = SimpleNamespace(saved_at=(0, 0))
     learning = UnhurriedLearning(config, env)
     validation = Validation(config, tmp_path, learning, env)
-    parts = Parts(env, None, env, Guide(), learning, validation)
-    training: Any = TrainingRun(config, tmp_path, parts=parts)
+    parts = env, Guide(), learning, validation
+    training: Any = TrainingRun(config, tmp_path, False, *parts)
     person_run._recover(training, sitting)
     learning.close()
     return training

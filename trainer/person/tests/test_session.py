@@ -22,7 +22,7 @@ from trainer.person.tests.people import (
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):
     """Drive as the readings say, then quit: outcomes, recorded steps, views, and the sitting."""
     person = person or Puppet(readings, QUIT, presence)
-    sitting = make_sitting(directory, person, alone=policy is None)
+    sitting = make_sitting(directory, person)
     drive(sitting, None if policy is None else constant_driver(policy), abs)
     sitting.close()
     path = sitting.recorder.path

@@ -7,6 +7,7 @@ from pathlib import Path
 import aiohttp
 import pytest
 
+from trainer.environments import make_environment
 from trainer.person import web
 from trainer.person.tests.browser import (
     WAIT_S,
@@ -16,6 +17,8 @@ from trainer.person.tests.browser import (
     say,
 )
 from trainer.person.web import MAX_INPUT_BYTES, Cockpit
+
+LEFT_TURN = make_environment("left_turn")
 
 
 async def status_of(url, **more):
@@ -72,8 +75,8 @@ async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
 
 
 def open_web(**options):
-    given = {"scenario": "left_turn", "host": "127.0.0.1", "port": 0}
-    return web.open_cockpit(argparse.Namespace(**given | options))
+    given = {"host": "127.0.0.1", "port": 0}
+    return web.open_cockpit(argparse.Namespace(**given | options), LEFT_TURN)
 
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
@@ -113,7 +116,7 @@ async def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
 
 
 async def test_the_address_that_it_listens_on_is_let_in():
-    with closing(Cockpit(host="0.0.0.0")) as cockpit:
+    with closing(Cockpit(LEFT_TURN, host="0.0.0.0")) as cockpit:
         printed = cockpit.url.split("/")[2]
         here = cockpit.url.replace(printed, f"127.0.0.2:{cockpit.port}")
         assert (await status_of(here))[0] == 200
