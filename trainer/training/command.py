@@ -44,6 +44,7 @@ from trainer.training.config import (
     settings_in,
 )
 from trainer.training.curves import write_learning_curve
+from trainer.training.demonstrations import SCRIPTED
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
@@ -179,7 +180,8 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     if not SLOWEST <= how.speed <= FASTEST:
         raise UserError(f"speed must be from {SLOWEST} to {FASTEST}: {how.speed}")
     values["human"] = PERSON if human in HUMANS else located(human)
-    if demonstrations := values.get("demonstrations"):
+    demonstrations = values.get("demonstrations")
+    if demonstrations and not SCRIPTED.fullmatch(demonstrations):
         values["demonstrations"] = os.path.abspath(demonstrations)
     values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
     config = make_config(preset, values)

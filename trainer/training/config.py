@@ -99,7 +99,8 @@ class RunConfig:
     """Processor threads of the learner; 0: PyTorch's default. Another number sums in another order,
     and gives other weights."""
     demonstrations: str = ""
-    """Path of drives that fill the replay before the first step; empty: none."""
+    """Path of drives that fill the replay before the first step, or ``human:N``: N drives of the
+    scripted human; empty: none. Their seconds count as the human's."""
     success: str = ""
     """``module:function`` that says whether an episode succeeded; empty: the environment does."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
