@@ -51,6 +51,7 @@ class Purpose(IntEnum):
     HUMAN_BATCHES = 5
     GUIDANCE = 6
     SITTINGS = 7  # Episodes that a person drives without learning
+    DEMONSTRATIONS = 8
 
 
 def episode_seed(run_seed: int, purpose: Purpose, episode: int) -> int:

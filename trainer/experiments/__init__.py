@@ -44,6 +44,8 @@ NORMAL, GOOD = "normal", "good"
 ROWS, HELPED = (tuple(DATA["groups"][name]) for name in ("rows", "helped"))
 """Rows of the table of human guidance, and those that a human helps."""
 RIVALS = tuple(name for name in HELPED if name != "phil_td3")
+SHOWN: Mapping[str, Mapping[str, Any]] = DATA["shown"]
+"""Row of the table of human guidance whose human does not take over -> its settings of a run."""
 TUNED: Mapping[str, Mapping[str, Any]] = dict.fromkeys(DATA["groups"]["guided"], FASTER)
 """Row of the table of human guidance -> the hyper-parameters that its tuning chose in our scenes,
 where the paper's experiments have others. What it chose for other rows stands in ``ALGORITHMS``."""
@@ -203,6 +205,7 @@ class Study:
             "evaluation_runs": here.evaluation_runs,
             **confirmed,
             **setting.get("run", {}),
+            **(SHOWN.get(unit.algorithm, {}) if unit.setting in HUMANS else {}),
             "learner": {
                 **asked,
                 **row.settings,

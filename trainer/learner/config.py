@@ -105,13 +105,14 @@ ALGORITHMS: dict[str, Algorithm] = {
     # authors do not explore; here the validations were higher on average where it does.
     "pvp_td3": PVP,
     "pvp4real_td3": replace(PVP, behaviour_cloning=True),
-    # RLPD (2302.02948) with interventions, after HIL-SERL (2410.21845): no cloning, no penalty.
-    # All rows have layer normalisation in the critics. Two critics, not ten; the actor is updated
-    # once a step. If the human prevents every failure, the critics rate every action good.
+    # RLPD (2302.02948): demonstrations come first; a human may also take over, as in HIL-SERL
+    # (2410.21845). No cloning, no penalty. Two critics, not ten, and two updates a step, not 20:
+    # so few never carried a far goal back by one-step targets, hence the returns of all rows.
+    # Without failures of its own the critics rate every action good.
     "rlpd_td3": Algorithm(
         penalty=False, behaviour_cloning=False, advantage_weight=0.0, human_share=0.5,
         updates_per_step=2,
-        settings={**UNIFORM, **FASTER, "return_steps": 1, "policy_delay": 2},
+        settings={**UNIFORM, **FASTER, "policy_delay": 2},
     ),
     # Predictive preference learning (2510.01545): in the L = 4 states to which the overruled action
     # would have led, the human's is preferred. Cloning counts as much. No Q term.

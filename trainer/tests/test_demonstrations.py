@@ -12,9 +12,11 @@ from bridge.fork import read_episodes
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import refusal
 from trainer.environments import make_environment
+from trainer.learner.config import LearnerConfig
 from trainer.person.tests.people import record, recorded_step
 from trainer.training.config import RunConfig
 from trainer.training.demonstrations import read_demonstrations
+from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
 
 DRIVE = Path(__file__).parents[2] / "hil_tests/recordings/left_turn.mcap"
@@ -65,6 +67,20 @@ def test_sittings_fill_the_replay_before_the_first_step(tmp_path):
     assert run.learning.replay.added == 4
     assert run.learning.replay.human_count == 2
     run.learning.close()
+
+
+def test_a_scripted_human_shows_drives_that_count_as_its_seconds(tmp_path):
+    learner = LearnerConfig(warmup_steps=10**6)
+    config = RunConfig(
+        demonstrations="human:2", guided_share=0.0, episodes=2, evaluate_every_steps=0,
+        learner=learner,
+    )  # fmt: skip
+    run = TrainingRun(config, tmp_path / "run")
+    shown = run.learning.added
+    assert shown == run.learning.replay.human_count > 60
+    run.train()
+    first, second = read_metrics(tmp_path / "run")
+    assert (int(first["human_steps"]), int(second["human_steps"])) == (shown, 0)
 
 
 def test_an_empty_place_is_refused(tmp_path, capsys):

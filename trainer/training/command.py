@@ -44,6 +44,7 @@ from trainer.training.config import (
     settings_in,
 )
 from trainer.training.curves import write_learning_curve
+from trainer.training.demonstrations import SCRIPTED
 from trainer.training.metrics import EpisodeMetrics, metrics_table, read_metrics
 from trainer.training.run import TrainingRun, environment_of
 
@@ -51,6 +52,7 @@ FINDS_NOTHING = (
     "every episode has had the same return so far: there is nothing to learn from. A human, or more"
     " noise (--set exploration_initial=1 --set exploration_final=0.5), may find what pays"
 )
+
 
 @dataclass(frozen=True)
 class Run:
@@ -170,7 +172,8 @@ def _begin(preset: str, values: dict[str, Any], how: argparse.Namespace) -> Run:
     human = values.get("human", DEFAULTS.human)
     # A run's own config says ``person``.
     values["human"] = PERSON if human in (*HUMANS, PERSON) else located(human)
-    if demonstrations := values.get("demonstrations"):
+    demonstrations = values.get("demonstrations")
+    if demonstrations and not SCRIPTED.fullmatch(demonstrations):
         values["demonstrations"] = os.path.abspath(demonstrations)
     values["scenario"] = scenario_of(values.get("scenario", DEFAULTS.scenario))
     config = make_config(preset, values)

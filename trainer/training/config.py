@@ -98,7 +98,8 @@ class RunConfig:
     and gives other weights."""
     demonstrations: str = ""
     """Drives to learn from before the first step: a person's recordings, F.mcap of bridge record,
-    or a LeRobot data set."""
+    a LeRobot data set, or ``human:N``, N drives of the scripted human. Their seconds count as the
+    human's."""
     success: str = ""
     """Who says whether an episode succeeded, where the environment does not: it takes the last
     observation, its info and the return, and returns True, False or None."""

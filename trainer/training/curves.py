@@ -80,7 +80,8 @@ def _curves(run_dir: Path) -> pd.DataFrame:
     curves = metrics_table(run_dir).drop(columns="outcome").astype(float)
     if curves.empty:
         raise UserError(f"{run_dir} holds no metrics to draw")
-    curves["human_share"] = curves.human_steps / curves.steps
+    # Demonstrations before the first episode count in it.
+    curves["human_share"] = (curves.human_steps / curves.steps).clip(upper=1.0)
     smooth = [name for name in PANELS if name not in (SUCCESS, RETURN)]
     curves[smooth] = curves[smooth].rolling(WINDOW, min_periods=1).mean()
     return curves

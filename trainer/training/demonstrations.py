@@ -2,10 +2,13 @@
 
 A person's sittings hold transitions. Of a recording of the wire the actions are driven again, in
 the run's environment. A LeRobot data set holds observations and actions; its pictures are one a
-frame, and a stack is made of the frames before.
+frame, and a stack is made of the frames before. ``human:N`` stands for N drives of a scripted
+human.
 """
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
@@ -19,11 +22,15 @@ from bridge.messages import is_picture
 from bridge.recording import Recording
 from edge_runtime.util import UserError
 from trainer.environments import inner, task_of
+from trainer.evaluation import Drive, Driver
 from trainer.learner.replay import Transition
 from trainer.person.recording import TOPIC, RecordedStep, find_recordings, read_episodes, read_steps
+from trainer.util import Purpose, episode_seed
 
 Episode = list[Transition]
 REWARD = "next.reward"  # Column of a data set; ours have none
+SCRIPTED = re.compile(r"human:(\d+)")
+"""In a path's place: so many drives of the run's own human, a script or a model."""
 
 
 def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
@@ -41,6 +48,17 @@ def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
             yield from (_from_sitting(steps, env) for steps in read_episodes(read_steps(path)))
         else:
             yield from (_driven_again(drive, env) for drive in fork.read_episodes(path))
+
+
+def drive_demonstrations(driver: Driver, env: Any, seed: int, episodes: int) -> Iterator[Episode]:
+    """Yield episodes of a run of this seed that the driver drives alone."""
+    for number in range(episodes):
+        drive, episode = Drive(env, episode_seed(seed, Purpose.DEMONSTRATIONS, number)), Episode()
+        driver.reset()
+        while not drive.over:
+            drive.step(driver.act(drive.observation))
+            episode.append(replace(drive.seen, overruled=None, human=True))
+        yield episode
 
 
 def _from_sitting(steps: list[RecordedStep], env: Any) -> Episode:

@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -40,7 +40,12 @@ from trainer.learner.networks import Actor
 from trainer.learner.replay import Action, Observation, Transition
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import CONFIG_FILE, RANDOM, TAKEOVERS, RunConfig
-from trainer.training.demonstrations import read_demonstrations
+from trainer.training.demonstrations import (
+    SCRIPTED,
+    Episode,
+    drive_demonstrations,
+    read_demonstrations,
+)
 from trainer.training.learning import LearningThread, diverged
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 
@@ -185,6 +190,14 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
     return HumanGuide(driver, expert, steps_held(period_s), attention, asking, hands, random)
 
 
+def demonstrations_of(config: RunConfig, env: Any) -> Iterator[Episode]:
+    """Yield the episodes that fill a run's replay before its first step."""
+    if scripted := SCRIPTED.fullmatch(config.demonstrations):
+        driver, _ = load_driver(config.human, env)
+        return drive_demonstrations(driver, env, config.seed, int(scripted[1]))
+    return read_demonstrations(Path(config.demonstrations), env)
+
+
 class TrainingRun:
     """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
@@ -218,14 +231,16 @@ class TrainingRun:
         self.quitting = False  # The episode under way is to be the last of this call
         self.found = False
         """Whether an episode has succeeded, in training or validation, or success is unknown."""
+        self._shown_steps = 0  # Of the human in demonstrations; the first episode counts them
         if resume:
             path = run_dir / CHECKPOINT_FILE
             with util.fitting(f"{path} does not fit this run"):
                 self._restore(util.load_torch(path))
         elif config.demonstrations:
-            for episode in read_demonstrations(Path(config.demonstrations), self.env):
+            for episode in demonstrations_of(config, self.env):
                 for transition in episode:
                     self.learning.add(transition)
+                    self._shown_steps += transition.human
                 self.learning.release()
 
     def train(
@@ -302,7 +317,9 @@ class TrainingRun:
         self.validation.load_state_dict(state)
 
     def _episode(self) -> EpisodeMetrics:
-        config, metrics = self.config, EpisodeMetrics(self.episode)
+        config = self.config
+        metrics = EpisodeMetrics(self.episode, human_steps=self._shown_steps)
+        self._shown_steps = 0
         seed = util.episode_seed(config.seed, util.Purpose.TRAINING, self.episode)
         observation, info = self.vehicle.reset(seed=seed)
         self._drawn = np.zeros(self.env.action_space.shape)
