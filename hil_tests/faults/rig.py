@@ -49,8 +49,9 @@ class Rig:
     ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
     ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
     Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
-    sends states here, without a simulator. With the vehicle ``hunter`` there is a mock of it on a
-    CAN bus. The attributes below exist only where the options ask for them.
+    sends states here, without a simulator; with ``senses`` a source stands in its place. With the
+    vehicle ``hunter`` there is a mock of it on a CAN bus. The attributes below exist only where the
+    options ask for them.
     """
 
     simulator: Process
@@ -69,6 +70,7 @@ class Rig:
         vehicle: str = "none",
         sender: bool = False,
         ride_s: float = 0.0,
+        senses: bool = False,
     ) -> None:
         self.number = 0  # Of the try
         self.timeline = DriveTimeline()
@@ -76,6 +78,7 @@ class Rig:
         self.task, self.period_s = task, task.control_period_s
         self.has_vehicle = vehicle != "none"  # Only an operator lets it drive again after a stop
         self._directory, self._processes = directory, list[Process]()
+        self._policy, self._senses = policy, senses
         self._edge = [*policy, "--vehicle-id", VEHICLE_ID, "--vehicle", vehicle]
         if ride_s:
             (directory / "edge.toml").write_text(f"[ride_through]\nmax_s = {ride_s}\n")
@@ -121,10 +124,13 @@ class Rig:
         return self._start(*run)
 
     def start_simulator(self) -> Process:
+        where = ("--listen", self._listen, "--vehicle-id", VEHICLE_ID)
+        if self._senses:
+            sense = ("bridge", "sense", "--source", inside.SENSES, *self._policy)
+            return self._start(*sense, *where)
         return self._start(
             _INSIDE, "bridge", "simulate", "--env", inside.ENVIRONMENT, "--clock", "realtime",
-            "--listen", self._listen, "--vehicle-id", VEHICLE_ID,
-            "--out", str(self._directory / "report.json"),
+            *where, "--out", str(self._directory / "report.json"),
         )  # fmt: skip
 
     def start_recorder(self) -> tuple[Process, Path]:
