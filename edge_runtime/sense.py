@@ -3,8 +3,9 @@
 A source is a class with `observe()`, which returns an array for each entry of the policy's
 manifest, taken after it was called. `Intake` judges what it says and makes states of it; it is
 pure: time is passed in. A thread of its own calls the source, so that one that hangs holds neither
-the loop nor ^C. The first fault ends the command: no state comes any more, and the edge runtime
-stops by its own rule, as if the cable had been pulled. Runs on the board, with its libraries alone.
+the loop nor ^C. What is too old is not sent, and any other fault ends the command: no state comes,
+and the edge runtime stops by its own rule, as if the cable had been pulled. It runs on the board
+with the board's libraries alone.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ SOURCE_FAILED = 1  # exit status
 FROZEN_PERIODS = 5
 """A camera's noise changes a picture each time: one that stays the same for so long is frozen, or
 the lens is covered."""
+GIVES_UP_S = 2.0  # so long without a state, and the command ends: the vehicle stopped long ago
 ROUNDING_S = 1e-9
 _POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
 
@@ -91,15 +93,14 @@ def pack(task: Task, seen: Any) -> Dict[str, bytes]:
 
 
 class Intake:
-    """Makes the states of one session from what a source says; no use after a SourceError.
+    """Makes the states of one session from what a source says.
 
     Call `begin` when the source is asked and `take` with its answer; `now_s` is monotonic. A state
-    is stamped with the moment of asking. The answer may take 2.2 T at most, as long as the edge
-    runtime answers a state, and longer than T only once in a row: the policy is made for T.
+    is stamped with the moment of asking. An answer may take 2.2 T, as long as the edge runtime
+    answers a state, but more than T only once in a row: the policy is made for T.
     """
 
     def __init__(self, task: Task, session: str, zero_ns: int) -> None:
-        self.limit_s = SILENCE_PERIODS * task.control_period_s
         self._task, self._layout, self._session = task, Layout(task), session
         self._zero_ns = zero_ns  # the wall clock at monotonic 0: stamps never leap
         self._episode = self._step = self._unchanged = 0
@@ -109,20 +110,18 @@ class Intake:
     def begin(self, now_s: float) -> None:
         self._began_s = now_s
 
-    def check_age(self, now_s: float) -> None:
-        """Raise SourceError where the answer has taken too long, or does not come."""
-        if now_s - self._began_s > self.limit_s + ROUNDING_S:
-            raise SourceError(f"observe() takes longer than {self.limit_s:g} s, or hangs")
+    def take(self, seen: Seen, now_s: float) -> Optional[State]:
+        """Return the state to send now; None where it is too old.
 
-    def take(self, seen: Seen, now_s: float) -> State:
-        """Return the state to send now."""
-        self.check_age(now_s)
-        period_s = self._task.control_period_s
-        slow = now_s - self._began_s > period_s + ROUNDING_S
-        if slow and self._was_slow:
-            raise SourceError(f"observe() takes longer than the control period, {period_s:g} s")
-        self._was_slow = slow
+        Raises SourceError for numbers that are not finite, and for a picture that has frozen; this
+        session is then over.
+        """
         self._watch(seen.observation)
+        period_s, periods = self._task.control_period_s, 1.0 if self._was_slow else SILENCE_PERIODS
+        took_s = now_s - self._began_s - ROUNDING_S
+        self._was_slow = took_s > period_s
+        if took_s > periods * period_s:
+            return None
         state = State(
             session=self._session, episode=self._episode, step=self._step,
             sim_time_s=round(self._step * period_s, 6), speed_mps=seen.speed_mps,
@@ -248,7 +247,10 @@ def run(arguments: argparse.Namespace) -> int:
         end = _End(session, vehicle_id, task)
         stack.callback(end.close)
         try:
-            _sense(_Source(make, task), end, task, tls, f"{asked.source} vehicle_id={vehicle_id}")
+            source = _Source(make, task)
+            source.answer()  # The first one is not sent: a camera takes its time to open.
+            print(f"ready vehicle_id={vehicle_id} source={asked.source}", flush=True)
+            _sense(source, end, task, tls)
         except SourceError as error:
             # At once, before anything is closed: nothing is sent any more.
             stops = "nothing is sent any more, so the vehicle stops"
@@ -257,27 +259,27 @@ def run(arguments: argparse.Namespace) -> int:
     return SOURCE_FAILED
 
 
-def _sense(
-    source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles], name: str
-) -> None:
+def _sense(source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles]) -> None:
     """Send a state each period until the source fails: SourceError."""
     intake = Intake(task, end.session, time.time_ns() - time.monotonic_ns())
-    source.answer()  # The first one is not sent: a camera takes its time to open.
-    print(f"ready source={name}", flush=True)
-    said, next_s = end.told, time.monotonic()
+    said, next_s, sent_s = end.told, time.monotonic(), time.monotonic()
     while True:
         time.sleep(max(0.0, next_s - time.monotonic()))
-        now_s = time.monotonic()
-        next_s = max(next_s + task.control_period_s, now_s)
         if tls is not None:
             tls.require_valid(time.time())
+        now_s = time.monotonic()
+        next_s = max(next_s + task.control_period_s, now_s)
         intake.begin(now_s)
         source.ask()
-        seen = source.answer(now_s + intake.limit_s)
+        seen = source.answer(sent_s + GIVES_UP_S)
         if seen is None:
-            intake.check_age(math.inf)
+            raise SourceError(f"observe() hangs, or is too slow: no state for {GIVES_UP_S:g} s")
+        took_s = time.monotonic() - now_s
+        if (state := intake.take(seen, now_s + took_s)) is None:
+            print(f"too old: observe() took {took_s:.2f} s; it is not sent", flush=True)
         else:
-            end.send(intake.take(seen, time.monotonic()))
+            end.send(state)
+            sent_s = time.monotonic()
         if end.told != said:
             said = end.told
             print(f"the edge runtime says {' '.join(said).strip()}", flush=True)
