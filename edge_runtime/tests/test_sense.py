@@ -117,7 +117,7 @@ def test_a_state_is_stamped_when_the_source_was_asked_and_an_episode_ends_as_it_
 def sent(ages: list[float], pictures: list[int]) -> list[bool]:
     """Whether a state comes of each answer of these ages (in T) and pictures, until it fails."""
     intake, now_s, found = Intake(TASK, "s", 0), 100.0, list[bool]()
-    for age, number in zip(ages, pictures, strict=True):
+    for age, number in zip(ages, pictures):
         intake.begin(now_s)
         now_s += age * T
         try:

@@ -242,8 +242,8 @@ class MockHunter:
     def _move(self, step_s: float) -> None:
         """Integrate one step towards the set-point, or brake with the steering held."""
         p = self._parameters
-        in_hand = self.control in (Control.REMOTE, Control.REMOTE_OVER_CAN) and self.sticks != REST
-        if in_hand:
+        remote = self.control in (Control.REMOTE, Control.REMOTE_OVER_CAN)
+        if in_hand := remote and self.state == protocol.STATE_OK and self.sticks != REST:
             self._setpoint = self.sticks
         if not (in_hand or self.obeys):
             # Where control comes back, it does so from a stand, not with what was asked before.
