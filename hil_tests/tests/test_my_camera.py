@@ -44,7 +44,7 @@ def my_camera(monkeypatch, tmp_path, frames):
     return my_camera
 
 
-def test_a_camera_shows_what_was_taken_after_it_was_asked_and_says_that_it_is_gone(
+def test_a_camera_shows_what_was_taken_since_it_was_asked_and_says_when_it_is_gone(
     my_camera, frames
 ):
     camera, seen = my_camera.Camera(), []
