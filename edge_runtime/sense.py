@@ -3,9 +3,9 @@
 A source is a class with `observe()`, which returns an array for each entry of the policy's
 manifest, taken after it was called. `Intake` judges what it says and makes states of it; it is
 pure: time is passed in. A thread of its own calls the source, so that one that hangs holds neither
-the loop nor ^C. What is too old is not sent, and any other fault ends the command: no state comes,
-and the edge runtime stops by its own rule, as if the cable had been pulled. It runs on the board
-with the board's libraries alone.
+the loop nor ^C (unless it holds the interpreter). What is too old is not sent, and any other fault
+ends the command: no state comes, and the edge runtime stops by its own rule, as if the cable had
+been pulled. It runs on the board with the board's libraries alone.
 """
 
 from __future__ import annotations

@@ -264,6 +264,14 @@ class Source:
     def episode_over(self):
         return open("word").read() == "over"
 
+class Few(Source):
+    count = 0  # one state in time, one too late, and then nothing that can be read
+
+    def observe(self):
+        self.count += 1
+        time.sleep(0.4 * (self.count == 3))
+        return super().observe() if self.count < 4 else 7
+
 def broken():
     raise RuntimeError("no device")
 """
@@ -328,6 +336,7 @@ def test_an_end_that_the_source_tells_is_no_fault(folder):
 
 def test_what_cannot_begin_is_refused(folder, capsys, monkeypatch):
     monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "my_source", raising=False)
     policy = make_policy(folder)
     for source in ("my_source:Nobody", "nowhere:Source", "my_source"):
         words = ("sense", "--source", source, "--policy", policy, "--allow-unsigned")
@@ -340,6 +349,16 @@ def test_what_cannot_begin_is_refused(folder, capsys, monkeypatch):
     found, _, err = call(capsys, *words, *listen, package="edge_runtime")
     assert found == 1
     assert "no device" in err
+
+
+def test_what_is_too_old_is_said_and_what_cannot_be_read_ends_it(folder, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "my_source", raising=False)
+    words = ("sense", "--source", "my_source:Few", "--policy", make_policy(folder))
+    listen = ("--allow-unsigned", "--listen", free_endpoint())
+    found, out, err = call(capsys, *words, *listen, package="bridge")
+    assert (found, out.count("too old"), len(err.splitlines())) == (1, 1, 1)
+    assert "int, not frames" in err
 
 
 def test_a_hanging_source_holds_no_signal(folder):
