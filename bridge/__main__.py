@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from edge_runtime.cli import program, run_cli
@@ -26,4 +27,7 @@ main = program(
 )
 
 if __name__ == "__main__":
-    sys.exit(run_cli(main))
+    status = run_cli(main)
+    if sys.argv[1:2] == ["sense"]:  # The interpreter's exit would wait for threads of a source.
+        os._exit(status)
+    sys.exit(status)

@@ -250,6 +250,7 @@ class Source:
 
     def __init__(self):
         self.random = np.random.default_rng(0)
+        threading.Thread(target=threading.Event().wait).start()  # no daemon: it holds the exit
 
     def observe(self):
         word = open("word").read()
@@ -266,6 +267,9 @@ class Source:
 
 class Few(Source):
     count = 0  # one state in time, one too late, and then nothing that can be read
+
+    def __init__(self):
+        self.random = np.random.default_rng(0)
 
     def observe(self):
         self.count += 1
