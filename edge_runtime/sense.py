@@ -95,22 +95,19 @@ def pack(task: Task, seen: Any) -> Dict[str, bytes]:
 class Intake:
     """Makes the states of one session from what a source says.
 
-    Call `begin` when the source is asked and `take` with its answer; `now_s` is monotonic. A state
-    is stamped with the moment of asking. An answer may take 2.2 T, as long as the edge runtime
-    answers a state, but more than T only once in a row: the policy is made for T.
+    Times are monotonic. A state is stamped with the moment at which the source was asked. The
+    answer may take 2.2 T, as long as the edge runtime answers a state, but more than T only once in
+    a row: the policy is made for T.
     """
 
     def __init__(self, task: Task, session: str, zero_ns: int) -> None:
         self._task, self._layout, self._session = task, Layout(task), session
         self._zero_ns = zero_ns  # the wall clock at monotonic 0: stamps never leap
         self._episode = self._step = self._unchanged = 0
-        self._began_s, self._was_slow = -math.inf, False
+        self._was_slow = False
         self._pictures: Dict[str, bytes] = {}
 
-    def begin(self, now_s: float) -> None:
-        self._began_s = now_s
-
-    def take(self, seen: Seen, now_s: float) -> Optional[State]:
+    def take(self, seen: Seen, asked_s: float, now_s: float) -> Optional[State]:
         """Return the state to send now; None where it is too old.
 
         Raises SourceError for numbers that are not finite, and for a picture that has frozen; this
@@ -118,14 +115,14 @@ class Intake:
         """
         self._watch(seen.observation)
         period_s, periods = self._task.control_period_s, 1.0 if self._was_slow else SILENCE_PERIODS
-        took_s = now_s - self._began_s - ROUNDING_S
+        took_s = now_s - asked_s - ROUNDING_S
         self._was_slow = took_s > period_s
         if took_s > periods * period_s:
             return None
         state = State(
             session=self._session, episode=self._episode, step=self._step,
             sim_time_s=round(self._step * period_s, 6), speed_mps=seen.speed_mps,
-            sent_ns=self._zero_ns + round(self._began_s * 1e9), final=seen.episode_over,
+            sent_ns=self._zero_ns + round(asked_s * 1e9), final=seen.episode_over,
             observation=seen.observation, task=self._layout.task_text,
         )  # fmt: skip
         # Just what the edge runtime does with it.
@@ -267,19 +264,18 @@ def _sense(source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles
         time.sleep(max(0.0, next_s - time.monotonic()))
         if tls is not None:
             tls.require_valid(time.time())
-        now_s = time.monotonic()
-        next_s = max(next_s + task.control_period_s, now_s)
-        intake.begin(now_s)
+        asked_s = time.monotonic()
+        next_s = max(next_s + task.control_period_s, asked_s)
         source.ask()
         seen = source.answer(sent_s + GIVES_UP_S)
         if seen is None:
             raise SourceError(f"observe() hangs, or is too slow: no state for {GIVES_UP_S:g} s")
-        took_s = time.monotonic() - now_s
-        if (state := intake.take(seen, now_s + took_s)) is None:
-            print(f"too old: observe() took {took_s:.2f} s; it is not sent", flush=True)
+        now_s = time.monotonic()
+        if (state := intake.take(seen, asked_s, now_s)) is None:
+            print(f"too old: observe() took {now_s - asked_s:.2f} s; it is not sent", flush=True)
         else:
             end.send(state)
-            sent_s = time.monotonic()
+            sent_s = now_s
         if end.told != said:
             said = end.told
             print(f"the edge runtime says {' '.join(said).strip()}", flush=True)

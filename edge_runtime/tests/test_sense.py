@@ -93,9 +93,8 @@ def test_what_is_not_the_manifests_is_no_observation(seen):
 def test_what_is_not_finite_is_never_sent(ranges, speed_mps):
     seen = look(Says({**GOOD, "ranges": np.array(ranges)}, speed_mps=speed_mps), ROVER_TASK)
     intake = Intake(ROVER_TASK, "s", 0)
-    intake.begin(1.0)
     with pytest.raises(SourceError):
-        intake.take(seen, 1.0)
+        intake.take(seen, 1.0, 1.0)
 
 
 def picture(number: int) -> dict[str, bytes]:
@@ -105,8 +104,8 @@ def picture(number: int) -> dict[str, bytes]:
 def test_a_state_is_stamped_when_the_source_was_asked_and_an_episode_ends_as_it_says():
     intake, found = Intake(TASK, "s", zero_ns=10**18), list[Any]()
     for number, over in enumerate([False, True, False]):
-        intake.begin(number * T)
-        found.append(intake.take(Seen(picture(number), None, over), number * T + 0.5 * T))
+        seen = Seen(picture(number), None, over)
+        found.append(intake.take(seen, number * T, number * T + 0.5 * T))
     assert [(s.episode, s.step, s.final) for s in found] == [
         (0, 0, False), (0, 1, True), (1, 0, False),
     ]  # fmt: skip
@@ -118,10 +117,9 @@ def sent(ages: list[float], pictures: list[int]) -> list[bool]:
     """Whether a state comes of each answer of these ages (in T) and pictures, until it fails."""
     intake, now_s, found = Intake(TASK, "s", 0), 100.0, list[bool]()
     for age, number in zip(ages, pictures):
-        intake.begin(now_s)
-        now_s += age * T
+        asked_s, now_s = now_s, now_s + age * T
         try:
-            found.append(intake.take(Seen(picture(number)), now_s) is not None)
+            found.append(intake.take(Seen(picture(number)), asked_s, now_s) is not None)
         except SourceError:
             break
     return found
@@ -141,8 +139,7 @@ def test_pictures_that_stay_the_same_are_frozen():
     numbers = msgspec.structs.replace(TASK, observation={"x": Entry(dtype="float32", shape=[1])})
     intake = Intake(numbers, "s", 0)  # a robot that stands may measure the same for hours
     for _ in range(3 * FROZEN_PERIODS):
-        intake.begin(1.0)
-        assert intake.take(Seen({"x": bytes(4)}), 1.0)
+        assert intake.take(Seen({"x": bytes(4)}), 1.0, 1.0)
 
 
 KINDS = ("good", "raises", "nan", "shape", "over", "same")
@@ -172,13 +169,12 @@ class Story:
         for count, (age, kind, more) in enumerate(each):
             link = max(0.0, link + more) if count > 1 else 0.0
             begun_s = self.now_s
-            intake.begin(begun_s)
             if age * T > GIVES_UP_S:
                 return
             try:
                 number += kind != "same"
                 seen = self.says(kind, number)
-                state = intake.take(seen, begun_s + age * T)
+                state = intake.take(seen, begun_s, begun_s + age * T)
             except (SourceError, ValueError):
                 return
             self.now_s = begun_s + max(age, 1.0) * T
