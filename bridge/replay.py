@@ -222,7 +222,7 @@ def _vehicle_limits(drive: RecordedDrive, policy: Policy, config: Config) -> Lim
     elif name not in (NONE, *BUILT_IN):
         option = "--config FILE.toml whose table [vehicle] has as its driver"
         name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
-    return vehicle_limits(name, config.vehicle_settings, policy.manifest)
+    return vehicle_limits(name, config.vehicle_settings, policy.manifest, config.bounds)
 
 
 def controller_of(

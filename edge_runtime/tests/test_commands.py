@@ -18,6 +18,7 @@ import edge_runtime
 from edge_runtime import __main__ as commands
 from edge_runtime import cli
 from edge_runtime.__main__ import main, render_status
+from edge_runtime.bounds import Bounds
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
@@ -114,6 +115,13 @@ WRONG = {
     "bus = 'can0'": "bus",
     "[vehicle]\nname = 'mock'": "vehicle_settings",
     "[vehicle]\ndriver = 3": "vehicle",
+    "[vehicle]\nrearm = 'never'": "vehicle.rearm.*each_episode, once",
+    "max_speed_mps = 0.3": r"max_speed_mps must stand in the table \[vehicle\]",
+    **{
+        f"[vehicle]\n{name} = {value}": name
+        for name in Bounds._fields
+        for value in ("nan", "inf", "-1.0", "0", "0.0", "'fast'", "true", "[1.0]")
+    },
 }
 
 
@@ -121,6 +129,14 @@ WRONG = {
 def test_a_wrong_config_file_is_named_with_the_key(settings, text):
     with pytest.raises(UserError, match=rf"edge\.toml.*{WRONG[text]}"):
         load_config(settings(text), {"policy": "p.onnx"})
+
+
+def test_bounds_are_of_the_table_vehicle_and_a_leash_waits_for_its_re_arm(settings):
+    text = "policy = 'p.onnx'\n[vehicle]\ndriver = 'mock'\nmax_speed_mps = 1\nrearm = 'once'"
+    config = load_config(settings(text), {})
+    assert (config.bounds, config.rearm) == (Bounds(max_speed_mps=1.0), "once")
+    assert config.is_armed_at_start
+    assert not load_config(settings(f"{text}\nleash_m = 2.5"), {}).is_armed_at_start
 
 
 def test_flags_win_over_the_file(settings):
