@@ -61,6 +61,14 @@ class RecordedEpisode:
     commands: dict[int, Command] = field(default_factory=dict)  # First answer to each state
     applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
     """Of each step: the action, and whether the brake was pressed."""
+    waited: int = 0  # Steps before the first one, while a vehicle waited for a re-arm
+
+    def leave_out_waiting(self) -> None:
+        """Count the steps from the first one that the environment took."""
+        for name in ("states", "commands", "applied"):
+            kept = getattr(self, name).items()
+            driven = {step - self.waited: each for step, each in kept if step >= self.waited}
+            setattr(self, name, driven)
 
     @property
     def steps(self) -> int:
@@ -110,6 +118,7 @@ def read_episodes(
             about = message.origin, message.task, heard.arrived_ns
             begun = RecordedEpisode(path, vehicle_id, len(drives), *about)
             begun = drives.setdefault((message.origin.session, message.episode), begun)
+            begun.waited = message.waited
             if len(message.applied or ()) == len(begun.task.action):
                 begun.applied[message.step - 1] = list(message.applied or ()), message.braked
         elif isinstance(message, State | Command):
@@ -119,6 +128,8 @@ def read_episodes(
                 kept: dict[int, Any] = drive.states if is_state else drive.commands
                 kept.setdefault(message.step, message)
     recording.say_trouble()
+    for drive in drives.values():
+        drive.leave_out_waiting()
     return list(drives.values())
 
 

@@ -21,7 +21,7 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
-from edge_runtime.transport import is_tls, open_session
+from edge_runtime.transport import open_session, rearm_command
 from edge_runtime.util import PathLike, ends_within, printable
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
@@ -249,9 +249,3 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
             each_episode=config.rearm == EACH_EPISODE,
         )
     )
-
-
-def rearm_command(connect: str, vehicle_id: str) -> str:
-    """Return what an operator types to let a vehicle drive again."""
-    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
-    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
