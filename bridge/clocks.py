@@ -81,9 +81,6 @@ class _Clock:
             self.check.end(state.step)
         self.publish(self._stamped(state))
 
-    def pause(self) -> None:
-        """Wait before the next exchange, where that does not keep time by itself."""
-
     def close(self) -> None:
         pass
 
@@ -111,9 +108,6 @@ class LockStepClock(_Clock):
 
     def receive(self, payload: bytes) -> None:
         self._inbox.put(payload)
-
-    def pause(self) -> None:
-        time.sleep(self._period_s)
 
     def exchange(self, state: State) -> Decision:
         """Let virtual time run from this tick to the end of its command window."""

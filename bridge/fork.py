@@ -61,14 +61,7 @@ class RecordedEpisode:
     commands: dict[int, Command] = field(default_factory=dict)  # First answer to each state
     applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
     """Of each step: the action, and whether the brake was pressed."""
-    waited: int = 0  # Steps before the first one, while a vehicle waited for a re-arm
-
-    def leave_out_waiting(self) -> None:
-        """Count the steps from the first one that the environment took."""
-        for name in ("states", "commands", "applied"):
-            kept = getattr(self, name).items()
-            driven = {step - self.waited: each for step, each in kept if step >= self.waited}
-            setattr(self, name, driven)
+    waited: int = 0  # Steps that do not count: the vehicle waited for a re-arm
 
     @property
     def steps(self) -> int:
@@ -120,16 +113,15 @@ def read_episodes(
             begun = drives.setdefault((message.origin.session, message.episode), begun)
             begun.waited = message.waited
             if len(message.applied or ()) == len(begun.task.action):
-                begun.applied[message.step - 1] = list(message.applied or ()), message.braked
+                step = message.step - message.waited - 1
+                begun.applied[step] = list(message.applied or ()), message.braked
         elif isinstance(message, State | Command):
             drive = drives.get((message.session, message.episode))
             if drive is not None and number in (None, drive.number):
                 is_state = isinstance(message, State)
                 kept: dict[int, Any] = drive.states if is_state else drive.commands
-                kept.setdefault(message.step, message)
+                kept.setdefault(message.step - drive.waited, message)
     recording.say_trouble()
-    for drive in drives.values():
-        drive.leave_out_waiting()
     return list(drives.values())
 
 

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from bridge import environments, report
-from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
+from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, LockStepClock, VehicleClock
 from bridge.environments import CONDITIONS, Adapter, Environment, make_environment
 from bridge.inbound import NO_COMMAND, CommandCheck, Decision
 from bridge.messages import Origin, Scene
@@ -250,7 +250,8 @@ class EpisodeRunner:
                 if waits and self.on_wait is not None:
                     if not waited:
                         self.on_wait(episode, command.reason)
-                    self.clock.pause()
+                    # Real time keeps its pace by itself.
+                    time.sleep(self._period_s * isinstance(self.clock, LockStepClock))
                     waited += 1
                     continue
             action = apply(self._adapter, decision)

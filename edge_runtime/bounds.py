@@ -19,6 +19,9 @@ class Bounds(NamedTuple):
     leash_m: float = math.inf
 
 
+NO_BOUNDS = Bounds()
+
+
 class Model(NamedTuple):
     """What a vehicle can do, as far as its driver knows (inf: it does not).
 

@@ -160,8 +160,6 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
 
 def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
     """`vehicle` is a driver, or a table: `driver`, rules, and a table of settings for each one."""
-    if misplaced := tables.keys() & {*_RULES}:
-        raise UserError(f"{', '.join(sorted(misplaced))} must stand in the table [vehicle]")
     if not isinstance(tables.get("vehicle"), dict):
         return tables
     settings = dict(tables["vehicle"])
@@ -185,9 +183,7 @@ def _check(config: Config) -> Config:
     check_choice("vehicle.rearm", config.rearm, REARM)
     for name, value in config.bounds._asdict().items():
         if getattr(config, name) is not None and not 0.0 < value < math.inf:
-            raise UserError(
-                f"vehicle.{name} {value:g} is not valid: it must be above 0, and finite"
-            )
+            raise UserError(f"vehicle.{name} {value:g} is not valid: it must be finite, above 0")
     return config
 
 

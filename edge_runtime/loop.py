@@ -160,7 +160,7 @@ class ControlLoop:
         """Return the fields of health about the operator's bounds; None: none is set."""
         if self._vehicle is None:
             return {}
-        found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash_left_m}
+        found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}
         return {name: value if value < math.inf else None for name, value in found.items()}
 
     def _on_state(self, payload: bytes) -> None:

@@ -8,23 +8,19 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 
 from edge_runtime.link import FIELDS
 from edge_runtime.util import UserError, printable
-from edge_runtime.wire import DRIVE
 
 _PERIOD_S = 1.0
-_CLEAR = "\x1b[H\x1b[2J"
-_OLD_S = 1.5  # Feedback comes twenty times a second
-
-Status = Mapping[str, Any]  # The reply of the queryable
+_OLD_S = 1.5  # feedback comes twenty times a second
+Status = Mapping[str, Any]  # the reply of the queryable
 
 
 def watch(look: Callable[[], Status], first: Status) -> None:
     """Print the status once a second until ^C; a runtime that is gone is waited for."""
-    lines = render(first)
-    clear = _CLEAR if sys.stdout.isatty() else ""
+    lines, clear = render(first), "\x1b[H\x1b[2J" if sys.stdout.isatty() else ""
     while True:
-        asked_s = time.monotonic()
+        next_s = time.monotonic() + _PERIOD_S
         print(clear + "\n".join(map(printable, [time.strftime("%H:%M:%S"), *lines])), flush=True)
-        time.sleep(max(0.0, asked_s + _PERIOD_S - time.monotonic()))
+        time.sleep(max(0.0, next_s - time.monotonic()))
         try:
             lines = render(look())
         except UserError as error:
@@ -33,27 +29,25 @@ def watch(look: Callable[[], Status], first: Status) -> None:
 
 def render(status: Status) -> List[str]:
     """Return a line for each thing, at most some 40 characters wide."""
-    feedback: Status = status.get("feedback") or {}
-    command: Status = status.get("command") or {}
+    told, command = (status.get(topic) or {} for topic in ("feedback", "command"))
     names = [row["name"] for row in status["manifest"]["action"]]
-    faults = ", ".join(feedback.get("faults", ())) or status["vehicle_fault"]
+    speed = f"{_number(told.get('speed_mps'), 'm/s')} of {_number(told.get('commanded_speed_mps'))}"
     rows = {
         "vehicle": f"{status['vehicle_id']} ({status['vehicle']})",
-        "mode": " ".join(filter(None, (status["mode"], status["reason"]))),
+        "mode": f"{status['mode']} {status['reason']}",
         "moved by": _who(status),
-        "fault": faults or "none",
+        "fault": ", ".join(told.get("faults", ())) or status["vehicle_fault"] or "none",
         "asked": _actions(names, command.get("action")),
-        "achieved": _actions(names, feedback.get("action")),
-        "speed": _number(feedback.get("speed_mps"), "m/s")
-        + _of(feedback.get("commanded_speed_mps"), "asked"),
+        "achieved": _actions(names, told.get("action")),
+        "speed": speed,
         "cap": f"{_number(status.get('max_speed_mps'), 'm/s')},"
         f" {_number(status.get('max_steering_rad'), 'rad')}",
-        "leash": _number(status.get("leash_left_m"), "m left") + _of(status.get("leash_m"), "of"),
-        "battery": _number(feedback.get("battery_v"), "V"),
+        "leash": f"{_number(status.get('leash_left_m'), 'm')} of {_number(status.get('leash_m'))}",
+        "battery": _number(told.get("battery_v"), "V"),
         "board": _number(status.get("temperature_c"), "C"),
         **_link(status.get("link", {})),
     }
-    age_s = (status["sent_ns"] - feedback.get("sent_ns", status["sent_ns"])) * 1e-9
+    age_s = (status["sent_ns"] - told.get("sent_ns", status["sent_ns"])) * 1e-9
     if age_s > _OLD_S:
         rows["achieved"] = rows["speed"] = f"not heard for {age_s:.0f} s"
     return [f"{name:<9} {value}" for name, value in rows.items()]
@@ -63,9 +57,7 @@ def _who(status: Status) -> str:
     """Say who may move the vehicle now."""
     if status["vehicle"] == "none":
         return "nobody: no vehicle"
-    if status["needs_rearm"]:
-        return "NOBODY until a re-arm"
-    return "THE POLICY" if status["mode"] == DRIVE else "THE POLICY, with the next states"
+    return "NOBODY until a re-arm" if status["needs_rearm"] else "THE POLICY"
 
 
 def _link(link: Mapping[str, float]) -> Dict[str, str]:
@@ -79,14 +71,8 @@ def _link(link: Mapping[str, float]) -> Dict[str, str]:
 
 
 def _actions(names: Sequence[str], action: Optional[Sequence[float]]) -> str:
-    if action is None:
-        return "-"
-    return ", ".join(f"{name} {value:.2f}" for name, value in zip(names, action))
+    return ", ".join(f"{name} {value:.2f}" for name, value in zip(names, action or ())) or "-"
 
 
-def _number(value: Optional[float], unit: str) -> str:
-    return "-" if value is None else f"{value:.2f} {unit}"
-
-
-def _of(value: Optional[float], word: str) -> str:
-    return "" if value is None else f" ({word} {value:.2f})"
+def _number(value: Optional[float], unit: str = "") -> str:
+    return "-" if value is None else f"{value:.2f} {unit}".rstrip()

@@ -106,8 +106,8 @@ def test_whoever_does_not_hold_the_cap_is_stopped():
         watch.report(report._replace(speed_mps=speed_mps, action={"pedal": 0.0}), now_s)
         return watch.fault(now_s)
 
-    assert [fault(1.09, 0.1), fault(-1.09, 0.3), fault(1.11, 0.5)] == [None, None, Fault.TOO_FAST]
-    assert fault(-1.11, 0.7) is Fault.TOO_FAST
+    assert [fault(1.11, 0.1), fault(-1.11, 0.3), fault(1.13, 0.5)] == [None, None, Fault.TOO_FAST]
+    assert fault(-1.13, 0.7) is Fault.TOO_FAST
     assert fault(1.2, 0.9, drives=False) is None  # it brakes; a re-arm is no longer in vain
 
 

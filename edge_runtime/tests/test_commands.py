@@ -120,7 +120,6 @@ WRONG = {
     "[vehicle]\nname = 'mock'": "vehicle_settings",
     "[vehicle]\ndriver = 3": "vehicle",
     "[vehicle]\nrearm = 'never'": "vehicle.rearm.*each_episode, once",
-    "max_speed_mps = 0.3": r"max_speed_mps must stand in the table \[vehicle\]",
     **{
         f"[vehicle]\n{name} = {value}": name
         for name in Bounds._fields

@@ -11,9 +11,9 @@ import math
 from importlib import import_module
 from importlib.metadata import entry_points
 from numbers import Real
-from typing import Any, Callable, Iterable, Mapping, Optional, Tuple, Type, TypeVar
+from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
-from edge_runtime.bounds import Bounds, check_bounds, narrowed
+from edge_runtime.bounds import NO_BOUNDS, Bounds, check_bounds, narrowed
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import Manifest
@@ -48,7 +48,7 @@ def check_driver(vehicle: Any) -> None:
 
 
 def vehicle_limits(
-    name: str, tables: Tables, manifest: Manifest, bounds: Optional[Bounds] = None
+    name: str, tables: Tables, manifest: Manifest, bounds: Bounds = NO_BOUNDS
 ) -> Limits:
     """Return the limits of the vehicle of a name without opening anything; of "none": {}.
 
@@ -59,8 +59,6 @@ def vehicle_limits(
         return {}
     kind, settings = _find(name, tables)
     limits = _checked(name, _call(name, kind.limits_of, settings, manifest))
-    if bounds is None:
-        return limits
     model = _call(name, kind.model_limits_of, settings, manifest)
     check_bounds(bounds, model, name)
     return narrowed(limits, bounds, model)

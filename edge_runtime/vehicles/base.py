@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
-from edge_runtime.bounds import Bounds, Leash, Model, check_bounds, narrowed
+from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, check_bounds, narrowed
 from edge_runtime.controller import Limits
 from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.util import UserError, ends_within, printable
@@ -34,7 +34,7 @@ class Vehicle(abc.ABC):
     name: ClassVar[str]
     limits: Limits
     model_limits: Model = Model()
-    allowed: Bounds = Bounds()
+    allowed: Bounds = NO_BOUNDS
     control_period_s: float = MIN_PERIOD_S
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -138,7 +138,7 @@ class VehicleRunner:
         self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
         self.allowed = vehicle.allowed
         self._limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
-        self._leash = Leash(vehicle.allowed.leash_m)
+        self.leash = Leash(vehicle.allowed.leash_m)
         self._watch = VehicleWatch(
             vehicle.control_period_s, vehicle.limits, vehicle.allowed.max_speed_mps
         )
@@ -160,14 +160,9 @@ class VehicleRunner:
         return self._watch.silent_at_s
 
     @property
-    def leash_left_m(self) -> float:
-        """How far it may go until the next re-arm; inf without a leash."""
-        return self._leash.left_m
-
-    @property
     def leash_is_used(self) -> bool:
         """Whether it has gone as far as it may, or will have before it is heard again."""
-        return not self._enable_due and self._leash.is_used(self._period_s)
+        return not self._enable_due and self.leash.is_used(self._period_s)
 
     def busy_s(self, now_s: float) -> float:
         """Return for how long the driver has kept its thread; 0 while that waits."""
@@ -260,7 +255,7 @@ class VehicleRunner:
     def _enable(self) -> None:
         now_s = time.monotonic()
         self._watch.enable(now_s)
-        self._leash.begin()
+        self.leash.begin()
         try:
             self._vehicle.enable(now_s)
             self._not_enabled = ""
@@ -344,7 +339,7 @@ class VehicleRunner:
         try:
             report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
-            self._leash.note(report.speed_mps, time.monotonic())
+            self.leash.note(report.speed_mps, time.monotonic())
         except BaseException as error:
             if not self._fails:
                 log.event("error", "no_feedback", detail=error)

@@ -25,7 +25,7 @@ LAG_S = 0.3
 LAG_DEVIATION = 0.125
 MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
 SPEED_NOISE_MPS = 0.5
-OVER_CAP = 1.1  # times the operator's speed cap: a driver that does not hold it
+OVER_CAP, OVER_CAP_MPS = 1.1, 0.02  # by so much, a driver does not hold the operator's speed cap
 _ROUNDING = 5e-4  # of an action's range
 
 # A streamed vehicle: the age of a set-point that a drive may still follow; that of a wheel, by its
@@ -105,7 +105,7 @@ class VehicleWatch:
     def __init__(
         self, control_period_s: float, limits: Limits, max_speed_mps: float = math.inf
     ) -> None:
-        self._most_mps = OVER_CAP * max_speed_mps
+        self._most_mps = OVER_CAP * max_speed_mps + OVER_CAP_MPS
         self._silence_s, self._limits = 2 * control_period_s, limits
         self._brakes_s = SILENCE_PERIODS * control_period_s
         self._drives, self._enabled_s = False, -math.inf
