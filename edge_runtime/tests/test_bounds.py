@@ -1,6 +1,8 @@
 """The operator's bounds: speed and steering of every driver, and the leash, in made-up time."""
 
+import contextlib
 import math
+from typing import Any
 
 import pytest
 from hil_tests.testing.policies import T
@@ -19,7 +21,7 @@ from edge_runtime.tests.rigs import (
     a_manifest,
 )
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import find_vehicle, vehicle_limits
+from edge_runtime.vehicles import find_vehicle, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.plausibility import Fault, VehicleWatch
 
@@ -87,6 +89,15 @@ def test_no_wheel_is_turned_further_than_its_cap(make, wishes):
     for wish in wishes:
         rig.step(20, {"pedal": 0.3, "steering": wish})
         assert abs(rig.inner_rad) <= cap_rad + 1e-3
+
+
+def test_a_real_driver_hands_its_bounds_to_what_decides():
+    tables = {"hunter": {"bus": "virtual:bounds"}}
+    with contextlib.closing(make_vehicle("hunter", tables, a_manifest())) as vehicle:
+        vehicle.take_bounds(Bounds(0.3, 0.2))
+        core: Any = vehicle
+        assert core._core.set_point.spec[:2] == (0.3, 0.2)
+        assert core._core.similarity.spec[:2] == SPEC[:2]  # what it can do is the model's
 
 
 def test_a_mocks_range_of_steering_is_in_proportion():

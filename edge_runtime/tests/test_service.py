@@ -202,6 +202,23 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert systemd.next() == "WATCHDOG=1"
 
 
+def test_the_end_of_an_episode_that_newer_states_overtake_is_remembered(running):
+    control, link, policy = running(Notifier({}))
+    policy.free.clear()
+    link.state_comes(encode(make_state(0)))
+    wait_until(lambda: control._busy_since_s is not None, "the inference")
+    told = []
+    for step in range(1, 5):
+        link.state_comes(encode(make_state(step, final=step == 2)))
+        told.append(control._slot.follows_final)
+    assert told == [False, False, True, True]
+    policy.free.set()
+    wait_until(lambda: control._slot is None, "the newest to be taken")
+    link.state_comes(encode(make_state(5)))
+    wait_until(lambda: control._controller._newest.state.step == 5, "the next")
+    assert not control._controller._newest.follows_final
+
+
 def test_no_late_answer_follows_the_last_safe_stop(running):
     control, link, policy = running(Notifier({}))
     link.state_comes(encode(make_state(0)))

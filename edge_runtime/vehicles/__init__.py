@@ -59,6 +59,8 @@ def vehicle_limits(
         return {}
     kind, settings = _find(name, tables)
     limits = _checked(name, _call(name, kind.limits_of, settings, manifest))
+    if bounds == NO_BOUNDS:
+        return limits
     model = _call(name, kind.model_limits_of, settings, manifest)
     check_bounds(bounds, model, name)
     return narrowed(limits, bounds, model)
