@@ -410,7 +410,7 @@ ROWS = [
     Row("vehicle_fault_between_episodes",
         "Emergency stop pressed for 1 s after the end of an episode",
         "nothing; then waits for a re-arm", vehicle_fault_between_episodes, **_SLOW,
-        rig={"vehicle": MOCK, "sender": True}),
+        rig={"vehicle": MOCK, "sender": True, "settings": '[vehicle]\nrearm = "once"'}),
     Row("vehicle_not_enabled", "Vehicle at fault; the driver's `enable` raises at the re-arm",
         "stands; stays until an enable succeeds", vehicle_not_enabled, **_MOCKED,
         reaction_limit_s=None),
