@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
+    "sense": ("bridge.sense", "serve a robot's own senses to an edge runtime, not a simulator's"),
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.ports:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),
@@ -25,4 +27,7 @@ main = program(
 )
 
 if __name__ == "__main__":
-    sys.exit(run_cli(main))
+    status = run_cli(main)
+    if sys.argv[1:2] == ["sense"]:  # The interpreter's exit would wait for threads of a source.
+        os._exit(status)
+    sys.exit(status)

@@ -61,6 +61,7 @@ class RecordedEpisode:
     commands: dict[int, Command] = field(default_factory=dict)  # First answer to each state
     applied: dict[int, tuple[list[float], bool]] = field(default_factory=dict)
     """Of each step: the action, and whether the brake was pressed."""
+    waited: int = 0  # Steps that do not count: the vehicle waited for a re-arm
 
     @property
     def steps(self) -> int:
@@ -110,14 +111,16 @@ def read_episodes(
             about = message.origin, message.task, heard.arrived_ns
             begun = RecordedEpisode(path, vehicle_id, len(drives), *about)
             begun = drives.setdefault((message.origin.session, message.episode), begun)
+            begun.waited = message.waited
             if len(message.applied or ()) == len(begun.task.action):
-                begun.applied[message.step - 1] = list(message.applied or ()), message.braked
+                step = message.step - message.waited - 1
+                begun.applied[step] = list(message.applied or ()), message.braked
         elif isinstance(message, State | Command):
             drive = drives.get((message.session, message.episode))
             if drive is not None and number in (None, drive.number):
                 is_state = isinstance(message, State)
                 kept: dict[int, Any] = drive.states if is_state else drive.commands
-                kept.setdefault(message.step, message)
+                kept.setdefault(message.step - drive.waited, message)
     recording.say_trouble()
     return list(drives.values())
 

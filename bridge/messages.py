@@ -116,7 +116,8 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     ``task`` says how to read the states. ``picture`` is a JPEG of an environment that has no
     ``scene()`` and draws itself; empty otherwise. ``applied`` is the action of the step that led
     here, whoever decided it, ``braked`` whether the brake was pressed in it, and ``ridden`` its
-    place in an earlier command's plan, 0 for none.
+    place in an earlier command's plan, 0 for none. ``waited`` counts the first steps of the
+    episode, in which the environment stood still: its vehicle waited for a re-arm.
     """
 
     episode: int
@@ -132,6 +133,7 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     applied: list[float] | None = None
     braked: bool = False
     ridden: int = 0
+    waited: int = 0
 
 
 def plain(value: Any) -> Any:

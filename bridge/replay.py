@@ -222,7 +222,7 @@ def _vehicle_limits(drive: RecordedDrive, policy: Policy, config: Config) -> Lim
     elif name not in (NONE, *BUILT_IN):
         option = "--config FILE.toml whose table [vehicle] has as its driver"
         name = name_in_file(installed_as(name), f"{drive.recording.path} is of", option)
-    return vehicle_limits(name, config.vehicle_settings, policy.manifest)
+    return vehicle_limits(name, config.vehicle_settings, policy.manifest, config.bounds)
 
 
 def controller_of(
@@ -234,8 +234,11 @@ def controller_of(
 ) -> Controller:
     """Make the edge runtime's decision logic, with the ride-through of recorded commands."""
     period_s, task = policy.manifest.control_period_s, policy.layout.task_text
+    commands = [*commands]
     ride_s = period_s * max((len(command.plan or ()) for command in commands), default=0)
-    return Controller(ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s))
+    each = any(command.reason == Event.EPISODE.value for command in commands)
+    decides = ControllerConfig(limits, period_s, needs_rearm, is_armed, task, ride_s, each)
+    return Controller(decides)
 
 
 def _answer(
@@ -256,11 +259,12 @@ def _answer(
     if layout.refusal(state.observation) is None and not is_foreign(state, layout.task_text):
         output, _ = infer(policy, layout.arrays(state.observation))
     # How long a vehicle's fault stood is not recorded, and need not be: the stop is latched.
-    fault = Event.VEHICLE.value
-    if recorded.reason == fault and controller.safety.reason != fault:
+    fault, is_new = Event.VEHICLE.value, recorded.reason != controller.safety.reason
+    if recorded.reason == fault and is_new:
         controller.vehicle_fault = fault
+    controller.leash_is_used = recorded.reason == Event.LEASH.value and is_new
     order = controller.finish(output, 1, sent_s)
-    controller.vehicle_fault = ""
+    controller.vehicle_fault, controller.leash_is_used = "", False
     return order if recorded.inference_ns else None
 
 

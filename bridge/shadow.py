@@ -97,7 +97,8 @@ class Shadow:
 
     def __init__(self, policy: Policy, config: Config) -> None:
         self._policy, manifest = policy, policy.manifest
-        vehicle = vehicle_limits(config.vehicle, config.vehicle_settings, manifest)
+        tables, bounds = config.vehicle_settings, config.bounds
+        vehicle = vehicle_limits(config.vehicle, tables, manifest, bounds)
         limits, self._period_s = shared_limits(manifest.action, vehicle), manifest.control_period_s
         self._task, ride_s = policy.layout.task_text, config.ride_through.max_s
         decides = ControllerConfig(limits, self._period_s, task=self._task, ride_s=ride_s)

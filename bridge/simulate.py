@@ -12,26 +12,28 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from bridge import environments, report
-from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
+from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, LockStepClock, VehicleClock
 from bridge.environments import CONDITIONS, Adapter, Environment, make_environment
-from bridge.inbound import CommandCheck, Decision
+from bridge.inbound import NO_COMMAND, CommandCheck, Decision
 from bridge.messages import Origin, Scene
 from bridge.outcomes import outcome_of
 from bridge.ports import EdgeStatus, SimulatorPort, add_options, open_port
 from bridge.report import EpisodeResult, of_known
 from edge_runtime import cli
+from edge_runtime.config import NONE
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.safety import Event
-from edge_runtime.transport import DEFAULT_ENDPOINT, tls_for
+from edge_runtime.transport import DEFAULT_ENDPOINT, rearm_command, tls_for
 from edge_runtime.util import UserError
-from edge_runtime.wire import State
+from edge_runtime.wire import SAFE_STOP, State
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 PEDAL = "pedal"
@@ -105,6 +107,8 @@ def _drive(
         task = msgspec.structs.replace(task, action=edge.manifest.action)  # with the policy's stops
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
     runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
+    if edge.vehicle != NONE:
+        runner.on_wait = partial(_say_wait, asked)
     if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
@@ -137,6 +141,12 @@ def _drive(
         "vehicle": vehicle and {"name": vehicle.vehicle, "faults": dict(vehicle.faults)},
     }
     return report.make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
+
+
+def _say_wait(asked: Namespace, episode: int, reason: str) -> None:
+    command = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
+    waits = f"episode {episode}: the vehicle waits for a re-arm ({reason}): {command}"
+    print(waits, file=sys.stderr, flush=True)
 
 
 def other_task(task: Task) -> UserError:
@@ -185,6 +195,9 @@ class EpisodeRunner:
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""
+    on_wait: Callable[[int, str], None] | None = None
+    """Called with the episode and the reason where a vehicle waits for a re-arm; None: there is no
+    vehicle."""
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
@@ -222,15 +235,25 @@ class EpisodeRunner:
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
         applied: dict[str, Any] = {}  # What the scene says of the step before
-        felt, ended = [], False
+        felt, ended, waited, waits = [], False, 0, self.on_wait is not None
         apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action
         while not ended:
-            state = self._state(episode, result.steps, observation, info)
-            self._show(state, applied)
+            state = self._state(episode, waited + result.steps, observation, info)
+            self._show(state, {**applied, "waited": waited})
             self._under_way = state
             decision = self.clock.exchange(state)
             if decision.brake_reason == Event.OTHER_TASK.value:
                 raise other_task(self.task)
+            if waits and (command := decision.command) and decision.brake_reason != NO_COMMAND:
+                # A person may take minutes: until then only the states go on.
+                waits = command.mode == SAFE_STOP
+                if waits and self.on_wait is not None:
+                    if not waited:
+                        self.on_wait(episode, command.reason)
+                    # Real time keeps its pace by itself.
+                    time.sleep(self._period_s * isinstance(self.clock, LockStepClock))
+                    waited += 1
+                    continue
             action = apply(self._adapter, decision)
             observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
@@ -242,8 +265,9 @@ class EpisodeRunner:
             braked = bool(decision.brake_reason)
             applied = {"applied": result.actions[-1], "braked": braked, "ridden": decision.ridden}
             ended = bool(terminated or truncated)
-        final = self._state(episode, result.steps, observation, info, final=True)
-        self._show(final, applied)
+        steps = waited + result.steps
+        final = self._state(episode, steps, observation, info, final=True)
+        self._show(final, {**applied, "waited": waited})
         self.clock.finish(final)
         self._under_way = None
         result.outcome = outcome_of(info, only_truncated=not terminated)

@@ -111,7 +111,9 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
     flags = {"policy": str(given.policy), "tls": given.tls and str(given.tls)}
     config = load_config(given.config, flags)
     if config.vehicle in BUILT_IN or not given.wheels:  # A driver in a wheel is not installed here.
-        limits = vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
+        limits = vehicle_limits(
+            config.vehicle, config.vehicle_settings, policy.manifest, config.bounds
+        )
         shared_limits(policy.manifest.action, limits)
     contents = {
         NAME: build_installer(),

@@ -1,7 +1,7 @@
 """The command line: `python -m edge_runtime`, or `phil-edge` where the wheel is installed.
 
 Here are the commands that do not drive: `check` of a policy, and an operator's `status` and
-`rearm`. `run` is in run.py.
+`rearm`. `run` and `sense` are in files of these names.
 """
 
 from __future__ import annotations
@@ -72,12 +72,22 @@ def _add_operator(parser: argparse.ArgumentParser) -> None:
 def _add_status(parser: argparse.ArgumentParser) -> None:
     _add_operator(parser)
     parser.add_argument("--out", metavar="FILE.json", help="write the whole status to this file")
+    text = "show once a second, until ^C, what matters beside the vehicle"
+    parser.add_argument("--watch", action="store_true", help=text)
 
 
 def _status(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-    reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
+
+    def look() -> Dict[str, Any]:
+        return ask(arguments.connect, arguments.vehicle_id, "status", tls)
+
+    reply = look()
+    if arguments.watch:
+        from edge_runtime.watch import watch
+
+        watch(look, reply)
     print(render_status(reply))
     write_json_out(arguments.out, reply)
     return 0
@@ -94,7 +104,7 @@ def _rearm(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_NOT_SHOWN = ("manifest", "schema", "sent_ns")
+_NOT_SHOWN = ("manifest", "schema", "sent_ns", "command", "feedback")
 
 
 def render_status(status: Dict[str, Any]) -> str:
@@ -124,7 +134,10 @@ CHECK = Subcommand(
     _check,
 )
 STATUS = Subcommand(
-    examples("python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01"),
+    examples(
+        "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01",
+        "python -m edge_runtime status --watch",
+    ),
     _add_status,
     _status,
 )
@@ -139,6 +152,7 @@ REARM = Subcommand(
 COMMANDS = {
     "check": (CHECK, "check whether a policy may drive, and measure its inference time"),
     "run": ("edge_runtime.run", "drive a policy: answer each state of a simulator until ^C"),
+    "sense": ("edge_runtime.sense", "send a source's observations in the simulator's place"),
     "status": (STATUS, "print the status of a running edge runtime"),
     "rearm": (REARM, "let a vehicle drive again after a safe stop"),
 }

@@ -6,17 +6,21 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import Any, Dict, Mapping, Optional, Sequence, Tuple, Type, TypeVar
 
 import msgspec
 
 from edge_runtime import log
+from edge_runtime.bounds import Bounds
 from edge_runtime.cli import add_public_key
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, check_fits
 from edge_runtime.util import PathLike, UserError, read_toml
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 NONE = "none"
+EACH_EPISODE, ONCE = REARM = "each_episode", "once"
+_RULES = ("max_speed_mps", "max_steering_rad", "leash_m", "rearm")  # of [vehicle], for any driver
 BUILT_IN = {
     "mock": "edge_runtime.vehicles.mock:MockVehicle",
     "hunter": "edge_runtime.vehicles.hunter:HunterVehicle",
@@ -35,7 +39,8 @@ class RideThrough(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory.
 
-    `vehicle_settings` are the tables [vehicle.NAME], by name; each driver checks its own.
+    `vehicle_settings` are the tables [vehicle.NAME], by name; each driver checks its own. The four
+    before it are of [vehicle]: bounds (None: none), and which episodes need a re-arm.
     """
 
     policy: Optional[str] = None
@@ -49,12 +54,26 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hold: Optional[str] = None
     ride_through: RideThrough = RideThrough()
     log_level: str = "info"
+    max_speed_mps: Optional[float] = None
+    max_steering_rad: Optional[float] = None
+    leash_m: Optional[float] = None
+    rearm: str = EACH_EPISODE
     vehicle_settings: Dict[str, Dict[str, Any]] = msgspec.field(default_factory=dict)
 
     @property
     def is_armed_at_start(self) -> bool:
-        """Whether a vehicle may drive at once; nobody sees what follows when a hold ends."""
-        return self.armed_at_start and self.hold is None
+        """Whether a vehicle may drive at once.
+
+        Nobody sees what follows when a hold ends. And a start, which may be a service manager's,
+        gives no new leash: only a re-arm does.
+        """
+        return self.armed_at_start and self.hold is None and self.leash_m is None
+
+    @property
+    def bounds(self) -> Bounds:
+        names = Bounds._fields
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return Bounds(**given)
 
 
 # The settings that are flags as well: metavar and help.
@@ -140,12 +159,13 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any], opens_link: boo
 
 
 def _split_vehicle(tables: Dict[str, Any]) -> Dict[str, Any]:
-    """`vehicle` is a driver, or a table: `driver`, and a table of settings for each vehicle."""
+    """`vehicle` is a driver, or a table: `driver`, rules, and a table of settings for each one."""
     if not isinstance(tables.get("vehicle"), dict):
         return tables
     settings = dict(tables["vehicle"])
     driver = settings.pop("driver", NONE)
-    return {**tables, "vehicle": driver, "vehicle_settings": settings}
+    rules = {name: settings.pop(name) for name in _RULES if name in settings}
+    return {**tables, **rules, "vehicle": driver, "vehicle_settings": settings}
 
 
 def convert(settings: Mapping[str, Any], kind: Type[_S], table: str = "") -> _S:
@@ -160,6 +180,10 @@ def _check(config: Config) -> Config:
     check_endpoint(config.connect)
     check_vehicle_id(config.vehicle_id)
     check_choice("log_level", config.log_level, log.LEVELS)
+    check_choice("vehicle.rearm", config.rearm, REARM)
+    for name, value in config.bounds._asdict().items():
+        if getattr(config, name) is not None and not 0.0 < value < math.inf:
+            raise UserError(f"vehicle.{name} {value:g} is not valid: it must be finite, above 0")
     return config
 
 

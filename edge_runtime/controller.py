@@ -137,11 +137,15 @@ class Ride:
 
 
 class Received(NamedTuple):
-    """An accepted state with the time of its arrival, monotonic and wall clock."""
+    """An accepted state with the time of its arrival, monotonic and wall clock.
+
+    `follows_final`: it has taken the place of a final state that nobody answered.
+    """
 
     state: State
     arrived_s: float
     arrived_ns: int
+    follows_final: bool = False
 
     @property
     def trip_s(self) -> Optional[float]:
@@ -188,8 +192,9 @@ class Order(NamedTuple):
 class ControllerConfig(NamedTuple):
     """What a controller decides by.
 
-    `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop. `task`
-    is the policy's; a state that names another one is a fault. `ride_s` is [ride_through] max_s.
+    `needs_rearm`: a vehicle is attached, and only an operator lets it drive after a stop; with
+    `each_episode`, in each new episode too, where the start counts for the first one. `task` is the
+    policy's; a state that names another one is a fault. `ride_s` is [ride_through] max_s.
     """
 
     limits: Limits
@@ -198,6 +203,7 @@ class ControllerConfig(NamedTuple):
     armed_at_start: bool = True
     task: str = ""
     ride_s: float = 0.0
+    each_episode: bool = False
 
 
 class Controller:
@@ -210,6 +216,7 @@ class Controller:
     def __init__(self, config: ControllerConfig) -> None:
         self._limits, self._period_s = config.limits, config.control_period_s
         self._needs_rearm, self._task = config.needs_rearm, config.task
+        self.each_episode = config.needs_rearm and config.each_episode
         self._ride: Optional[Ride] = None
         if config.ride_s:
             self._ride = Ride(config.ride_s, self._period_s, self._limits, self._needs_rearm)
@@ -219,6 +226,7 @@ class Controller:
         self._fresh_before_s: Optional[float] = None  # `last_fresh_s` before the newest state
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
+        self.leash_is_used = False  # likewise
         self._latched_fault = ""  # what stopped it, until it is re-armed
         self._policy_is_dead = False
         self._last_action = neutral_action(self._limits)
@@ -246,6 +254,8 @@ class Controller:
         session, arrived_s = received.state.session, received.arrived_s
         # The gap counts even where the watchdog did not get to run within it.
         event = rules.classify_arrival(self.safety, session, arrived_s, self._needs_rearm)
+        if event is not Event.OTHER_SESSION and self._begins_episode(received):
+            event = Event.EPISODE
         if event is not None and not (event is Event.SILENT and self._stopped_late):
             self._apply(event)
         self._lag_s = self._freshness.lag_s(
@@ -320,6 +330,8 @@ class Controller:
             self._apply(Event.SILENT)
         elif self.vehicle_fault:
             self._apply(Event.VEHICLE)  # it may be over before the next state
+        elif self.leash_is_used:
+            self._apply(Event.LEASH)
         if self._newest is None:
             return None  # before the first state there is nobody to tell
         if self.safety.mode is not Mode.SAFE_STOP:
@@ -358,6 +370,7 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             arrives = "only late" if self._is_late else "no fresh"
             return f"{arrives} states arrive; re-arm when the link is back"
+        self.leash_is_used = False
         self._apply(Event.REARM)
         self.safety = self.safety._replace(permitted_s=now_s)
         return ""
@@ -379,9 +392,22 @@ class Controller:
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
+        if self.leash_is_used:
+            return Event.LEASH
         if self._is_late:  # the end of the episode ends the drive, however late it is
             return Event.FINAL if state.final and self.safety.mode is Mode.DRIVE else Event.LATE
         return rules.classify_fresh(self.safety, state.final, self._needs_rearm)
+
+    def _begins_episode(self, received: Received) -> bool:
+        """Return whether a vehicle needs a permission for this state's episode.
+
+        Not by the number alone: a simulator may give each episode the same.
+        """
+        before, now = self._newest, received.state
+        if not self.each_episode or before is None:
+            return False
+        same = (before.state.session, before.state.episode) == (now.session, now.episode)
+        return not same or before.state.final or received.follows_final
 
     @property
     def _is_late(self) -> bool:

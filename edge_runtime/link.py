@@ -53,6 +53,7 @@ class Link:
         self.gave_way = False  # another runtime speaks for this vehicle
         self._session, self._manifest = session, manifest
         self._declared: List[Any] = []
+        self._newest: Dict[str, Message] = {}  # of each topic
         self._presence: Optional[Presence] = None
         self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
@@ -80,7 +81,8 @@ class Link:
             on_state(bytes(max_state_bytes + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
-            about = {"version": __version__, "manifest": self._manifest}
+            newest = {topic: self._newest.get(topic) for topic in ("command", "feedback")}
+            about = {"version": __version__, "manifest": self._manifest, **newest}
             _reply(query, msgspec.to_builtins({**msgspec.structs.asdict(health()), **about}))
 
         def rearm_asked(query: zenoh.Query) -> None:
@@ -124,6 +126,7 @@ class Link:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
         if self.gave_way:
             return
+        self._newest[topic] = message
         if self._presence and self.listener and time.time() >= self.listener.own_until_s:
             self._stop()
         try:

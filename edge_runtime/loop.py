@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Deque, Dict, Optional
+from typing import TYPE_CHECKING, Any, Deque, Dict, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
@@ -153,7 +153,15 @@ class ControlLoop:
                 vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
                 link=self._link_quality.measured(),
+                **self._bounds(),
             )
+
+    def _bounds(self) -> Dict[str, Any]:
+        """Return the fields of health about the operator's bounds; None: none is set."""
+        if self._vehicle is None:
+            return {}
+        found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}
+        return {name: value if value < math.inf else None for name, value in found.items()}
 
     def _on_state(self, payload: bytes) -> None:
         arrived_s, arrived_ns = time.monotonic(), time.time_ns()
@@ -167,9 +175,11 @@ class ControlLoop:
                 self._log_rejection(rejection, arrived_s)
                 return
             self._link_quality.note_state(state, arrived_ns)
-            is_waiting = self._slot is not None
+            before = self._slot
+            is_waiting = before is not None
             self._superseded += int(is_waiting)
-            self._slot = Received(state, arrived_s, arrived_ns)
+            ended = before is not None and (before.state.final or before.follows_final)
+            self._slot = Received(state, arrived_s, arrived_ns, ended)
         if not is_waiting:
             self._wakes.put(None)
 
@@ -221,6 +231,8 @@ class ControlLoop:
         if fault != self._controller.vehicle_fault:
             log.event("warning" if fault else "info", "vehicle", fault=fault)
             self._controller.vehicle_fault = fault
+        if self._vehicle is not None:
+            self._controller.leash_is_used = self._vehicle.leash_is_used
 
     def _wake_watchdog(self) -> None:
         with self._lock:
@@ -260,9 +272,11 @@ class ControlLoop:
             self._link.send("command", command)
             self._link_quality.note_command(command.episode, command.sent_ns)
         if self._vehicle is not None:
-            # The end of an episode is no fault; and a stop that is repeated between the re-arm
-            # and the first fresh state must not take back what the re-arm has given.
-            ends = order.reason == Event.FINAL.value or self._controller.safety.rearmed
+            # The end of an episode is no fault, where the next needs no re-arm; and a stop that is
+            # repeated between the re-arm and the first fresh state must not take back what the
+            # re-arm has given.
+            ends = order.reason == Event.FINAL.value and not self._controller.each_episode
+            ends = ends or self._controller.safety.rearmed
             self._vehicle.command(command, order.answers.state.speed_mps, latch=not ends)
 
     def _log_transition(self) -> None:
@@ -273,7 +287,8 @@ class ControlLoop:
             log.event(level, "mode", was=was_mode.value, now=now, reason=safety.reason)
             self._notifier.tell(f"STATUS={now} {safety.reason}".rstrip())
         if waits and not waited:
-            log.event("warning", "waits_for_rearm", command=self._rearm_command)
+            told = {"after": safety.reason, "command": self._rearm_command}
+            log.event("warning", "waits_for_rearm", **told)
         self._logged = (safety.mode, safety.reason, waits)
 
     def _log_link(self, link: Dict[str, float]) -> None:

@@ -83,12 +83,32 @@ def load_policy(
         raise UserError(f"policy {Path(path)} may not drive: {error}") from None
 
 
-def open_policy(data: bytes, trust: str) -> Policy:
-    """Check and probe the policy in a file's bytes, without its signature. Raises UserError."""
+def load_manifest(
+    path: PathLike, public_key: Optional[PathLike] = None, allow_unsigned: bool = False
+) -> Manifest:
+    """Read the manifest of a trusted policy; its network, and onnxruntime, are not loaded.
+
+    Raises UserError as `load_policy` does.
+    """
+    data = read_bytes(path, "policy file", MAX_POLICY_MIB)
+    check_trust(path, data, public_key, allow_unsigned)
+    try:
+        return manifest_of(data)
+    except UserError as error:
+        raise UserError(f"policy {Path(path)} may not drive: {error}") from None
+
+
+def manifest_of(data: bytes) -> Manifest:
+    """Check the graph in a file's bytes, and return its manifest. Raises UserError."""
     metadata = check_graph(data)
     if MANIFEST_KEY not in metadata:
         raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
-    manifest = decode_manifest(metadata[MANIFEST_KEY])
+    return decode_manifest(metadata[MANIFEST_KEY])
+
+
+def open_policy(data: bytes, trust: str) -> Policy:
+    """Check and probe the policy in a file's bytes, without its signature. Raises UserError."""
+    manifest = manifest_of(data)
     policy = Policy(open_network(data), manifest, Layout(manifest), trust, policy_id_of(data))
     check_tensors(policy.session, manifest)
     _probe(policy)

@@ -12,15 +12,16 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 
 from edge_runtime import log, service
+from edge_runtime.bounds import narrowed
 from edge_runtime.cli import ENDING_SIGNALS, handled
-from edge_runtime.config import NONE, Config, add_run_flags, load_config
+from edge_runtime.config import EACH_EPISODE, NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
 from edge_runtime.link import Link, link_words, require_free, taken
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import VERIFIED, Policy, load_policy
 from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
-from edge_runtime.transport import is_tls, open_session
+from edge_runtime.transport import open_session, rearm_command
 from edge_runtime.util import PathLike, ends_within, printable
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
@@ -125,6 +126,8 @@ class _Runtime:
         if config.vehicle != NONE:
             vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
             _close_unless_built(vehicle, unbuilt)
+        if vehicle is not None:
+            vehicle.take_bounds(config.bounds)
         controller = _controller(config, self._policy, vehicle)
         hold = None if config.hold is None else service.Hold(config.hold)
         # Both sessions hear only what this vehicle's edge may hear.
@@ -234,7 +237,7 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
     period_s, its_limits = policy.manifest.control_period_s, {}
     if vehicle is not None:
         vehicle.control_period_s = period_s
-        its_limits = vehicle.limits
+        its_limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
     return Controller(
         ControllerConfig(
             limits=shared_limits(policy.manifest.action, its_limits),
@@ -243,11 +246,6 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
             armed_at_start=config.is_armed_at_start,
             task=policy.layout.task_text,
             ride_s=config.ride_through.max_s,
+            each_episode=config.rearm == EACH_EPISODE,
         )
     )
-
-
-def rearm_command(connect: str, vehicle_id: str) -> str:
-    """Return what an operator types to let a vehicle drive again."""
-    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
-    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"

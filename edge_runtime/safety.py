@@ -42,6 +42,8 @@ class Event(str, Enum):
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
     OTHER_TASK = "other_task"  # the state is of another task than the policy
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
+    EPISODE = "episode"  # a vehicle needs a permission for each new episode
+    LEASH = "leash"  # a vehicle has gone as far as one permission lets it
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
 
@@ -63,6 +65,8 @@ _ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
     Event.OTHER_SESSION: (_X, _X, _X),
     Event.OTHER_TASK: (_X, _X, _X),
     Event.NOT_ARMED: (_X, _X, _X),
+    Event.EPISODE: (_X, _X, _X),
+    Event.LEASH: (_X, _X, _X),
     Event.VEHICLE: (_X, _X, _X),
     Event.REARM: (_S, _D, _X),  # a fresh state must follow
 }

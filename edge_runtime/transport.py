@@ -138,3 +138,9 @@ def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.
             hear(sample)
 
     return take
+
+
+def rearm_command(connect: str, vehicle_id: str) -> str:
+    """Return what an operator types to let a vehicle drive again."""
+    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
+    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"

@@ -155,7 +155,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     a newer one replaced before the policy took them, `rivals` other runtimes with this vehicle id.
     `temperature_c` is the board's hottest sensor, None where it has none. `vehicle_fault` says in
     words what is wrong with the vehicle, or what has stopped it and waits for a re-arm. `link` is
-    `LinkQuality.measured`.
+    `LinkQuality.measured`. The operator's bounds of the vehicle follow; None where none is set.
     """
 
     vehicle_id: str
@@ -179,6 +179,10 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     rivals: int = 0
     vehicle_fault: str = ""
     link: Dict[str, float] = msgspec.field(default_factory=dict)
+    max_speed_mps: Optional[float] = None
+    max_steering_rad: Optional[float] = None
+    leash_m: Optional[float] = None
+    leash_left_m: Optional[float] = None
     schema: int = SCHEMA
 
 

@@ -334,6 +334,7 @@ class WireLog:
     def _draw_status(self) -> None:
         lines = [f"# {self._mode or 'waiting'}", self._reason]
         if (health := self._health) is not None:
+            lines += ["**waits for a re-arm**"] * health.needs_rearm
             counts = [f"{name} {count}" for name, count in health.rejected.items() if count]
             lines += [
                 f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",

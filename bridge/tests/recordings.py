@@ -173,7 +173,7 @@ class Hand:
         """Write states at every T, each answered, with ``drive`` unless ``changes`` differ."""
         for step in range(first, last):
             at_s = start_s + step * 0.1
-            self.state(at_s, step)
+            self.state(at_s, step, episode=changes.get("episode", 0))
             self.command(at_s + ANSWER_S, step, **changes)
 
     def stop(self, step: int, count: int) -> None:

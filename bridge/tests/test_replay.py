@@ -118,6 +118,18 @@ def armed_later(hand):
     hand.drive(13, 20, **NOT_ARMED)
 
 
+EPISODE, LEASH = ({**NOT_ARMED, "reason": reason} for reason in ("episode", "leash"))
+
+
+def an_episode_and_a_leash(hand):
+    hand.hear_health(0.0, 5.0, vehicle="mock")
+    hand.drive(0, 3)
+    hand.drive(3, 10, episode=1, **EPISODE)
+    hand.drive(10, 13, episode=1)
+    hand.drive(13, 20, episode=1, **LEASH)
+    hand.drive(20, 23, episode=1)
+
+
 def faults(hand):
     hand.hear_health(0.0, 5.0, vehicle="hunter")
     hand.drive(0, 3)
@@ -136,7 +148,7 @@ def late_watchdog(hand):
 
 STORIES = [
     (braked_gap, 12), (ridden_gap, 9), (restart, 12), (thirty_years, 12), (rearmed_vehicle, 16),
-    (armed_later, 19), (faults, 23), (late_watchdog, 4),
+    (armed_later, 19), (faults, 23), (late_watchdog, 4), (an_episode_and_a_leash, 23),
 ]  # fmt: skip
 
 

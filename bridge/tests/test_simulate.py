@@ -19,11 +19,12 @@ from bridge.messages import Origin
 from bridge.simulate import EpisodeRunner
 from bridge.tests.odd import odd
 from bridge.tests.recordings import bridge_status, record_drive, rerun
+from edge_runtime.link import ask
 from edge_runtime.policy import load_policy
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from hil_tests.processes import Process
+from hil_tests.processes import Process, operator
 from hil_tests.testing.drives import TOY, make_policy, read, start_edge, start_simulate
 from hil_tests.testing.messages import make_command
 from hil_tests.testing.policies import STEERING, write_policy, write_rover
@@ -63,6 +64,34 @@ def test_an_interrupted_run_reports_the_episodes_that_it_drove(tmp_path):
     assert report["interrupted"]
     assert 1 <= report["episodes"] == len(report["per_episode"]) < 9999
     assert all(row["outcome"] for row in report["per_episode"])
+
+
+def test_the_environment_stands_while_its_vehicle_waits_for_a_re_arm(tmp_path):
+    """The drive is that without a vehicle, and so is its fork; lock-step, for that waits, too."""
+    policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "report.json"
+    drive = tmp_path / "drive.mcap"
+    with start_simulate(endpoint, out, TOY, "--episodes", "2", "--seed", "3") as simulate:
+        record = ("record", "--out", drive, "--connect", endpoint, "--vehicle-id", "hunter01")
+        with (
+            Process("bridge", *record, ready="recording"),
+            start_edge(endpoint, policy, "--vehicle", "mock") as edge,
+        ):
+            simulate.wait_for_line("episode 1: the vehicle waits for a re-arm (episode)")
+            time.sleep(1.0)
+            assert not simulate.has_ended
+            assert ask(endpoint, "hunter01", "status")["reason"] == "episode"
+            assert "waits_for_rearm after=episode" in edge.errors
+            with operator(endpoint, "hunter01"):
+                simulate.succeed()
+    report = read(out)
+    assert not [row for row in report["safe_stop_events"] if row["reason"] == "episode"]
+    if not report["safe_stops"]:  # a busy machine may stop it once more
+        drove_as_in_process(report, policy)
+        found = tmp_path / "fork.json"
+        words = ("fork", drive, "--out", found, "--episode", "1", "--at", "0.5", "--env", TOY)
+        trust = ("--policy", policy, "--allow-unsigned")
+        assert bridge_status([str(word) for word in (*words, *trust)]) == 0
+        assert read(found)["fork"]["outcome"] == report["per_episode"][1]["outcome"]
 
 
 def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):

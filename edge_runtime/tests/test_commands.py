@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from argparse import ArgumentTypeError
@@ -10,21 +11,25 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from hil_tests.processes import Process, wait_until
 from hil_tests.testing.commands import exit_status, run_command
-from hil_tests.testing.messages import HEALTH
+from hil_tests.testing.messages import HEALTH, make_feedback
 from hil_tests.testing.policies import write_policy
 
 import edge_runtime
 from edge_runtime import __main__ as commands
 from edge_runtime import cli
 from edge_runtime.__main__ import main, render_status
+from edge_runtime.bounds import Bounds
 from edge_runtime.config import BUILT_IN, Config, convert, load_config
+from edge_runtime.link import FIELDS
 from edge_runtime.reach import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import HunterSettings
 from edge_runtime.vehicles.mock import MockParameters
 from edge_runtime.vehicles.ros2 import Ros2Settings
+from edge_runtime.watch import render
 
 
 @pytest.fixture
@@ -114,6 +119,12 @@ WRONG = {
     "bus = 'can0'": "bus",
     "[vehicle]\nname = 'mock'": "vehicle_settings",
     "[vehicle]\ndriver = 3": "vehicle",
+    "[vehicle]\nrearm = 'never'": "vehicle.rearm.*each_episode, once",
+    **{
+        f"[vehicle]\n{name} = {value}": name
+        for name in Bounds._fields
+        for value in ("nan", "inf", "-1.0", "0", "0.0", "'fast'", "true", "[1.0]")
+    },
 }
 
 
@@ -121,6 +132,14 @@ WRONG = {
 def test_a_wrong_config_file_is_named_with_the_key(settings, text):
     with pytest.raises(UserError, match=rf"edge\.toml.*{WRONG[text]}"):
         load_config(settings(text), {"policy": "p.onnx"})
+
+
+def test_bounds_are_of_the_table_vehicle_and_a_leash_waits_for_its_re_arm(settings):
+    text = "policy = 'p.onnx'\n[vehicle]\ndriver = 'mock'\nmax_speed_mps = 1\nrearm = 'once'"
+    config = load_config(settings(text), {})
+    assert (config.bounds, config.rearm) == (Bounds(max_speed_mps=1.0), "once")
+    assert config.is_armed_at_start
+    assert not load_config(settings(f"{text}\nleash_m = 2.5"), {}).is_armed_at_start
 
 
 def test_flags_win_over_the_file(settings):
@@ -162,6 +181,51 @@ def test_an_answer_that_is_no_json_or_none_is_one_line(topic, refuses):
         refuses([topic, "--connect", endpoint], "no edge runtime")
         session.declare_queryable(key, lambda query: query.reply(key, b"[" * 100_000))
         refuses([topic, "--connect", endpoint], "JSON")
+
+
+def a_status(**changes):
+    action = [{"name": "pedal"}, {"name": "steering"}]
+    about = {"manifest": {"action": action, "task": "t"}, "command": None, "feedback": None}
+    return {**msgspec.to_builtins(HEALTH), **about, **changes}
+
+
+def test_a_phone_shows_what_matters_beside_the_vehicle():
+    nothing = "\n".join(render(a_status()))
+    assert "nobody: no vehicle" in nothing
+    feedback = msgspec.to_builtins(make_feedback(3, speed_mps=0.25, battery_v=24.5, sent_ns=10**9))
+    known = {
+        "vehicle": "hunter", "sent_ns": 10**9, "feedback": {**feedback, "action": [0.25, -0.5]},
+        "command": {"action": [1.0, -0.5]}, "max_speed_mps": 0.3, "leash_m": 5.0,
+        "leash_left_m": 3.2, "link": dict.fromkeys(FIELDS, 12.3), "temperature_c": 48.0,
+    }  # fmt: skip
+    lines = render(a_status(mode="drive", **known))
+    told = dict(line.split(maxsplit=1) for line in lines if not line.startswith(("link", "moved")))
+    assert told["asked"] == "pedal 1.00, steering -0.50"
+    assert told["achieved"] == "pedal 0.25, steering -0.50"
+    assert [told[name].split()[0] for name in ("speed", "cap", "leash", "battery", "board")] == [
+        "0.25", "0.30", "3.20", "24.50", "48.00",
+    ]  # fmt: skip
+    assert max(map(len, lines)) <= 48
+    assert any("THE POLICY" in line for line in lines)
+    waits = render(a_status(mode="safe_stop", reason="episode", needs_rearm=True, **known))
+    assert any("NOBODY" in line for line in waits)
+    assert any("safe_stop episode" in line for line in waits)
+    old = render(a_status(**{**known, "sent_ns": 5 * 10**9}))
+    assert sum("not heard for 4 s" in line for line in old) == 2
+
+
+def test_a_watch_goes_on_until_it_is_interrupted():
+    endpoint, key = free_endpoint(), "phil/hunter01/status"
+    reply = json.dumps(a_status(reason="\x1b[2J")).encode()
+    with open_session(listen=endpoint, mode="router") as session:
+        answers = session.declare_queryable(key, lambda query: query.reply(key, reply))
+        with Process("edge_runtime", "status", "--watch", "--connect", endpoint) as shown:
+            wait_until(lambda: shown.output.count("moved by") >= 2, "two looks")
+            answers.undeclare()
+            shown.wait_for_line("NO ANSWER")
+            shown.send(signal.SIGINT)
+            assert shown.wait() == 130
+    assert all(line.isprintable() for line in shown.output.splitlines())
 
 
 def test_an_error_or_a_status_holds_nothing_that_a_terminal_acts_upon():

@@ -31,6 +31,9 @@ KINDS: dict = {  # of states that come, and how the policy answers them
     "of another simulator": {"session": "simulator-b"},
     "of our task": {"task": "ours"},
     "of another task": {"task": "another"},
+    "of the same episode": {"episode": 0},
+    "of a later episode": {"episode": 7},
+    "after a final that was not seen": {"episode": 0, "follows_final": True},
     "final nan of another task": {"task": "another", "final": True, "output": NAN},
 }
 
@@ -43,7 +46,8 @@ def make(needs_rearm=False, actions=(PEDAL,), vehicle=None, **options):
 
 def begin(controller, step, arrived_s, now_s, **changes):
     sent = {"sent_ns": round(arrived_s * 1e9), **changes}
-    controller.begin(Received(make_state(step, **sent), arrived_s, 0), now_s)
+    follows_final = sent.pop("follows_final", False)
+    controller.begin(Received(make_state(step, **sent), arrived_s, 0, follows_final), now_s)
 
 
 def answer(controller, step, now_s, output=GOOD, **changes):
@@ -126,6 +130,8 @@ def play(controller, story):
                 continue
         elif what == "fault":
             found = controller.vehicle_fault = expected
+        elif what == "leash":
+            found = controller.leash_is_used = expected
         elif what == "words":
             found = controller.vehicle_words
         elif what == "dies":
@@ -136,7 +142,7 @@ def play(controller, story):
             found = said(controller.finish(GOOD, QUICK_NS, now_s))
         else:
             episode = sum("final" in earlier for _, earlier, _ in story[:step])
-            order = answer(controller, step, now_s, episode=episode, **KINDS[what])
+            order = answer(controller, step, now_s, **{"episode": episode, **KINDS[what]})
             assert order.answers.state.step == step
             found = said(order)
         assert found == expected, (step, now_s, what)
@@ -438,8 +444,91 @@ def test_with_a_vehicle(story):
     assert (controller.safety.safe_stops, controller.waits_for_rearm) == (safe_stops, waits)
 
 
+EPISODE, LEASH, NOTHING = "episode", "leash", "nothing to re-arm"
+ENDED = [FIRST, (0.1, "final", "final_state")]
+# With a permission for each episode. The start is that of the first one.
+EPISODE_STORIES = {
+    "each new one waits for its own": (2, True, [
+        *ENDED, *states(1.1, 9, EPISODE), (1.95, "rearm", ""), (2.0, "state", "drive"),
+        (2.05, "rearm", NOTHING),  # sent twice
+        (2.1, "final", "final_state"), *states(3.0, 9, EPISODE),
+    ]),
+    "however long the reset took": (1, False, [
+        *ENDED, *states(60.0, 5, EPISODE), (60.45, "rearm", ""), (60.5, "state", "drive"),
+    ]),
+    "where the end of the last one was lost": (1, True, [
+        FIRST, *states(0.1, 9, EPISODE, "of a later episode"),
+    ]),
+    "where all have one number": (
+        1, True, [*ENDED, *states(0.2, 9, EPISODE, "of the same episode")]
+    ),
+    "where one state has taken the place of the end": (1, True, [
+        FIRST, (0.1, "after a final that was not seen", EPISODE),
+        *states(0.2, 9, EPISODE, "of the same episode"),
+    ]),
+    "where the end comes again and again": (1, True, [*ENDED, *states(0.2, 9, EPISODE, "final")]),
+    "a re-arm before its first state is none": (1, True, [
+        *ENDED, (0.15, "rearm", NOTHING), *states(0.2, 2, EPISODE), (0.9, "rearm", "no fresh"),
+        *states(1.0, 9, SILENT),
+    ]),
+    "a re-arm in the last one's stop is none": (1, True, [
+        *STOPPED, *states(0.5, 3, SILENT), (0.75, "rearm", ""), (0.8, "final", SILENT),
+        *states(0.9, 9, EPISODE),
+    ]),
+    "another simulator is said to be one": (1, True, [
+        *ENDED, *states(1.0, 8, "other_session", "of another simulator"),
+    ]),
+    "a fault while it waits": (1, False, [
+        *ENDED, (0.5, "state", EPISODE), (0, "fault", LYING), (0.6, "state", FAULT),
+        (0.65, "rearm", LYING), (0, "fault", ""), *states(0.7, 5, FAULT), (1.15, "rearm", ""),
+        (1.2, "state", "drive"),
+    ]),
+    "a leash that is used up stops until the re-arm": (1, False, [
+        FIRST, (0, "leash", True), (0.01, "tick", LEASH), *states(0.1, 9, LEASH),
+        (0.95, "rearm", ""), *states(1.0, 4, LEASH), (1.4, "state", "drive"),
+        (1.45, "rearm", NOTHING),  # no new leash for what drives
+    ]),
+    "a leash that is used up between two looks": (
+        1, True, [FIRST, (0, "leash", True), (0.1, "state", LEASH)]
+    ),
+    "no episode gives a new leash": (1, True, [
+        FIRST, (0, "leash", True), (0.1, "final", LEASH), *states(0.2, 9, LEASH),
+    ]),
+    "a leash that a re-armed vehicle uses before it drives": (1, True, [
+        *STOPPED, *states(0.5, 3, SILENT), (0.75, "rearm", ""), (0, "leash", True),
+        *states(0.8, 9, LEASH),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("story", EPISODE_STORIES)
+def test_with_a_permission_for_each_episode(story):
+    safe_stops, waits, rows = EPISODE_STORIES[story]
+    controller = play(make(needs_rearm=True, each_episode=True), rows)
+    assert (controller.safety.safe_stops, controller.waits_for_rearm) == (safe_stops, waits)
+
+
+def test_without_a_vehicle_no_episode_waits():
+    rows = [(0.0, "final", "drive"), *states(1.0, 3, "drive")]
+    assert play(make(each_episode=True), rows).safety.safe_stops == 0
+
+
+def test_nobody_rides_into_a_new_episode():
+    limits = shared_limits([PEDAL], {})
+    config = ControllerConfig(limits, T, True, ride_s=0.5, each_episode=True)
+    controller = Controller(config)
+    play(controller, [FIRST, (0.121, "tick", "drive"), (0.2, "of a later episode", EPISODE)])
+    due = [said(controller.tick(0.2 + step * T)) for step in range(1, 9)]
+    assert {*due} <= {EPISODE, SILENT, None}
+
+
 def fault_in_the_vehicle(controller):
     controller.vehicle_fault = LYING
+    controller.tick(0.31)
+
+
+def use_the_leash(controller):
+    controller.leash_is_used = True
     controller.tick(0.31)
 
 
@@ -456,6 +545,8 @@ CAUSES = {
     Event.OTHER_SESSION: lambda c: answer(c, 9, 0.32, session="simulator-b"),
     Event.OTHER_TASK: lambda c: answer(c, 9, 0.32, task="another"),
     Event.VEHICLE: fault_in_the_vehicle,
+    Event.EPISODE: lambda c: answer(c, 9, 0.32, episode=9),
+    Event.LEASH: use_the_leash,
 }
 WAYS = {  # into each mode
     Mode.STANDBY: [(0.2, "state", "drive"), (0.3, "final", "final_state")],
@@ -469,6 +560,7 @@ WAYS = {  # into each mode
 def test_the_table_holds_in_every_mode(mode, event):
     controller = play(make(needs_rearm=True, task="ours"), WAYS[mode])
     assert controller.safety.mode is mode
+    controller.each_episode = event is Event.EPISODE  # else the way into standby is one's end
     CAUSES[event](controller)
     assert controller.safety.mode is TRANSITIONS[mode, event]
     if controller.safety.mode is Mode.SAFE_STOP:

@@ -43,14 +43,22 @@ outputs = st.one_of(
 
 
 class AnyHistory(RuleBasedStateMachine):
-    def __init__(self, vehicle: bool, armed_at_start: bool, ride_s: float) -> None:
+    def __init__(
+        self, vehicle: bool, armed_at_start: bool, ride_s: float, each_episode: bool
+    ) -> None:
         super().__init__()
         self.vehicle = vehicle
         self.limits = shared_limits([PEDAL, STEERING], SLOW if vehicle else {})
         self.controller = Controller(
-            ControllerConfig(self.limits, T, vehicle, armed_at_start, ride_s=ride_s)
+            ControllerConfig(
+                self.limits, T, vehicle, armed_at_start, ride_s=ride_s, each_episode=each_episode
+            )
         )
         self.ride_s = ride_s
+        self.each_episode = vehicle and each_episode
+        self.episode = 0
+        self.ended = False  # the next state begins an episode, whatever its number
+        self.leash_is_used = False
         self.answered_s = -math.inf  # the last order that was no ridden one
         self.now_s = 100.0
         self.step = 0
@@ -89,6 +97,26 @@ class AnyHistory(RuleBasedStateMachine):
         self.permitted = self.permitted and self.arrived_s is None
         self._state([0.5, 0.1], 0.0)
 
+    @rule(gap_s=gaps, says_so=st.booleans())
+    def another_episode(self, gap_s, says_so):
+        """With a final state before it, or without; with a number of its own, or the last one."""
+        if says_so:
+            self._state([0.5, 0.1], T, final=True)
+        else:
+            self.episode, self.ended = self.episode + 1, True
+        self._state([0.5, 0.1], gap_s)
+
+    @rule()
+    def the_leash_is_used(self):
+        if self.vehicle:
+            drove = self._drives()
+            self.controller.leash_is_used = self.leash_is_used = True
+            order = self.controller.tick(self.now_s)
+            assert not drove or (order is not None and order.reason == "leash")
+            self.good_in_a_row, self.permitted = 0, False
+            if order is not None:
+                self._note(order)
+
     @rule(duration_s=st.sampled_from([0.05, 0.25, 2.0, 12.0]))
     def nothing_comes(self, duration_s):
         self._pass(duration_s, late=False)
@@ -112,7 +140,8 @@ class AnyHistory(RuleBasedStateMachine):
             assert self.vehicle
             assert self.arrived_s is not None
             assert self.now_s - self.arrived_s <= SILENT_S
-            self.permitted = True
+            self.permitted, self.leash_is_used = True, False
+            assert not self.controller.leash_is_used
 
     def _state(self, output, gap_s, wait_s=0.0, duration_s=0.001, final=False, late=False):
         """A state comes after `gap_s`, waits for the policy, and is answered."""
@@ -122,17 +151,27 @@ class AnyHistory(RuleBasedStateMachine):
             self._fault()
         if pause_s > LONGEST_PAUSE_S:
             self.permitted = False
+        if self.each_episode and self.ended and self.arrived_s is not None:
+            self._fault()
+            self.permitted = False
+        self.ended = final
         self.arrived_s = self.now_s
         self.step += 1
         sent = {"sent_ns": int(self.now_s * 1e9)}  # No link holds it up.
         state = make_state(self.step, session=f"s{self.session}", final=final, **sent)
+        state = msgspec.structs.replace(state, episode=self.episode)
         received = Received(state, self.now_s, 0)
         self._pass(wait_s, late)
         self.controller.begin(received, self.now_s)
         self._pass(duration_s, late)
         in_time = duration_s <= T and self.now_s - received.arrived_s <= SILENT_S
         answer = np.array(output, np.float32)
-        if in_time and answer.shape == (2,) and np.all(np.isfinite(answer)):
+        if (
+            in_time
+            and not self.leash_is_used
+            and answer.shape == (2,)
+            and np.all(np.isfinite(answer))
+        ):
             self.good_in_a_row += 1
         else:
             self._fault()
@@ -228,9 +267,10 @@ class AnyHistory(RuleBasedStateMachine):
 
 @pytest.mark.parametrize("ride_s", [0.0, 0.5])
 @pytest.mark.parametrize(
-    ("vehicle", "armed_at_start"), [(False, True), (True, True), (True, False)]
+    ("vehicle", "armed_at_start", "each_episode"),
+    [(False, True, True), (True, True, False), (True, True, True), (True, False, True)],
 )
-def test_any_history(vehicle, armed_at_start, ride_s):
+def test_any_history(vehicle, armed_at_start, each_episode, ride_s):
     patient = settings(max_examples=30, stateful_step_count=30)
-    make: Any = partial(AnyHistory, vehicle, armed_at_start, ride_s)
+    make: Any = partial(AnyHistory, vehicle, armed_at_start, ride_s, each_episode)
     run_state_machine_as_test(make, settings=patient)

@@ -21,6 +21,7 @@ from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, Ros2Rig
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import ros2
+from edge_runtime.vehicles.mapping import SPECS
 from edge_runtime.vehicles.plausibility import Fault
 from edge_runtime.vehicles.ros2 import (
     ODOMETRY,
@@ -126,6 +127,31 @@ LE = b"\0\1\0\0"  # how a message of little-endian CDR begins
 )
 def test_what_is_no_odometry_is_not_read(payload):
     assert read_odometry(payload) is None
+
+
+def hunter_ros2_inner_rad(linear_x, angular_z, spec):
+    """The inner wheel's angle that the maker's driver sends to the chassis for a Twist."""
+    if angular_z == 0.0:
+        return 0.0
+    side, radius_m = math.copysign(1.0, angular_z), abs(linear_x) / abs(angular_z)
+    if radius_m < spec.wheelbase_m:
+        return side * spec.max_inner_steering_rad
+    inner_rad = math.atan(spec.wheelbase_m / (radius_m - spec.track_m / 2))
+    return side * (-inner_rad if linear_x < 0.0 else inner_rad)
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
+@given(speed_mps=st.floats(-1.0, 1.0), share=st.floats(-1.0, 1.0))
+def test_the_makers_driver_turns_the_wheels_as_they_are_asked_to_backwards_too(
+    spec, speed_mps, share
+):
+    inner_rad = share * spec.max_inner_steering_rad
+    motion = Motion(speed_mps, spec.centre_rad(inner_rad))
+    twist = STORE.deserialize_cdr(twist_of(motion, YAW_RATE, spec.wheelbase_m), TWIST)
+    if abs(twist.angular.z) < 1e-300:  # it stands, or next to: a yaw rate of 0 tells no angle
+        return
+    found_rad = hunter_ros2_inner_rad(twist.linear.x, twist.angular.z, spec)
+    assert found_rad == pytest.approx(inner_rad, abs=1e-9)
 
 
 def test_commands_by_hand_in_the_second_librarys_bytes():

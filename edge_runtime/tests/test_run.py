@@ -255,13 +255,41 @@ def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
     simulator.drive_until(moves, "the mock moves again", rearms=True)
     simulator.send(make_state(next(simulator.steps), final=True))
     wait_until(lambda: simulator.feedback[-1].speed_mps == 0.0, "it stands between two episodes")
-    # No operator is needed for another episode.
-    simulator.drive_until(moves, "the next drive", episode=1)
+    simulator.steps, told = itertools.count(), []
+    for _ in range(8):
+        told.append(simulator.ask(make_state(next(simulator.steps), episode=1)))
+        time.sleep(0.1)
+    assert {(command.mode, command.reason) for command in told} == {("safe_stop", "episode")}
+    assert not moves()
+    simulator.drive_until(moves, "the next drive", rearms=True, episode=1)
     edge.send(signal.SIGINT)  # as SIGTERM
     last = command_of_reason(simulator, "runtime_ended")
     assert (last.mode, last.action) == ("safe_stop", [-1.0])
     assert edge.wait() == 0
     assert " ended " in edge.errors
+
+
+def test_a_leash_needs_a_re_arm_and_ends_within_its_length(edge_and_simulator, tmp_path):
+    path = tmp_path / "edge.toml"
+    path.write_text("[vehicle]\ndriver = 'mock'\nmax_speed_mps = 2.0\nleash_m = 1.0\n")
+    edge, simulator = edge_and_simulator("constant", "--config", path, value=0.8)
+    assert {command.reason for command in drive(simulator, range(7))} == {"not_armed"}
+    simulator.steps = itertools.count(7)
+
+    def is_used():
+        return simulator.health[-1].reason == "leash"
+
+    assert simulator.query("rearm")["accepted"]
+    simulator.drive_until(is_used, "the end of the leash")
+    health = simulator.health[-1]
+    assert (health.needs_rearm, health.leash_m, health.max_speed_mps) == (True, 1.0, 2.0)
+    wait_until(lambda: simulator.feedback[-1].speed_mps == 0.0, "a stand")
+    told = [(feedback.sent_ns * 1e-9, feedback.speed_mps) for feedback in simulator.feedback]
+    pairs = list(zip(told, told[1:]))
+    at_m = sum(0.5 * (v + w) * (t - s) for (s, v), (t, w) in pairs)
+    assert at_m <= 1.0 + 2.0**2 / (2 * 4.0) + 2.0 * 0.1  # its stopping distance
+    assert max(speed_mps for _, speed_mps in told) <= 2.0 * 1.03
+    assert edge.end() == 0
 
 
 def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):

@@ -13,7 +13,7 @@ GOOD = {"fresh_state", "recovered", "final_state"}
 BAD = {
     "no_fresh_state", "output_not_finite", "inference_failed", "policy_thread_dead", "other_task",
     "inference_too_long", "pause_too_long", "other_session", "not_armed", "vehicle_fault",
-    "state_late",
+    "state_late", "episode", "leash",
 }  # fmt: skip
 
 

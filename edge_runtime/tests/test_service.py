@@ -162,10 +162,10 @@ def running():
     """Starts a loop with its real threads between a fake policy and a fake link."""
     with contextlib.ExitStack() as ends:
 
-        def start(notifier: Any, vehicle: Any = None) -> Any:
+        def start(notifier: Any, vehicle: Any = None, **decides: Any) -> Any:
             policy: Any = FakePolicy()
             link: Any = FakeLink()
-            controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T))
+            controller = Controller(ControllerConfig(shared_limits([PEDAL], {}), T, **decides))
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
             control = ControlLoop(policy, controller, link, notifier, runner)
             control.start()
@@ -200,6 +200,37 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert link.sent["command"][0] > before  # the safe stops go on
     policy.free.set()
     assert systemd.next() == "WATCHDOG=1"
+
+
+def test_the_end_of_an_episode_that_newer_states_overtake_is_remembered(running):
+    control, link, policy = running(Notifier({}))
+    policy.free.clear()
+    link.state_comes(encode(make_state(0)))
+    wait_until(lambda: control._busy_since_s is not None, "the inference")
+    told = []
+    for step in range(1, 5):
+        link.state_comes(encode(make_state(step, final=step == 2)))
+        told.append(control._slot.follows_final)
+    assert told == [False, False, True, True]
+    policy.free.set()
+    wait_until(lambda: control._slot is None, "the newest to be taken")
+    link.state_comes(encode(make_state(5)))
+    wait_until(lambda: control._controller._newest.state.step == 5, "the next")
+    assert not control._controller._newest.follows_final
+
+
+@pytest.mark.parametrize(("each_episode", "asked"), [(True, "brake"), (False, "stand")])
+def test_a_driver_is_latched_between_episodes_where_the_next_needs_a_re_arm(
+    running, each_episode, asked
+):
+    vehicle = BrokenVehicle()
+    decides = {"needs_rearm": True, "each_episode": each_episode}
+    _, link, _ = running(Notifier({}), vehicle, **decides)
+    link.state_comes(encode(make_state(0)))
+    wait_until(lambda: "command" in vehicle.asked, "a drive")
+    link.state_comes(encode(make_state(1, final=True)))
+    wait_until(lambda: {"brake", "stand"} & {*vehicle.asked}, "the end of the episode")
+    assert next(each for each in vehicle.asked if each in ("brake", "stand")) == asked
 
 
 def test_no_late_answer_follows_the_last_safe_stop(running):

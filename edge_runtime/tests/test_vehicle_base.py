@@ -1,5 +1,6 @@
 """The runner of a driver that raises, hangs or reports nonsense."""
 
+import contextlib
 import time
 
 import msgspec
@@ -11,10 +12,11 @@ from hil_tests.testing.policies import T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge_runtime.bounds import Bounds, Model
 from edge_runtime.tests.rigs import BrokenVehicle
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import base
-from edge_runtime.vehicles.base import VehicleRunner
+from edge_runtime.vehicles.base import VehicleRunner, _Order
 from edge_runtime.vehicles.plausibility import DEVIATES_S, LAG_S, Fault
 from edge_runtime.wire import SAFE_STOP, encode
 
@@ -24,10 +26,10 @@ RAISED = [BUS_OFF, SystemExit(3), KeyboardInterrupt(), GeneratorExit()]
 
 
 class NotingRunner(VehicleRunner):
-    def __init__(self, vehicle):
+    def __init__(self, vehicle, names=("pedal",)):
         self.heard: list = []
         self.faults: list = []
-        super().__init__(vehicle, ["pedal"], self.heard.append)
+        super().__init__(vehicle, names, self.heard.append)
         self.on_fault = lambda: self.faults.append(True)
 
     def now(self):
@@ -73,6 +75,43 @@ def test_a_driver_that_raises_or_reports_nonsense_is_silent_and_its_thread_lives
     wait_until(lambda: vehicle.asked == ["brake"], "the brake")
     setattr(vehicle, name, {})
     runner.wait_for_reports()
+
+
+def test_no_driver_is_given_more_than_the_bounds(vehicle):
+    vehicle.model_limits = Model(6.0, 0.4, 0.4)
+    vehicle.take_bounds(Bounds(max_speed_mps=0.5, max_steering_rad=0.1))
+    runner = NotingRunner(vehicle, ["pedal", "steering"])
+    given: list = []
+    vehicle.command = lambda action, *_: given.append(action)
+    for speed_mps, asked, expected in (
+        (0.4, [1.0, 1.0], [1.0, 0.25]), (0.5, [1.0, -0.5], [0.0, -0.25]),
+        (0.51, [-0.5, 0.1], [-0.5, 0.1]),
+    ):  # fmt: skip
+        vehicle.odd = {"speed_mps": speed_mps}
+        runner._ask()
+        runner._obey(_Order(make_command(action=asked), None, True, time.monotonic()))
+        assert [*given[-1].values()] == pytest.approx(expected)
+
+
+def test_only_enable_gives_a_new_leash(vehicle):
+    vehicle.take_bounds(Bounds(leash_m=0.3))
+    vehicle.odd = {"speed_mps": -1.0}
+    runner = NotingRunner(vehicle)
+    runner.start(armed=False)
+    with contextlib.closing(runner):
+        wait_until(lambda: runner.leash_is_used, "its end")
+        assert runner.faults  # the watchdog is woken
+        runner.command(make_command(mode=SAFE_STOP))
+        runner.wait_for_reports(3)
+        assert runner.leash_is_used
+        vehicle.odd = {"speed_mps": 0.0}
+        runner.wait_for_reports(3)
+        runner.enable()
+        assert not runner.leash_is_used  # at once: the next look must not stop it again
+        wait_until(lambda: "enable" in vehicle.asked, "enable")
+        runner.wait_for_reports(2)
+        assert not runner.leash_is_used
+        assert runner.leash.left_m > 0.2
 
 
 def test_a_report_in_numbers_of_numpy_and_words_that_no_message_can_carry_is_one(vehicle, runner):

@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 from numbers import Real
 from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
+from edge_runtime.bounds import NO_BOUNDS, Bounds, check_bounds, narrowed
 from edge_runtime.config import BUILT_IN, NONE
 from edge_runtime.controller import ActionLimit, Limits
 from edge_runtime.manifest import Manifest
@@ -46,15 +47,23 @@ def check_driver(vehicle: Any) -> None:
         raise
 
 
-def vehicle_limits(name: str, tables: Tables, manifest: Manifest) -> Limits:
+def vehicle_limits(
+    name: str, tables: Tables, manifest: Manifest, bounds: Bounds = NO_BOUNDS
+) -> Limits:
     """Return the limits of the vehicle of a name without opening anything; of "none": {}.
 
-    Raises UserError where there is none, and for its settings.
+    They are cut to the operator's bounds. Raises UserError where there is none, and for its
+    settings.
     """
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    return _checked(name, _call(name, kind.limits_of, settings, manifest))
+    limits = _checked(name, _call(name, kind.limits_of, settings, manifest))
+    if bounds == NO_BOUNDS:
+        return limits
+    model = _call(name, kind.model_limits_of, settings, manifest)
+    check_bounds(bounds, model, name)
+    return narrowed(limits, bounds, model)
 
 
 def _checked(name: str, limits: Any) -> Limits:

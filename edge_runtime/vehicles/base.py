@@ -14,10 +14,11 @@ from functools import partial
 from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
 
 from edge_runtime import log
+from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, check_bounds, narrowed
 from edge_runtime.controller import Limits
 from edge_runtime.manifest import MIN_PERIOD_S, Manifest
 from edge_runtime.util import UserError, ends_within, printable
-from edge_runtime.vehicles.plausibility import Fault, VehicleReport, VehicleWatch
+from edge_runtime.vehicles.plausibility import PEDAL, Fault, VehicleReport, VehicleWatch
 from edge_runtime.wire import FEEDBACK_HZ, MAX_TEXT_CHARS, SAFE_STOP, Command, Feedback
 
 
@@ -26,11 +27,14 @@ class Vehicle(abc.ABC):
 
     `name` is what others see, and the table in the settings; by default the class's own name.
     The runtime sets `control_period_s` to the policy's before `enable`; until then it is the
-    shortest that a policy may have, which brakes soonest.
+    shortest that a policy may have, which brakes soonest. A driver drives no faster than
+    `allowed.max_speed_mps`; the runtime stops one that does, and sees to the other bounds.
     """
 
     name: ClassVar[str]
     limits: Limits
+    model_limits: Model = Model()
+    allowed: Bounds = NO_BOUNDS
     control_period_s: float = MIN_PERIOD_S
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -50,6 +54,16 @@ class Vehicle(abc.ABC):
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
         """Return `limits` of the driver to be, by default the class's. Opens nothing."""
         return cls.limits
+
+    @classmethod
+    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
+        """Return `model_limits` of the driver to be, by default the class's. Opens nothing."""
+        return cls.model_limits
+
+    def take_bounds(self, bounds: Bounds) -> None:
+        """Take the operator's bounds, before `enable`. UserError where the model's are below."""
+        check_bounds(bounds, self.model_limits, self.name)
+        self.allowed = bounds
 
     @abc.abstractmethod
     def enable(self, now_s: float) -> None:
@@ -122,7 +136,12 @@ class VehicleRunner:
         self.name = vehicle.name
         self.on_fault: Callable[[], None] = lambda: None
         self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
-        self._watch = VehicleWatch(vehicle.control_period_s, vehicle.limits)
+        self.allowed = vehicle.allowed
+        self._limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
+        self.leash = Leash(vehicle.allowed.leash_m)
+        self._watch = VehicleWatch(
+            vehicle.control_period_s, vehicle.limits, vehicle.allowed.max_speed_mps
+        )
         # As often as the topic says, and twice before silence would be a fault.
         self._period_s = min(1.0 / FEEDBACK_HZ, vehicle.control_period_s / 2)
         self._refuses = self._fails = False  # the driver raised at the newest command, report
@@ -139,6 +158,11 @@ class VehicleRunner:
     def silent_at_s(self) -> float:
         """When the vehicle counts as silent if nothing more is heard of it (monotonic)."""
         return self._watch.silent_at_s
+
+    @property
+    def leash_is_used(self) -> bool:
+        """Whether it has gone as far as it may, or will have before it is heard again."""
+        return not self._enable_due and self.leash.is_used(self._period_s)
 
     def busy_s(self, now_s: float) -> float:
         """Return for how long the driver has kept its thread; 0 while that waits."""
@@ -231,6 +255,7 @@ class VehicleRunner:
     def _enable(self) -> None:
         now_s = time.monotonic()
         self._watch.enable(now_s)
+        self.leash.begin()
         try:
             self._vehicle.enable(now_s)
             self._not_enabled = ""
@@ -248,7 +273,7 @@ class VehicleRunner:
         """Ask the driver. The mode alone makes a safe stop, whatever number is the policy's."""
         self._last = command = order.command
         now_s, vehicle = time.monotonic(), self._vehicle
-        action = dict(zip(self._action_names, command.action))
+        action = self._bounded(dict(zip(self._action_names, command.action)))
         self._watch.command(action, now_s, command.mode != SAFE_STOP)
         try:
             if command.mode == SAFE_STOP:
@@ -267,10 +292,20 @@ class VehicleRunner:
             return
         self._refuses = False
 
+    def _bounded(self, action: dict[str, float]) -> dict[str, float]:
+        """Cut an action to the operator's bounds: at the speed cap there is no more throttle."""
+        for name, limit in self._limits.items():
+            if name in action:
+                action[name] = min(max(action[name], limit.low), limit.high)
+        heard_mps = self._heard.speed_mps if self._heard else 0.0
+        if PEDAL in action and heard_mps >= self.allowed.max_speed_mps:
+            action[PEDAL] = min(action[PEDAL], 0.0)
+        return action
+
     def _report(self) -> None:
         report, last = self._ask(), self._last
         fault = self.fault(time.monotonic())
-        if fault:
+        if fault or self.leash_is_used:
             self.on_fault()
         if report is None:
             return
@@ -302,6 +337,7 @@ class VehicleRunner:
         try:
             report = _plain(self._vehicle.feedback(time.monotonic()), self._action_names)
             self._watch.report(report, time.monotonic())
+            self.leash.note(report.speed_mps, time.monotonic())
         except BaseException as error:
             if not self._fails:
                 log.event("error", "no_feedback", detail=error)

@@ -16,6 +16,7 @@ from typing import Dict, NamedTuple, Optional
 
 import msgspec
 
+from edge_runtime.bounds import Bounds, Model
 from edge_runtime.config import check_choice
 from edge_runtime.controller import ActionLimit
 from edge_runtime.manifest import Car, Manifest
@@ -67,8 +68,9 @@ class HunterSpec(NamedTuple):
 
 SPECS: Dict[str, HunterSpec] = {
     "2.0": HunterSpec(1.5, 0.576, 0.650, 0.605, 1.0),
-    # The track is given as 0.46 to 0.52 m, by position of the measurement: measure it.
-    "se": HunterSpec(4.8, 0.400, 0.550, 0.490, 1.0),
+    # The track is given as 0.46 to 0.52 m, by position of the measurement: measure it. The angle
+    # is given as 0.400 or 0.384 rad.
+    "se": HunterSpec(4.8, 0.384, 0.550, 0.490, 1.0),
 }
 
 
@@ -106,10 +108,17 @@ class Similarity(NamedTuple):
         """The most steering that the robot's wheels allow."""
         return abs(self.steering(self.spec.centre_rad(self.spec.max_inner_steering_rad)))
 
+    @property
+    def full_rad(self) -> float:
+        """The inner wheel's angle at the most steering."""
+        return abs(self.spec.inner_rad(self.centre_rad(self.reach)))
+
+    def model(self) -> Model:
+        return Model(self.spec.max_speed_mps, self.spec.max_inner_steering_rad, self.full_rad)
+
     def limits(self) -> Dict[str, ActionLimit]:
         """Return ranges and slew rates. A pedal is integrated: any leap of it is a ramp."""
-        reach = self.reach
-        full_rad = abs(self.spec.inner_rad(self.centre_rad(reach)))
+        reach, full_rad = self.reach, self.full_rad
         rate_per_s = self.spec.max_steering_rate_radps * reach / full_rad
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
@@ -182,11 +191,20 @@ class SetPoint:
     def __init__(self, similarity: Similarity) -> None:
         self.speed_mps = 0.0
         self.inner_rad = 0.0
+        self.spec = similarity.spec  # the model's limits, or the operator's below them
         self._similarity = similarity
+
+    def take_bounds(self, bounds: Bounds) -> None:
+        """Stay within the operator's bounds as well."""
+        spec = self.spec
+        self.spec = spec._replace(
+            max_speed_mps=min(spec.max_speed_mps, bounds.max_speed_mps),
+            max_inner_steering_rad=min(spec.max_inner_steering_rad, bounds.max_steering_rad),
+        )
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
         """Go on towards a command that was in force for `step_s`."""
-        similarity, spec = self._similarity, self._similarity.spec
+        similarity, spec = self._similarity, self.spec
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:
             lead_mps = similarity.acceleration_mps2(1.0) * LEAD_S

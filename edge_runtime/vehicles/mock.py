@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Deque, Dict, Mapping, Optional, Tuple
 
 import msgspec
 
+from edge_runtime.bounds import Model
 from edge_runtime.config import convert
 from edge_runtime.controller import ActionLimit
 from edge_runtime.manifest import Manifest
@@ -42,8 +43,13 @@ class MockVehicle(Vehicle):
     # another faster than its time. What the body does with it is the lag's business.
     limits: Dict[str, ActionLimit] = dict.fromkeys(("pedal", "steering"), ActionLimit(-1.0, 1.0))
 
-    def __init__(self, parameters: Optional[MockParameters] = None) -> None:
+    def __init__(
+        self, parameters: Optional[MockParameters] = None, full_steering_rad: float = math.inf
+    ) -> None:
         self._parameters = parameters or MockParameters()
+        self.model_limits = Model(
+            self._parameters.max_speed_mps, full_steering_rad, full_steering_rad
+        )
         self._pedal, self._steering, self._speed_mps = -1.0, 0.0, 0.0
         self._now_s, self._commanded_s = math.inf, -math.inf  # its time begins with the first call
         self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
@@ -59,11 +65,15 @@ class MockVehicle(Vehicle):
         for key, value in msgspec.structs.asdict(parameters).items():
             if not (0.0 < value < math.inf or (key, value) == ("dead_time_s", 0.0)):
                 raise UserError(f"[vehicle.mock]: {key} {value} is not valid: it must be above 0")
-        return cls(parameters)
+        return cls(parameters, abs(manifest.car.full_steering_rad) if manifest.car else math.inf)
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Dict[str, ActionLimit]:
         return cls.open(settings, manifest).limits  # It opens nothing.
+
+    @classmethod
+    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
+        return cls.open(settings, manifest).model_limits
 
     def enable(self, now_s: float) -> None:
         """Take a stop back; the brake is on until the first command."""
@@ -119,7 +129,8 @@ class MockVehicle(Vehicle):
             self._steering = self._follow(self._steering, self._target[1], step_s)
             full_mps2 = car.throttle_mps2 if self._pedal > 0.0 else car.brake_mps2
             speed_mps = self._speed_mps + self._pedal * full_mps2 * step_s
-            self._speed_mps = min(max(speed_mps, 0.0), car.max_speed_mps)
+            most_mps = min(car.max_speed_mps, self.allowed.max_speed_mps)
+            self._speed_mps = min(max(speed_mps, 0.0), most_mps)
 
     def _follow(self, position: float, target: float, step_s: float) -> float:
         """Lag towards the target by the time constant, no faster than the actuator's rate."""

@@ -25,6 +25,7 @@ LAG_S = 0.3
 LAG_DEVIATION = 0.125
 MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
 SPEED_NOISE_MPS = 0.5
+OVER_CAP, OVER_CAP_MPS = 1.1, 0.02  # by so much, a driver does not hold the operator's speed cap
 _ROUNDING = 5e-4  # of an action's range
 
 # A streamed vehicle: the age of a set-point that a drive may still follow; that of a wheel, by its
@@ -62,6 +63,7 @@ class Fault(str, Enum):
     STUCK = "vehicle_stuck"  # its speed, or an action of any driver
     STEERING_STUCK = "steering_stuck"
     SELF_BRAKING = "vehicle_self_braking"  # though it is to drive
+    TOO_FAST = "vehicle_too_fast"  # for the operator's speed cap, while it is to drive
 
 
 class Finding(NamedTuple):
@@ -100,7 +102,10 @@ class Asked:
 class VehicleWatch:
     """Watch the commands and reports of any driver. Not thread-safe."""
 
-    def __init__(self, control_period_s: float, limits: Limits) -> None:
+    def __init__(
+        self, control_period_s: float, limits: Limits, max_speed_mps: float = math.inf
+    ) -> None:
+        self._most_mps = OVER_CAP * max_speed_mps + OVER_CAP_MPS
         self._silence_s, self._limits = 2 * control_period_s, limits
         self._brakes_s = SILENCE_PERIODS * control_period_s
         self._drives, self._enabled_s = False, -math.inf
@@ -108,7 +113,7 @@ class VehicleWatch:
         self._asked = Asked(LAG_S)
         self._reported_s = math.inf  # until it owes a report
         self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
-        self._lies = False
+        self._lies = self._races = False
 
     @property
     def silent_at_s(self) -> float:
@@ -139,6 +144,7 @@ class VehicleWatch:
         self._lies = self._is_impossible(report, now_s)
         if not self._lies:
             self._believed = (now_s, report.speed_mps)
+        self._races = self._drives and abs(report.speed_mps) > self._most_mps
         self._reported_s = now_s
         is_astray = self._is_astray(report, now_s)
         self._deviates_since_s = lasting(self._deviates_since_s, is_astray, now_s)
@@ -152,6 +158,8 @@ class VehicleWatch:
             return Fault.SILENT
         if self._lies:
             return Fault.LYING
+        if self._races:
+            return Fault.TOO_FAST
         may_brake_until_s = max(self._brakes_since_s, self._enabled_s + ENABLE_TIMEOUT_S)
         if now_s - may_brake_until_s > self._brakes_s:
             return Fault.SELF_BRAKING  # it obeys nobody, and would drive off with the next command

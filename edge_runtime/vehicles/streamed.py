@@ -19,6 +19,7 @@ from enum import Enum
 from typing import Any, ClassVar, Deque, Dict, List, Mapping, Optional, Tuple, Type
 
 from edge_runtime import log
+from edge_runtime.bounds import Bounds, Model
 from edge_runtime.config import convert
 from edge_runtime.controller import Limits
 from edge_runtime.manifest import MIN_PERIOD_S, Manifest
@@ -260,7 +261,7 @@ class StreamedVehicle(Vehicle):
 
     def __init__(self, core: StreamedCore) -> None:
         self._core = core
-        self.limits = core.similarity.limits()
+        self.limits, self.model_limits = core.similarity.limits(), core.similarity.model()
         self._lock = threading.Lock()
         self._closed = self._ending = False
         self._logged = ("", "")
@@ -278,6 +279,16 @@ class StreamedVehicle(Vehicle):
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
         return given.similarity(cls.name, manifest).limits()
+
+    @classmethod
+    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
+        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        return given.similarity(cls.name, manifest).model()
+
+    def take_bounds(self, bounds: Bounds) -> None:
+        super().take_bounds(bounds)
+        with self._lock:
+            self._core.set_point.take_bounds(bounds)
 
     def enable(self, now_s: float) -> None:
         """Ask for control; `feedback` tells whether it came. Does nothing once closed."""

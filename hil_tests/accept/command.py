@@ -122,7 +122,7 @@ def prepare(asked: Namespace) -> Job:
         period_s = policy.manifest.control_period_s
         with closing(make_environment(asked.env, period_s=period_s)) as env:
             load_driver(asked.policy, env, policy.public_key)  # It is for this environment.
-        vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest)
+        vehicle_limits(config.vehicle, config.vehicle_settings, policy.manifest, config.bounds)
     trust = ["--public-key", key] if key else []
     trust += ["--allow-unsigned"] if asked.allow_unsigned else []
     return Job(asked, settings, Path(asked.out), policy_id, policy, refusal, config, trust)

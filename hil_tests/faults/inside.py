@@ -4,9 +4,9 @@
 cannot be done to it from outside.
 
 The directory PHIL_FAULT_DIR holds the switches, which are files: END ends the episode, BRIGHT turns
-pictures white, SLOW slows inference down, VEHICLE holds the fault of the mock vehicle. The TASK of
-the policy stands there, too, and the log of the simulated brake: a line in BRAKES for each change,
-with its monotonic time and 1 where it is pressed.
+pictures white, SLOW slows inference down, VEHICLE holds the fault of the mock vehicle, SOURCE that
+of a source of `sense`. The TASK of the policy stands there, too, and the log of the simulated
+brake: a line in BRAKES for each change, with its monotonic time and 1 where it is pressed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import os
 import runpy
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,10 @@ from edge_runtime.vehicles.mock import MockVehicle
 
 ENVIRONMENT = "hil_tests.faults.inside:PhilEndless-v0"
 MOCK = "hil_tests.faults.inside:FaultyMockVehicle"
+SENSES = "hil_tests.faults.inside:FaultySource"
 DIRECTORY = "PHIL_FAULT_DIR"
 END, BRIGHT, BRAKES, VEHICLE, TASK, SLOW = "end", "bright", "brakes", "vehicle", "task", "slow"
+SOURCE = "source"
 HERE = Path(os.environ.get(DIRECTORY, ""))
 SLOWER_S = 0.25
 _FULL_MPS2, _MOST_MPS = 4.0, 12.0
@@ -135,6 +138,27 @@ class FaultyMockVehicle(MockVehicle):
     def _fault(self) -> str:
         switch = HERE / VEHICLE
         return switch.read_text() if switch.exists() else ""
+
+
+class FaultySource:
+    """A robot's senses: noise, with the fault that SOURCE holds."""
+
+    speed_mps = 0.5
+
+    def __init__(self) -> None:
+        self._task = msgspec.json.decode((HERE / TASK).read_bytes(), type=Task)
+        self._random = np.random.default_rng()
+
+    def observe(self) -> Observation:
+        switch = HERE / SOURCE
+        match switch.read_text() if switch.exists() else "":
+            case "raises":
+                raise OSError("the camera is gone")
+            case "late":
+                time.sleep(3.0 * self._task.control_period_s)
+            case "hangs":
+                threading.Event().wait()
+        return noise(self._task, self._random)
 
 
 def launch(package: str, *arguments: str) -> None:

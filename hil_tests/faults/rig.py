@@ -49,8 +49,10 @@ class Rig:
     ``policy`` are the edge runtime's options for its policy, which is made for ``task``;
     ``vehicle`` is its ``--vehicle``. The ``directory`` is an empty one, for switches and reports.
     Edge runtime and probe meet at a ``relay`` or a ``router`` where ``between`` says so. ``sender``
-    sends states here, without a simulator. With the vehicle ``hunter`` there is a mock of it on a
-    CAN bus. The attributes below exist only where the options ask for them.
+    sends states here, without a simulator; with ``senses`` a source stands in its place.
+    ``settings`` is TOML for the edge runtime. With the
+    vehicle ``hunter`` there is a mock of it on a CAN bus. The attributes below exist only where the
+    options ask for them.
     """
 
     simulator: Process
@@ -69,6 +71,8 @@ class Rig:
         vehicle: str = "none",
         sender: bool = False,
         ride_s: float = 0.0,
+        senses: bool = False,
+        settings: str = "",
     ) -> None:
         self.number = 0  # Of the try
         self.timeline = DriveTimeline()
@@ -76,10 +80,11 @@ class Rig:
         self.task, self.period_s = task, task.control_period_s
         self.has_vehicle = vehicle != "none"  # Only an operator lets it drive again after a stop
         self._directory, self._processes = directory, list[Process]()
+        self._policy, self._senses = policy, senses
         self._edge = [*policy, "--vehicle-id", VEHICLE_ID, "--vehicle", vehicle]
-        if ride_s:
-            (directory / "edge.toml").write_text(f"[ride_through]\nmax_s = {ride_s}\n")
-            self._edge += ["--config", str(directory / "edge.toml")]
+        told = f"[ride_through]\nmax_s = {ride_s}\n{settings}"
+        (directory / "edge.toml").write_text(told)
+        self._edge += ["--config", str(directory / "edge.toml")]
         (directory / inside.BRAKES).touch()
         (directory / inside.TASK).write_bytes(msgspec.json.encode(task))
         self._listen, self._hub = free_endpoint(), free_endpoint()
@@ -121,10 +126,13 @@ class Rig:
         return self._start(*run)
 
     def start_simulator(self) -> Process:
+        where = ("--listen", self._listen, "--vehicle-id", VEHICLE_ID)
+        if self._senses:
+            sense = ("bridge", "sense", "--source", inside.SENSES, *self._policy)
+            return self._start(*sense, *where)
         return self._start(
             _INSIDE, "bridge", "simulate", "--env", inside.ENVIRONMENT, "--clock", "realtime",
-            "--listen", self._listen, "--vehicle-id", VEHICLE_ID,
-            "--out", str(self._directory / "report.json"),
+            *where, "--out", str(self._directory / "report.json"),
         )  # fmt: skip
 
     def start_recorder(self) -> tuple[Process, Path]:
@@ -250,7 +258,7 @@ class Sender:
     """The rig's own simulator: sends step after step at absolute ticks until it is stopped."""
 
     def __init__(self, rig: Rig) -> None:
-        self.step = 0
+        self.step = self.episode = 0
         self.ahead_ns = 0  # By how much its clock is set ahead
         self.running = threading.Event()
         self.running.set()
@@ -273,7 +281,8 @@ class Sender:
 
     def state(self, step: int, final: bool = False) -> State:
         stamp_ns = time.time_ns() + self.ahead_ns
-        return noisy_state(step, self._rig.task, sent_ns=stamp_ns, final=final)
+        place = {"episode": self.episode, "final": final}
+        return noisy_state(step, self._rig.task, sent_ns=stamp_ns, **place)
 
     def stop(self) -> None:
         self._stopping.set()

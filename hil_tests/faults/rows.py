@@ -26,7 +26,7 @@ import numpy as np
 
 from bridge.recording import Recording, heard_of
 from edge_runtime.wire import DRIVE, SAFE_STOP, State, decode_state, encode
-from hil_tests.faults.inside import MOCK, SLOW, VEHICLE
+from hil_tests.faults.inside import MOCK, SLOW, SOURCE, VEHICLE
 from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S
 from hil_tests.faults.rig import RIDE_S, VEHICLE_ID, Rig, noisy_state
 from hil_tests.processes import wait_until
@@ -253,6 +253,23 @@ def vehicle_not_enabled(rig: Rig) -> Try:
     return Try(None, rig.drive_again(), "vehicle_fault", wrong)
 
 
+def _source_is(word: str, rig: Rig) -> Try:
+    """Judge that it stops, that `sense` says why and ends, and that no new one drives by itself."""
+    time.sleep(SETTLED_S)
+    begin_s = time.monotonic()
+    rig.switch(SOURCE, word)
+    stop = rig.stop_command(begin_s)
+    last_s = rig.last_state_s(before_s=stop.seen_s)
+    status, said = rig.simulator.wait(), rig.simulator.errors
+    wrong = [] if status == 1 and "has failed" in said else [f"status {status}: {said[-200:]!r}"]
+    rig.switch(SOURCE, None)
+    rig.simulator = rig.start_simulator()
+    rig.simulator.wait_for_line("ready")
+    time.sleep(LASTS_S)
+    wrong += rig.timeline.drives_between(stop.seen_s)
+    return Try(stop.seen_s - last_s, rig.drive_again(), stop.reason, wrong)
+
+
 def disk_full(rig: Rig) -> Try:
     recorder, path = rig.start_recorder()
     # No file may grow beyond a limit: the same failing write as on a full disk.
@@ -386,10 +403,14 @@ ROWS = [
     Row("vehicle_self_braking", "vehicle says that it brakes by itself while it is to drive",
         _REARM, partial(_vehicle_is, "self_braking"), **_STUCK,
         reaction_limit_s=REACTION_LIMIT_S + 0.1),
+    *(Row(f"source_{word}", f"a robot's own senses: observe() {does}; a new source",
+          "edge sends safe_stop: no_fresh_state; stays until re-armed", partial(_source_is, word),
+          policy="steady", rig={"vehicle": MOCK, "senses": True})
+      for word, does in (("late", "takes 3 T"), ("hangs", "never ends"), ("raises", "raises"))),
     Row("vehicle_fault_between_episodes",
         "Emergency stop pressed for 1 s after the end of an episode",
         "nothing; then waits for a re-arm", vehicle_fault_between_episodes, **_SLOW,
-        rig={"vehicle": MOCK, "sender": True}),
+        rig={"vehicle": MOCK, "sender": True, "settings": '[vehicle]\nrearm = "once"'}),
     Row("vehicle_not_enabled", "Vehicle at fault; the driver's `enable` raises at the re-arm",
         "stands; stays until an enable succeeds", vehicle_not_enabled, **_MOCKED,
         reaction_limit_s=None),

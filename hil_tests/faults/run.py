@@ -16,7 +16,7 @@ from typing import Any
 
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
-from hil_tests.faults import hunter, messages, rows
+from hil_tests.faults import bounds, hunter, messages, rows
 from hil_tests.faults.observe import later_s, longest_gap_s
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.rows import Row, Try, at_any_phase
@@ -26,7 +26,7 @@ from hil_tests.testing.policies import TASK, write_policy
 STALLED_PERIODS = 1.5
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS]
+ROWS = [*rows.ROWS, *hunter.ROWS, *messages.ROWS, *bounds.ROWS]
 POLICIES = {"steady": ("constant", 0.6), "mean": ("mean", 0.0)}
 """Made for the rows that name them. Brightness is the pedal of `mean`: full throttle on white
 frames, the brake on all others."""

@@ -99,6 +99,7 @@ STANDS_MPS = 0.005
 FAST_S = 0.02
 SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
 STEP_S = 0.005
+REST = WheelMotion(0.0, 0.0)
 _LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
 _BATTERY_V = 27.9
 # The motors stand and are well, whatever 0x211 and 0x221 show.
@@ -140,6 +141,7 @@ class MockHunter:
         self.control, self.brake_locked, self.faults = Control.STANDBY, True, set[str]()
         self.errors: set[str] = set()  # of BITS, as it shows them
         self.speed_mps = self.inner_rad = 0.0
+        self.sticks = REST  # of the remote control: what the person asks for
         self.next_s = now_s
         self._parameters, self._now_s = parameters, now_s
         self._commanded_s = -math.inf  # when the newest 0x111 came, or CAN control was taken
@@ -240,7 +242,10 @@ class MockHunter:
     def _move(self, step_s: float) -> None:
         """Integrate one step towards the set-point, or brake with the steering held."""
         p = self._parameters
-        if not self.obeys:
+        remote = self.control in (Control.REMOTE, Control.REMOTE_OVER_CAN)
+        if in_hand := remote and self.state == protocol.STATE_OK and self.sticks != REST:
+            self._setpoint = self.sticks
+        if not (in_hand or self.obeys):
             # Where control comes back, it does so from a stand, not with what was asked before.
             self._setpoint = WheelMotion(0.0, self.inner_rad)
             self.speed_mps -= clamp(self.speed_mps, p.braking_mps2 * step_s)
@@ -286,14 +291,17 @@ EXAMPLE = examples(
     "python -m hil_tests mock_hunter --bus socketcan:vcan0",
 )
 _tell = partial(print, flush=True)
-Orders = queue.SimpleQueue[tuple[str, bool]]  # a fault's name, and whether it is switched on
+Orders = queue.SimpleQueue[tuple[str, bool | WheelMotion]]
+"""A fault's name, and whether it is switched on; or STICKS, and where they are."""
+STICKS = "sticks"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         f"{parser.description} "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
-        f" Known are {', '.join(FAULTS)}."
+        f" Known are {', '.join(FAULTS)}. `{STICKS} MPS RAD` is what a person with the remote"
+        " control asks for while that has taken over (RAD: of the inner wheel, left above 0)."
     )
     add = parser.add_argument
     add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
@@ -318,6 +326,9 @@ def serve(hunter: MockHunter, bus: can.BusABC, orders: Orders, ending: threading
     while not ending.is_set():
         while not orders.empty():
             (name, on), now_s = orders.get(), time.monotonic()
+            if isinstance(on, WheelMotion):
+                hunter.sticks = on
+                continue
             hunter.switch(name, on, now_s)
             _tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
         for frame, data in hunter.due(time.monotonic()):
@@ -340,6 +351,10 @@ def _read_orders(orders: Orders) -> None:
     with open(0, errors="replace", closefd=False) as lines:
         for line in lines:
             name, _, word = line.strip().partition(" ")
+            if name == STICKS:
+                with contextlib.suppress(ValueError, TypeError):
+                    orders.put((name, WheelMotion(*map(float, word.split()))))
+                    continue
             if name in FAULTS and word in ("on", "off"):
                 orders.put((name, word == "on"))
             else:

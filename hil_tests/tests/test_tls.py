@@ -347,3 +347,26 @@ def test_a_vehicle_at_a_router_hears_only_its_own(parties):
             simulator.put(f"phil/{vehicle}/state", b"go")
         time.sleep(SETTLE_S)
     assert set(found) == {"phil/hunter01/state"}
+
+
+def test_a_robots_own_senses_speak_as_the_simulator_of_its_vehicle(parties, tmp_path):
+    source = "import numpy as np\nclass Source:\n    observe = lambda self: "
+    source += "{'frames': np.random.randint(0, 99, (2, 45, 80), np.uint8)}\n"
+    (tmp_path / "own_source.py").write_text(source)
+    place, policy = free_endpoint("tls"), make_policy(tmp_path, "constant", 0.1)
+
+    def sense(party, *where):
+        words = ("--source", "own_source:Source", "--policy", policy, "--allow-unsigned")
+        tls = ("--tls", parties / party)
+        return Process("bridge", "sense", *words, *where, *tls, cwd=tmp_path)
+
+    with sense("viewer", "--listen", place) as refused:
+        assert refused.wait() == 2
+    own, flags = "simulator-hunter01", edge_flags(place, tmp_path, parties / "edge-hunter01")
+    with sense(own, "--listen", place) as listens, run_edge(*flags) as edge:
+        edge.wait_for_line("now=drive")
+        listens.kill()
+        edge.wait_for_line("now=safe_stop")
+    router = listener(place, parties / "router", rules_for_listener(["hunter01"]))
+    with router, sense(own, "--connect", place) as connects, run_edge(*flags):
+        connects.wait_for_line("says drive")

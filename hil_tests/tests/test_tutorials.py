@@ -32,7 +32,13 @@ def script_of(text: str, folder: Path) -> str:
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", ["own_environment", "own_policy", "own_vehicle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "own_environment", "own_policy", "own_vehicle",
+        pytest.param("my_camera", marks=pytest.mark.board),
+    ],
+)  # fmt: skip
 def test_every_command_of_a_tutorial_works(name, tmp_path):
     packages, folder = tmp_path / "packages", tmp_path / "empty"
     folder.mkdir()

@@ -9,9 +9,11 @@ import pytest
 
 from bridge.__main__ import main as bridge
 from bridge.fork import read_episodes
+from bridge.tests.recordings import Hand
 from edge_runtime.util import UserError
 from hil_tests.testing.commands import refusal
-from trainer.environments import make_environment
+from hil_tests.testing.messages import make_feedback
+from trainer.environments import make_environment, task_of
 from trainer.learner.config import LearnerConfig
 from trainer.person.tests.people import record, recorded_step
 from trainer.training.config import RunConfig
@@ -76,11 +78,50 @@ def test_a_scripted_human_shows_drives_that_count_as_its_seconds(tmp_path):
         learner=learner,
     )  # fmt: skip
     run = TrainingRun(config, tmp_path / "run")
-    shown = run.learning.added
+    shown = run.learning.replay.added
     assert shown == run.learning.replay.human_count > 60
     run.train()
     first, second = read_metrics(tmp_path / "run")
     assert (int(first["human_steps"]), int(second["human_steps"])) == (shown, 0)
+
+
+def hand_driven(path, speeds_mps, **changes):
+    """Record senses and a vehicle that a person drives; the pedal grows with the step."""
+    hand, task = Hand(path), task_of(make_environment("left_turn")).text
+    for step, speed_mps in enumerate(speeds_mps):
+        hand.hear(step * 0.1 - 0.02, "feedback", make_feedback(
+            step, speed_mps=speed_mps, action=[step / 100], **{"mode": "safe_stop", **changes}
+        ))  # fmt: skip
+        state = {"task": task, "observation": {"frames": bytes([step]) * (2 * 45 * 80)}}
+        hand.state(step * 0.1, step, **state)
+    hand.close()
+    return path
+
+
+def test_a_drive_by_hand_is_taken_as_recorded_from_the_first_movement_to_the_last(tmp_path):
+    path = hand_driven(tmp_path / "drive.mcap", [0.0] * 5 + [0.3] * 4 + [0.0, 0.3] + [0.0] * 5)
+    (episode,) = read_demonstrations(path, make_environment("left_turn"))
+    # What the vehicle reports before a state is what it did after the state before.
+    assert [step.observation.max() for step in episode] == [4, 5, 6, 7, 8, 9]
+    assert [step.next_observation.max() for step in episode] == [5, 6, 7, 8, 9, 10]
+    pedals = [step.action[0] for step in episode]
+    assert pedals == pytest.approx([0.05, 0.06, 0.07, 0.08, 0.09, 0.10])
+    assert all(step.human and step.reward == 0.0 for step in episode)
+    assert [step.truncated for step in episode] == [False] * 5 + [True]
+
+
+def test_what_the_runtime_drove_is_not_the_persons(tmp_path):
+    path = hand_driven(tmp_path / "drive.mcap", [0.3] * 4, mode="drive")
+    (episode,) = read_demonstrations(path, make_environment("left_turn"))
+    assert not any(step.human for step in episode)
+
+
+def test_a_drive_of_another_task_or_without_movement_is_refused(tmp_path):
+    moved = hand_driven(tmp_path / "moved.mcap", [0.3] * 4)
+    still = hand_driven(tmp_path / "still.mcap", [0.0] * 4)
+    for path, scenario in ((moved, "congestion"), (still, "left_turn")):
+        with pytest.raises(UserError):
+            next(read_demonstrations(path, make_environment(scenario)))
 
 
 def test_an_empty_place_is_refused(tmp_path, capsys):

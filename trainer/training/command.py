@@ -30,6 +30,7 @@ from trainer import util
 from trainer.environments import scenario_of
 from trainer.evaluation import CHECKPOINT_FILE, located
 from trainer.human.guide import Record
+from trainer.learner.config import find_algorithm
 from trainer.person import FASTEST, HUMANS, PERSON, SLOWEST
 from trainer.training.config import (
     CONFIG_FILE,
@@ -222,7 +223,8 @@ def _train(config: RunConfig, run_dir: Path, env: Any, how: argparse.Namespace) 
             ends = training.progress >= config.learner.exploration_share
             if ends and not explored and len(recent) > 1:
                 explored = True
-                if len({row["episode_return"] for row in read_metrics(run_dir)}) == 1:
+                returns = {row["episode_return"] for row in read_metrics(run_dir)}
+                if len(returns) == 1 and find_algorithm(config.algorithm).q_term:
                     print(f"\n{FINDS_NOTHING}", file=sys.stderr)
             if not math.isnan(metrics.validation_success):
                 figures["validation"] = f"{metrics.validation_success:.2f}"

@@ -1,9 +1,9 @@
 """``train --demonstrations``: drives that fill the replay before the first step.
 
 A person's sittings hold transitions. Of a recording of the wire the actions are driven again, in
-the run's environment. A LeRobot data set holds observations and actions; its pictures are one a
-frame, and a stack is made of the frames before. ``human:N`` stands for N drives of a scripted
-human.
+the run's environment; one of `bridge sense` is taken as it is, for nobody can drive it again. A
+LeRobot data set holds observations and actions; its pictures are one a frame, and a stack is made
+of the frames before. ``human:N`` stands for N drives of a scripted human.
 """
 
 import re
@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge import fork
+from bridge.clocks import STANDSTILL_MPS
 from bridge.environments import NOMINAL
 from bridge.messages import is_picture
-from bridge.recording import Recording
+from bridge.recording import Recording, choose_vehicle, valid_messages
+from edge_runtime.manifest import Layout
 from edge_runtime.util import UserError
+from edge_runtime.wire import DRIVE, Feedback, State
 from trainer.environments import inner, task_of
 from trainer.evaluation import Drive, Driver
 from trainer.learner.replay import Transition
@@ -47,7 +50,9 @@ def read_demonstrations(place: Path, env: Any) -> Iterator[Episode]:
         if channel is not None and channel.topic == TOPIC:
             yield from (_from_sitting(steps, env) for steps in read_episodes(read_steps(path)))
         else:
-            yield from (_driven_again(drive, env) for drive in fork.read_episodes(path))
+            drives = fork.read_episodes(path)
+            again = (_driven_again(drive, env) for drive in drives)
+            yield from again if drives else _as_recorded(path, env)
 
 
 def drive_demonstrations(driver: Driver, env: Any, seed: int, episodes: int) -> Iterator[Episode]:
@@ -88,6 +93,48 @@ def _driven_again(drive: fork.RecordedEpisode, env: Any) -> Episode:
             break
     press_brake(False)
     return episode
+
+
+def _as_recorded(path: Path, env: Any) -> Iterator[Episode]:
+    """Take what was seen, and what the vehicle did in each period, without a reward.
+
+    Where the runtime did not drive, a person did, by the vehicle's own remote control. How long it
+    stood before and after shows nothing. Raises UserError where it never moved.
+    """
+    recording, task, told = Recording(path), task_of(env), None
+    layout, drives = Layout(task), dict[tuple[str, int], list[tuple[State, Feedback | None]]]()
+    for _, message in valid_messages(recording, choose_vehicle(recording, None)):
+        if isinstance(message, Feedback):
+            told = message
+        elif isinstance(message, State):
+            if message.task != task.text or layout.refusal(message.observation):
+                raise UserError(f"{path} is of {message.task}, not of {task.text}")
+            drives.setdefault((message.session, message.episode), []).append((message, told))
+    recording.say_trouble()
+    found = False
+    for drive in drives.values():
+        steps = [
+            (state, after, did) for (state, _), (after, did) in pairwise(drive)
+            if did is not None and after.step == state.step + 1
+        ]  # fmt: skip
+        moves = [n for n, (*_, did) in enumerate(steps) if abs(did.speed_mps) > STANDSTILL_MPS]
+        if not moves:
+            continue
+        found, steps = True, steps[moves[0] : moves[-1] + 1]
+        yield [
+            Transition(_seen(state, layout, env), inner(env.action_range, did.action), 0.0,
+                       _seen(after, layout, env), False, number == len(steps), did.mode != DRIVE)
+            for number, (state, after, did) in enumerate(steps, 1)
+        ]  # fmt: skip
+    if not found:
+        raise UserError(f"{path} shows no drive: the vehicle never moved, or nobody recorded it")
+
+
+def _seen(state: State, layout: Layout, env: Any) -> NDArray[Any]:
+    seen = np.zeros(env.layout.shape, env.layout.dtype)
+    for name, array in layout.arrays(state.observation).items():
+        (seen[name] if seen.dtype.names else seen)[...] = array
+    return seen
 
 
 def _from_dataset(folder: Path, env: Any) -> Iterator[Episode]:

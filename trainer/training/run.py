@@ -193,7 +193,7 @@ def make_guide(config: RunConfig, env: Any) -> Guide:
 def demonstrations_of(config: RunConfig, env: Any) -> Iterator[Episode]:
     """Yield the episodes that fill a run's replay before its first step."""
     if scripted := SCRIPTED.fullmatch(config.demonstrations):
-        driver, _ = load_driver(config.human, env)
+        driver, _ = evaluation.load_driver(config.human, env)
         return drive_demonstrations(driver, env, config.seed, int(scripted[1]))
     return read_demonstrations(Path(config.demonstrations), env)
 

@@ -223,7 +223,8 @@ class HunterCore(streamed.StreamedCore):
         return [*([_CLEAR] if self.reports.needs_clearing else []), _TAKE, _RELEASE]
 
     def _motion(self) -> Sent:
-        return protocol.motion(self.set_point.speed_mps, self.set_point.inner_rad, self._spec)
+        asked = self.set_point
+        return protocol.motion(asked.speed_mps, asked.inner_rad, asked.spec)
 
     def _centre_rad(self) -> Optional[float]:
         motion = self.reports.motion

@@ -2,6 +2,7 @@
 
 import pytest
 
+from edge_runtime.vehicles.hunter.protocol import WheelMotion
 from hil_tests.faults.rig import Chassis, free_bus
 from hil_tests.mock_hunter import BITS, MODELS, MockHunter
 
@@ -148,3 +149,19 @@ def test_as_a_process_it_obeys_orders_and_ends_on_a_signal():
         chassis.switch("remote", True)
         chassis.wait_for_line("control=remote ")
     assert chassis.end() == 0
+
+
+def test_a_person_drives_with_the_remote_control_alone_and_no_longer_than_it_has_control():
+    bench = Bench()
+    bench.hunter.sticks = WheelMotion(0.4, -0.2)
+    assert bench.run(1.0).stands
+    bench.switch("remote")
+    bench.run(1.0)
+    assert bench.hunter.speed_mps == pytest.approx(0.4, abs=0.01)
+    assert bench.hunter.inner_rad == pytest.approx(-0.2, abs=0.01)
+    bench.switch("estop")
+    assert bench.run(1.0).stands
+    bench.switch("estop", False)
+    assert not bench.run(1.0).stands
+    bench.switch("remote", False)
+    assert bench.run(1.0).stands

@@ -1,0 +1,86 @@
+"""What an operator allows a vehicle: how fast, how sharp, how far until the next re-arm. Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from edge_runtime.controller import Limits
+from edge_runtime.util import UserError
+
+STEERING = "steering"
+
+
+class Bounds(NamedTuple):
+    """The settings of these names in [vehicle]; inf: none."""
+
+    max_speed_mps: float = math.inf
+    max_steering_rad: float = math.inf
+    leash_m: float = math.inf
+
+
+NO_BOUNDS = Bounds()
+
+
+class Model(NamedTuple):
+    """What a vehicle can do, as far as its driver knows (inf: it does not).
+
+    `full_steering_rad` is the angle at the ends of `limits["steering"]`. Angles are of the wheel
+    that the driver steers by: a Hunter's inner one.
+    """
+
+    max_speed_mps: float = math.inf
+    max_steering_rad: float = math.inf
+    full_steering_rad: float = math.inf
+
+
+def check_bounds(bounds: Bounds, model: Model, vehicle: str) -> None:
+    """Raise UserError for a cap above the model's limit, and for one that nobody could hold."""
+    for name in ("max_speed_mps", "max_steering_rad"):
+        asked, most = getattr(bounds, name), getattr(model, name)
+        if most < asked < math.inf:
+            raise UserError(f"[vehicle] {name} {asked:g} is above the limit of {vehicle}: {most:g}")
+    if bounds.max_steering_rad < math.inf == model.full_steering_rad:
+        words = f"[vehicle] max_steering_rad: the driver {vehicle} does not know its angle"
+        raise UserError(f"{words}; leave it out, or set the driver's `model`")
+
+
+def narrowed(limits: Limits, bounds: Bounds, model: Model) -> Limits:
+    """Cut the range of the steering to the cap, for the loop and for any driver.
+
+    The angle grows at least in proportion to the action, so none within is above the cap.
+    """
+    share = bounds.max_steering_rad / model.full_steering_rad  # NaN where neither is known
+    if STEERING not in limits or not share < 1.0:
+        return limits
+    row = limits[STEERING]
+    return {**limits, STEERING: row._replace(low=row.low * share, high=row.high * share)}
+
+
+class Leash:
+    """The distance by odometry since the last re-arm; both directions count."""
+
+    def __init__(self, length_m: float) -> None:
+        self._length_m, self._gone_m = length_m, 0.0
+        self._noted_s, self._speed_mps = math.inf, 0.0
+
+    @property
+    def left_m(self) -> float:
+        """How far it may still go; inf without a leash."""
+        return max(self._length_m - self._gone_m, 0.0)
+
+    def begin(self) -> None:
+        """Start anew: a person has re-armed the vehicle."""
+        self._gone_m = 0.0
+
+    def note(self, speed_mps: float, now_s: float) -> None:
+        """Take a report. In between it may have been as fast as the faster of two."""
+        if not math.isfinite(speed_mps):
+            return  # a fault by itself; the next report counts for this one's time
+        faster_mps = max(abs(speed_mps), self._speed_mps)
+        self._gone_m += faster_mps * max(now_s - self._noted_s, 0.0)
+        self._noted_s, self._speed_mps = now_s, abs(speed_mps)
+
+    def is_used(self, ahead_s: float) -> bool:
+        """Return whether it is used up, or will be within `ahead_s`."""
+        return self.left_m <= self._speed_mps * ahead_s and self._length_m < math.inf

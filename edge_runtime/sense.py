@@ -1,0 +1,308 @@
+"""`python -m edge_runtime sense`, or `bridge sense`: a robot's own senses in the simulator's place.
+
+A source is a class with `observe()`, which returns an array for each entry of the policy's
+manifest, taken after it was called. `Intake` judges what it says and makes states of it; it is
+pure: time is passed in. A thread of its own calls the source, so that one that hangs holds neither
+the loop nor ^C (unless it holds the interpreter). What is too old is not sent, and any other fault
+ends the command: no state comes, and the edge runtime stops by its own rule, as if the cable had
+been pulled. It runs on the board with the board's libraries alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import queue
+import secrets
+import sys
+import threading
+import time
+from importlib import import_module
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
+
+import msgspec
+import numpy as np
+import zenoh
+
+from edge_runtime import tls as access
+from edge_runtime import wire
+from edge_runtime.cli import examples, sigterm_as_interrupt
+from edge_runtime.config import add_flags, add_trust
+from edge_runtime.manifest import Layout, Task
+from edge_runtime.policy import load_manifest
+from edge_runtime.safety import SILENCE_PERIODS, Event
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session, tls_for
+from edge_runtime.util import UserError, printable
+from edge_runtime.wire import Command, Rejection, State
+
+SOURCE_FAILED = 1  # exit status
+FROZEN_PERIODS = 5
+"""A camera's noise changes a picture each time: one that stays the same for so long is frozen, or
+the lens is covered."""
+GIVES_UP_S = 2.0  # so long without a state, and the command ends: the vehicle stopped long ago
+ROUNDING_S = 1e-9
+_POLL_S = 0.1  # a signal that another thread got wakes nobody: so it polls
+
+EXAMPLE = examples("python -m edge_runtime sense --source my_camera:Camera --policy my.onnx")
+
+
+class SourceError(Exception):
+    """What is wrong with the source."""
+
+
+class Seen(NamedTuple):
+    """What a source has said once: its observation as a state carries it."""
+
+    observation: Dict[str, bytes]
+    speed_mps: Optional[float] = None
+    episode_over: bool = False
+
+
+def look(source: Any, task: Task) -> Seen:
+    """Ask a source once. Raises SourceError for what is not the task's, and whatever it raises."""
+    observation = pack(task, source.observe())
+    speed_mps, over = (_offered(source, name) for name in ("speed_mps", "episode_over"))
+    return Seen(observation, None if speed_mps is None else float(speed_mps), bool(over))
+
+
+def _offered(source: Any, name: str) -> Any:
+    """Return what an optional attribute or method says; None where there is none."""
+    value = getattr(source, name, None)
+    return value() if callable(value) else value
+
+
+def pack(task: Task, seen: Any) -> Dict[str, bytes]:
+    """Return the arrays' bytes. Raises SourceError for other names, shapes or types than asked for.
+
+    A float may be of any size; no other number is converted.
+    """
+    if not isinstance(seen, Mapping) or seen.keys() != task.observation.keys():
+        found = ", ".join(map(str, seen)) if isinstance(seen, Mapping) else type(seen).__name__
+        raise SourceError(f"it observes {found}, not {', '.join(task.observation)}")
+    packed = {}
+    for name, entry in task.observation.items():
+        array, dtype = np.asarray(seen[name]), np.dtype(entry.dtype)
+        fits = array.dtype == dtype or array.dtype.kind == dtype.kind == "f"
+        if not fits or array.shape != tuple(entry.shape):
+            found = f"{name} is {array.dtype} {list(array.shape)}"
+            raise SourceError(f"{found}, not {entry.dtype} {entry.shape}")
+        with np.errstate(over="ignore"):  # it becomes inf, which is refused
+            packed[name] = array.astype(dtype).tobytes()
+    return packed
+
+
+class Intake:
+    """Makes the states of one session from what a source says.
+
+    Times are monotonic. A state is stamped with the moment at which the source was asked. The
+    answer may take 2.2 T, as long as the edge runtime answers a state, but more than T only once in
+    a row: the policy is made for T.
+    """
+
+    def __init__(self, task: Task, session: str, zero_ns: int) -> None:
+        self._task, self._layout, self._session = task, Layout(task), session
+        self._zero_ns = zero_ns  # the wall clock at monotonic 0: stamps never leap
+        self._episode = self._step = self._unchanged = 0
+        # The first of an episode must be in time: the edge runtime takes its lag for the least.
+        self._was_slow = True
+        self._pictures: Dict[str, bytes] = {}
+
+    def take(self, seen: Seen, asked_s: float, now_s: float) -> Optional[State]:
+        """Return the state to send now; None where it is too old.
+
+        Raises SourceError for numbers that are not finite, and for a picture that has frozen; this
+        session is then over.
+        """
+        self._watch(seen.observation)
+        period_s, periods = self._task.control_period_s, 1.0 if self._was_slow else SILENCE_PERIODS
+        took_s = now_s - asked_s - ROUNDING_S
+        self._was_slow = took_s > period_s
+        if took_s > periods * period_s:
+            return None
+        state = State(
+            session=self._session, episode=self._episode, step=self._step,
+            sim_time_s=round(self._step * period_s, 6), speed_mps=seen.speed_mps,
+            sent_ns=self._zero_ns + round(asked_s * 1e9), final=seen.episode_over,
+            observation=seen.observation, task=self._layout.task_text,
+        )  # fmt: skip
+        # Just what the edge runtime does with it.
+        found = self._layout.decode(wire.encode(state))
+        if isinstance(found, Rejection):
+            raise SourceError(found.detail)
+        self._step += 1
+        if seen.episode_over:
+            self._episode, self._step, self._was_slow = self._episode + 1, 0, True
+        return state
+
+    def _watch(self, observation: Dict[str, bytes]) -> None:
+        """Raise SourceError where no picture has changed for FROZEN_PERIODS."""
+        entries = self._task.observation.items()
+        names = [name for name, entry in entries if entry.dtype == "uint8" and len(entry.shape) > 1]
+        pictures = {name: observation[name] for name in names}
+        same = bool(pictures) and pictures == self._pictures
+        self._unchanged, self._pictures = (self._unchanged + 1 if same else 0), pictures
+        if self._unchanged >= FROZEN_PERIODS:
+            raise SourceError(f"no picture has changed in {FROZEN_PERIODS} periods: frozen")
+
+
+class _Source:
+    """Calls a source in a thread of its own: at the start once, then once for each `ask`."""
+
+    def __init__(self, make: Callable[[], Any], task: Task) -> None:
+        self._asked: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._said: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        work = (make, task)
+        threading.Thread(target=self._run, args=work, name="source", daemon=True).start()
+
+    def ask(self) -> None:
+        self._asked.put(None)
+
+    def answer(self, until_s: float = math.inf) -> Optional[Seen]:
+        """Wait for the answer; None where none comes in time. Raises SourceError."""
+        while True:
+            left_s = until_s - time.monotonic()
+            with contextlib.suppress(queue.Empty):
+                said = self._said.get(timeout=min(max(left_s, 0.0), _POLL_S))
+                if isinstance(said, BaseException):
+                    name = "" if isinstance(said, SourceError) else f"{type(said).__name__}: "
+                    raise SourceError(printable(" ".join(f"{name}{said}".split())))
+                return said
+            if left_s <= 0.0:
+                return None
+
+    def _run(self, make: Callable[[], Any], task: Task) -> None:
+        try:
+            source = make()
+            while True:
+                self._said.put(look(source, task))
+                self._asked.get()
+        except BaseException as error:  # somebody else's code; the main thread says it
+            self._said.put(error)
+
+
+class _End:
+    """The simulator's end of the wire: what is sent, and what the edge runtime says to it."""
+
+    def __init__(self, session: zenoh.Session, vehicle_id: str, task: Task) -> None:
+        self.session = secrets.token_hex(8)
+        self.told: Tuple[str, str] = ("", "")  # mode and reason of the newest command
+        self._task = msgspec.structs.asdict(task)
+        drop, own = zenoh.CongestionControl.DROP, wire.key(vehicle_id, "command")
+        self._states, self._scenes = (
+            session.declare_publisher(f"phil/{vehicle_id}/{topic}", congestion_control=drop)
+            for topic in ("state", "scene")
+        )
+        self._declared: List[Any] = [
+            session.liveliness().declare_token(f"phil/{vehicle_id}/simulator"),
+            session.declare_subscriber(own, only_own(own, self._hear)),
+        ]
+
+    def send(self, state: State) -> None:
+        """Publish a state, and for viewers how it is to be read."""
+        status: Any = self._scenes.matching_status
+        if status.matching:
+            place = {name: getattr(state, name) for name in ("episode", "step", "sim_time_s")}
+            self._scenes.put(msgspec.msgpack.encode({**place, "task": self._task}))
+        self._states.put(wire.encode(state))
+
+    def close(self) -> None:
+        for declared in [*self._declared, self._states, self._scenes]:
+            declared.undeclare()
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        command = wire.decode_command(bytes(sample.payload))
+        if isinstance(command, Command) and command.session == self.session:
+            self.told = (command.mode, command.reason)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    place = "the source: a class with observe() -> {entry: array}, and optionally speed_mps and "
+    place += "episode_over"
+    add("--source", metavar="MODULE:CLASS", required=True, help=place)
+    says = "the policy that is to drive: it says what is observed, and how often"
+    add("--policy", metavar="POLICY.onnx", type="path", required=True, help=says)
+    add_trust(parser)
+    where = parser.add_mutually_exclusive_group()
+    form: Any = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
+    here = f"endpoint on which edge runtimes and viewers connect (default: {DEFAULT_ENDPOINT})"
+    where.add_argument("--listen", **form, default=DEFAULT_ENDPOINT, help=here)
+    where.add_argument("--connect", **form, help="connect to this router instead of listening")
+    add_flags(parser, "tls", "vehicle_id")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Send what the source observes until ^C, or until it fails (status 1)."""
+    asked, vehicle_id = arguments, arguments.vehicle_id or wire.DEFAULT_VEHICLE_ID
+    tls = tls_for(asked.tls, asked.connect or asked.listen)
+    manifest = load_manifest(asked.policy, asked.public_key, asked.allow_unsigned)
+    task = Task(**{name: getattr(manifest, name) for name in Task.__struct_fields__})
+    make = _load(asked.source)
+    with sigterm_as_interrupt(), contextlib.ExitStack() as stack:
+        session = _open(asked, vehicle_id, tls)
+        stack.callback(session.close)
+        end = _End(session, vehicle_id, task)
+        stack.callback(end.close)
+        try:
+            source = _Source(make, task)
+            source.answer()  # The first one is not sent: a camera takes its time to open.
+            print(f"ready vehicle_id={vehicle_id} source={asked.source}", flush=True)
+            _sense(source, end, task, tls)
+        except SourceError as error:
+            # At once, before anything is closed: nothing is sent any more.
+            stops = "nothing is sent any more, so the vehicle stops"
+            print(f"error: the source {asked.source} has failed: {error}; {stops}", file=sys.stderr)
+            sys.stderr.flush()
+    return SOURCE_FAILED
+
+
+def _sense(source: _Source, end: _End, task: Task, tls: Optional[access.TlsFiles]) -> None:
+    """Send a state each period until the source fails: SourceError."""
+    intake = Intake(task, end.session, time.time_ns() - time.monotonic_ns())
+    said, next_s, sent_s = end.told, time.monotonic(), time.monotonic()
+    while True:
+        time.sleep(max(0.0, next_s - time.monotonic()))
+        if tls is not None:
+            tls.require_valid(time.time())
+        asked_s = time.monotonic()
+        next_s = max(next_s + task.control_period_s, asked_s)
+        source.ask()
+        seen = source.answer(sent_s + GIVES_UP_S)
+        if seen is None:
+            raise SourceError(f"observe() hangs, or is too slow: no state for {GIVES_UP_S:g} s")
+        now_s = time.monotonic()
+        if (state := intake.take(seen, asked_s, now_s)) is None:
+            print(f"too old: observe() took {now_s - asked_s:.2f} s; it is not sent", flush=True)
+        else:
+            end.send(state)
+            sent_s = now_s
+        if end.told != said:
+            said = end.told
+            print(f"the edge runtime says {' '.join(said).strip()}", flush=True)
+        if said[1] == Event.OTHER_TASK.value:
+            raise UserError(f"the edge runtime's policy is for another task than {task.task!r}")
+
+
+def _load(place: str) -> Callable[[], Any]:
+    """Import `module:Class`. Raises UserError."""
+    module, _, member = place.partition(":")
+    try:
+        made: Callable[[], Any] = getattr(import_module(module), member)
+    except BaseException as error:  # a module may raise anything when it is imported
+        raise UserError(f"no source {place!r}: {type(error).__name__}: {error}") from None
+    return made
+
+
+def _open(
+    asked: argparse.Namespace, vehicle_id: str, tls: Optional[access.TlsFiles]
+) -> zenoh.Session:
+    """Open the session as a simulator's. Raises UserError."""
+    rules = None
+    if tls is not None:
+        able = (access.ROUTER,) if asked.connect is None else ()
+        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
+        rules = access.rules_for_listener([vehicle_id])
+    if asked.connect is not None:
+        return open_session(connect=asked.connect, mode="client", tls=tls)
+    return open_session(listen=asked.listen, mode="router", tls=tls, access=rules)

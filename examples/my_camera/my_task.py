@@ -1,0 +1,54 @@
+"""What a policy of the camera sees and does, as an environment that shows the folder of pictures.
+
+Only a training needs it, and nothing moves in it: what is learned is what a person did.
+"""
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from my_camera import HEIGHT, WIDTH, Pictures
+
+from edge_runtime.manifest import Car
+
+TASK = "mine/Camera-v0"
+
+
+class CameraTask(gymnasium.Env):
+    """The pictures go by, whatever is done; there is no reward."""
+
+    control_period_s = 0.1
+    observation_name, action_names = "frames", ("pedal", "steering")
+    brake_action = (-1.0, 0.0)
+    # The robot itself, a Hunter 2.0, driven gently: so its scale is 1.
+    car = Car(
+        throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=1.5, full_steering_rad=0.38,
+        wheelbase_m=0.65,
+    )  # fmt: skip
+    observation_space = Box(0, 255, (2, HEIGHT, WIDTH), np.uint8)
+    action_space = Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        """Begin at the first picture."""
+        super().reset(seed=seed)
+        self.source = Pictures()
+        return self.source.observe()["frames"], {}
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        """Show the next picture."""
+        return self.source.observe()["frames"], 0.0, False, False, {}
+
+    def expert(self) -> "Nobody":
+        """Make the human who never takes over: the person's drives are recorded."""
+        return Nobody()
+
+
+class Nobody:
+    def act(self) -> np.ndarray:
+        return np.zeros(2, np.float32)
+
+    def wants_control(self, policy_action: np.ndarray) -> str | None:
+        return None
+
+
+if TASK not in gymnasium.registry:
+    gymnasium.register(TASK, "my_task:CameraTask", max_episode_steps=100)
