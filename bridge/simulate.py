@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import msgspec
@@ -108,7 +107,7 @@ def _drive(
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
     runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
     if edge.vehicle != NONE:
-        runner.on_wait = partial(_say_wait, asked)
+        runner.rearm_command = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
     if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.
@@ -141,12 +140,6 @@ def _drive(
         "vehicle": vehicle and {"name": vehicle.vehicle, "faults": dict(vehicle.faults)},
     }
     return report.make_report(results, runner.safe_stops.events, clock.latencies_ms, facts)
-
-
-def _say_wait(asked: Namespace, episode: int, reason: str) -> None:
-    command = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
-    waits = f"episode {episode}: the vehicle waits for a re-arm ({reason}): {command}"
-    print(waits, file=sys.stderr, flush=True)
 
 
 def other_task(task: Task) -> UserError:
@@ -195,9 +188,7 @@ class EpisodeRunner:
     task: Task
     origin: Origin
     """Sent with every scene; each episode has a seed of its own."""
-    on_wait: Callable[[int, str], None] | None = None
-    """Called with the episode and the reason where a vehicle waits for a re-arm; None: there is no
-    vehicle."""
+    rearm_command: str = ""  # What an operator types; empty without a vehicle
 
     def __post_init__(self) -> None:
         self._period_s = self.task.control_period_s
@@ -235,7 +226,7 @@ class EpisodeRunner:
         self.origin = msgspec.structs.replace(self.origin, seed=seed)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, None, None, 0)
         applied: dict[str, Any] = {}  # What the scene says of the step before
-        felt, ended, waited, waits = [], False, 0, self.on_wait is not None
+        felt, ended, waited, waits = [], False, 0, bool(self.rearm_command)
         apply = vehicle_action if isinstance(self.clock, VehicleClock) else policy_action
         while not ended:
             state = self._state(episode, waited + result.steps, observation, info)
@@ -247,9 +238,10 @@ class EpisodeRunner:
             if waits and (command := decision.command) and decision.brake_reason != NO_COMMAND:
                 # A person may take minutes: until then only the states go on.
                 waits = command.mode == SAFE_STOP
-                if waits and self.on_wait is not None:
+                if waits:
                     if not waited:
-                        self.on_wait(episode, command.reason)
+                        say = f"episode {episode}: the vehicle waits for a re-arm"
+                        print(f"{say} ({command.reason}): {self.rearm_command}", file=sys.stderr)
                     # Real time keeps its pace by itself.
                     time.sleep(self._period_s * isinstance(self.clock, LockStepClock))
                     waited += 1

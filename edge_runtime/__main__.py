@@ -10,6 +10,7 @@ import argparse
 import itertools
 import json
 import os
+from functools import partial
 from typing import Any, Dict, List
 
 import msgspec
@@ -79,10 +80,7 @@ def _add_status(parser: argparse.ArgumentParser) -> None:
 def _status(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-
-    def look() -> Dict[str, Any]:
-        return ask(arguments.connect, arguments.vehicle_id, "status", tls)
-
+    look = partial(ask, arguments.connect, arguments.vehicle_id, "status", tls)
     reply = look()
     if arguments.watch:
         from edge_runtime.watch import watch
