@@ -19,9 +19,10 @@ from edge_runtime import log
 from edge_runtime.bounds import STEERING, Bounds, Leash, narrowed
 from edge_runtime.cli import ENDING_SIGNALS, examples, handled
 from edge_runtime.config import NONE, add_flags, load_config
+from edge_runtime.controller import neutral_action
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.manifest import Action, Car, Entry, Manifest
-from edge_runtime.util import UserError, printable
+from edge_runtime.util import UserError
 from edge_runtime.vehicles import make_vehicle
 from edge_runtime.vehicles.base import Vehicle, VehicleReport, close_in_time
 from edge_runtime.vehicles.plausibility import OVER_CAP, OVER_CAP_MPS, PEDAL
@@ -45,10 +46,6 @@ nothing: Condition = lambda it: False  # noqa: E731
 stands: Condition = lambda it: abs(it.speed_mps) <= STANDS_MPS  # noqa: E731
 
 
-class UnexpectedError(Exception):
-    """What was measured, or done, in place of what was expected."""
-
-
 def bench_manifest(task: str, period_s: float) -> Manifest:
     """Return that of a policy which no file holds, to open a driver with: +1 steers to the left."""
     return Manifest(
@@ -63,9 +60,8 @@ def bench_manifest(task: str, period_s: float) -> Manifest:
 class Jog:
     """Calls a driver, and looks at each of its reports.
 
-    `ask` is passed the step's name and what the operator is to do or to confirm; it raises
-    UnexpectedError otherwise. `left`: the sign of a steering to the left. Raises UserError where
-    the bounds are above the model's.
+    `ask` is passed the step's name and what the operator is to do or to confirm, and raises where
+    that is not so. `left`: the sign of a steering to the left. UserError: bounds above the model's.
     """
 
     def __init__(
@@ -77,33 +73,25 @@ class Jog:
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.vehicle, self.now, self._ask, self._sleep = vehicle, now, ask, sleep
-        self.step, self.last = "", VehicleReport({}, 0.0, True, [])
+        self.vehicle, self.ask, self.now, self._sleep = vehicle, ask, now, sleep
         vehicle.control_period_s, model = CONTROL_PERIOD_S, vehicle.model_limits
-        vehicle.take_bounds(bounds)  # refuses what the model cannot do
-        self.crawl_mps = min(CRAWL_MPS, bounds.max_speed_mps, model.max_speed_mps)
         knows_angle = model.full_steering_rad < math.inf
         most_rad = min(STEERS_RAD, bounds.max_steering_rad, model.max_steering_rad)
+        self.crawl_mps = min(CRAWL_MPS, bounds.max_speed_mps, model.max_speed_mps)
         own = Bounds(self.crawl_mps, most_rad if knows_angle else math.inf, bounds.leash_m)
-        vehicle.take_bounds(own)
+        for each in (bounds, own):
+            vehicle.take_bounds(each)
         limits = narrowed(vehicle.limits, own, model)
-        self._still = {name: min(max(0.0, row.low), row.high) for name, row in limits.items()}
-        self._throttle = 0.0
+        self._still, self._throttle = dict(zip(limits, neutral_action(limits))), 0.0
         if PEDAL in limits:
             self._still[PEDAL], self._throttle = limits[PEDAL].low, PEDAL_SHARE * limits[PEDAL].high
-        self.turns: List[float] = []  # to the left, to the right
-        if STEERING in limits:
-            ends, share = limits[STEERING][:2], 1.0 if knows_angle else STEERING_SHARE
-            self.turns = sorted((share * end for end in ends), reverse=left > 0)
-        self.has = {PEDAL} & limits.keys() | vehicle.outranked_by.keys()
-        if self.turns and vehicle.steers_at_a_stand:
-            self.has.add(TURNS)
-        if type(vehicle).mute is not Vehicle.mute:
-            self.has.add(SILENCE)
-        self._leash, self.steering, self.most_mps = Leash(bounds.leash_m), 0.0, STANDS_MPS
-
-    def ask(self, text: str) -> None:
-        self._ask(self.step, text)
+        share, ends = 1.0 if knows_angle else STEERING_SHARE, limits.get(STEERING, ())[:2]
+        self.turns = sorted((share * end for end in ends), reverse=left > 0)  # left, right
+        can = {TURNS: bool(ends) and vehicle.steers_at_a_stand, PEDAL: PEDAL in limits}
+        can[SILENCE] = type(vehicle).mute is not Vehicle.mute
+        self.has = {*vehicle.outranked_by, *(name for name in can if can[name])}
+        self._leash, self.last = Leash(bounds.leash_m), VehicleReport({}, 0.0, True, [])
+        self.steering, self._most_mps = 0.0, STANDS_MPS
 
     def go_on(
         self,
@@ -114,7 +102,7 @@ class Jog:
     ) -> float:
         """Command a crawl or a stand (None: nothing) for a time; return how long it took `until`.
 
-        Raises UnexpectedError where that does not come, and at once where the vehicle is too fast
+        Raises UserError where that does not come, and at once where the vehicle is too fast
         or goes backwards, has used up its leash, or does what it must `never`.
         """
         begin_s, comes = self.now(), False
@@ -123,13 +111,13 @@ class Jog:
                 self.vehicle.command(self._action(drives), now_s)
             self.last = it = self.vehicle.feedback(now_s)
             self._leash.note(it.speed_mps, now_s)
-            is_within = -STANDS_MPS <= it.speed_mps <= self.most_mps  # NaN is not
+            is_within = -STANDS_MPS <= it.speed_mps <= self._most_mps  # NaN is not
             if not is_within or self._leash.is_used(LOOK_S) or never(it):
-                raise UnexpectedError(self.measured())
+                raise UserError(self.measured())
             comes = until is not None and until(it)
             self._sleep(LOOK_S)
         if until is not None and not comes:
-            raise UnexpectedError(f"{self.measured()}, after {limit_s:g} s")
+            raise UserError(f"{self.measured()}, after {limit_s:g} s")
         return now_s - begin_s
 
     def measured(self) -> str:
@@ -150,48 +138,34 @@ class Jog:
             action[PEDAL] = self._throttle if self.last.speed_mps < self.crawl_mps else 0.0
         return action
 
-    def begin(self) -> None:
+    def begin(self, crawls: bool = False) -> None:
         """Take control of a vehicle that stands: the operator's Enter is its re-arm."""
-        self.steering, self.most_mps = 0.0, STANDS_MPS
+        self.steering, self._most_mps = 0.0, STANDS_MPS
         self.go_on(None, LATER_S, lambda it: not it.standing, never=nothing)
         self._leash.begin()
         self.vehicle.enable(self.now())
         self.go_on(False, LATER_S, lambda it: not it.self_braking)
+        if crawls:
+            self._most_mps = OVER_CAP * self.crawl_mps + OVER_CAP_MPS
 
     def crawl(self) -> None:
-        """Begin, and come to the crawl."""
-        self.begin()
-        self.most_mps = OVER_CAP * self.crawl_mps + OVER_CAP_MPS
+        self.begin(crawls=True)
         self.go_on(True, LATER_S, lambda it: it.speed_mps >= (1 - SPEED_OFF) * self.crawl_mps)
 
     def stop(self) -> None:
+        """Brake; then a crawl is asked for in vain."""
         self.vehicle.brake(self.now())
         self.go_on(None, LATER_S, stands, never=nothing)
-
-    def stays_stopped(self) -> None:
-        """Ask for a crawl, which a stopped vehicle must not obey."""
-        self.most_mps = STANDS_MPS
-        self.go_on(PEDAL in self.has, HOLDS_S, never=nothing)
+        self._most_mps = STANDS_MPS
+        self.go_on(PEDAL in self.has or None, HOLDS_S, never=nothing)
 
     def tells(self, cause: str, drives: bool, limit_s: float) -> None:
         """Wait until the driver tells of what outranks it."""
         words = self.vehicle.outranked_by[cause]
         self.go_on(drives, limit_s, lambda it: words in it.standing, never=nothing)
 
-    def refuses(self, cause: str) -> None:
-        """Have it enabled in vain while the cause is there; without it, it waits to be enabled."""
-        self.stays_stopped()
-        self.tells(cause, False, HOLDS_S)  # so the runtime refuses a re-arm
-        self.vehicle.enable(self.now())
-        self.go_on(False, HOLDS_S, never=lambda it: not it.self_braking)
-        self.vehicle.brake(self.now())
-        self.tells(cause, False, HOLDS_S)
-        self.ask("let go of it; nothing moves")
-        self.go_on(None, LATER_S, lambda it: not it.standing, never=nothing)
-        self.stays_stopped()
 
-
-def _feedback(jog: Jog) -> str:
+def _feedback(jog: Jog, name: str) -> str:
     jog.go_on(None, SOON_S, lambda it: not it.standing)
     jog.go_on(None, SOON_S, never=lambda it: it.standing or it.faults)
     jog.begin()
@@ -199,122 +173,114 @@ def _feedback(jog: Jog) -> str:
     return jog.measured()
 
 
-def _outranked(jog: Jog, cause: str) -> str:
-    jog.begin()
-    jog.tells(cause, False, PERSON_S)
-    measured = jog.measured()
-    jog.refuses(cause)
+def _outranked(jog: Jog, name: str, cause: str, crawls: bool, limit_s: float) -> str:
+    jog.begin(crawls)
+    jog.tells(cause, crawls, limit_s)
+    took_s = jog.go_on(None, BRAKES_S, stands, never=nothing)
+    jog.stop()
+    jog.tells(cause, False, HOLDS_S)  # so the runtime refuses a re-arm, and the driver must, too:
+    jog.vehicle.enable(jog.now())
+    jog.go_on(False, HOLDS_S, never=lambda it: not it.self_braking)
+    jog.vehicle.brake(jog.now())
+    jog.tells(cause, False, HOLDS_S)
+    measured = f"stood after {took_s:.2f} s: {jog.measured()}"
+    jog.ask(name, "now let go of it; nothing moves")
+    jog.go_on(None, LATER_S, lambda it: not it.standing, never=nothing)
     return measured
 
 
-def _steering(jog: Jog) -> str:
+def _steering(jog: Jog, name: str) -> str:
     shares = []
     for asked, side in zip(jog.turns, ("LEFT", "RIGHT")):
-        jog.ask(f"the front wheels turn a little to the {side}, and back")
+        jog.ask(name, f"the front wheels turn a little to the {side}, and back")
         jog.begin()
         jog.steering = asked
         jog.go_on(False, SOON_S)
         shares.append(jog.last.action[STEERING] / asked)
         if not abs(shares[-1] - 1.0) <= STEERING_OFF:
-            raise UnexpectedError(f"{side}: {shares[-1]:.0%} of what was asked")
+            raise UserError(f"{side}: {shares[-1]:.0%} of what was asked")
         jog.steering = 0.0
         jog.go_on(False, SOON_S)
         jog.stop()
-        jog.ask(f"they did turn to the {side}")
+        jog.ask(name, f"they did turn to the {side}")
     return ", ".join(f"{share:.0%}" for share in shares) + " of what was asked"
 
 
-def _crawl(jog: Jog) -> str:
+def _crawl(jog: Jog, name: str) -> str:
     jog.crawl()
     least_mps = (1 - 2 * SPEED_OFF) * jog.crawl_mps
     jog.go_on(True, CRAWLS_S, never=lambda it: it.faults or it.speed_mps < least_mps)
     measured = jog.measured()
     jog.stop()
-    jog.ask("they did turn FORWARDS")
+    jog.ask(name, "they did turn FORWARDS")
     return measured
 
 
-def _brake(jog: Jog) -> str:
+def _stops(
+    jog: Jog, name: str, by: Callable[[Jog], Any], commands: Optional[bool], limit_s: float
+) -> str:
     jog.crawl()
-    jog.vehicle.brake(jog.now())
-    took_s = jog.go_on(True, BRAKES_S, stands, never=nothing)
-    jog.stays_stopped()
-    return f"stood after {took_s:.2f} s"
-
-
-def _silence(jog: Jog, mutes: bool) -> str:
-    jog.crawl()
-    if mutes:
-        jog.vehicle.mute()
-    took_s = jog.go_on(True if mutes else None, SOON_S, stands, never=nothing)
-    return f"stood after {took_s:.2f} s"
-
-
-def _rearm(jog: Jog) -> str:
-    jog.crawl()
-    jog.tells(ESTOP, True, PERSON_CRAWLS_S)
-    took_s = jog.go_on(None, BRAKES_S, stands, never=nothing)
-    jog.refuses(ESTOP)
-    return f"stood after {took_s:.2f} s"
+    by(jog)
+    return f"stood after {jog.go_on(commands, limit_s, stands, never=nothing):.2f} s"
 
 
 class Step(NamedTuple):
-    """`needs`: of `Jog.has`. `do` returns what was measured; UnexpectedError: the jog is over."""
+    """`needs`: of `Jog.has`. `do` returns what was measured; where it raises, the jog ends."""
 
     name: str
     needs: Tuple[str, ...]
     moves: str  # what will move, and what the operator does
     expected: str
-    do: Callable[[Jog], str]
+    do: Callable[[Jog, str], str]
 
 
 _SLOW = f"the wheels turn forwards, at {CRAWL_MPS:g} m/s at most"
-_WAITS = "stops and tells why; refuses until let go, then stands until a re-arm"
-_PRESS = "press the emergency stop, and hold it, within"
+_WAITS = f"stops within {BRAKES_S:g} s, tells why, refuses; let go, it stands until a re-arm"
+_PRESS = "then press the emergency stop, and hold it, within"
 STEPS = (
-    Step("feedback", (), "nothing moves; its brake is released", "alive, stands, no fault",
+    Step("feedback", (), "nothing moves; the brake is released", "alive, no fault, stands",
          _feedback),
-    Step(REMOTE, (REMOTE,), f"nothing moves: take over by remote control within {PERSON_S:g} s, and"
-         " leave its sticks alone", _WAITS, partial(_outranked, cause=REMOTE)),
+    Step(REMOTE, (REMOTE,), f"nothing moves: then take over by remote control within {PERSON_S:g} s"
+         " and leave its sticks alone", _WAITS,
+         partial(_outranked, cause=REMOTE, crawls=False, limit_s=PERSON_S)),
     Step(ESTOP, (ESTOP,), f"nothing moves: {_PRESS} {PERSON_S:g} s", _WAITS,
-         partial(_outranked, cause=ESTOP)),
+         partial(_outranked, cause=ESTOP, crawls=False, limit_s=PERSON_S)),
     Step("steering", (TURNS,), "the front wheels only, twice", f"{1 - STEERING_OFF:.0%} to"
          f" {1 + STEERING_OFF:.0%} of {math.degrees(STEERS_RAD):.0f} degrees or less", _steering),
     Step("crawl", (PEDAL,), f"{_SLOW}, for {CRAWLS_S:g} s", f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%}"
          " of that, or of a lower cap", _crawl),
-    Step("brake", (PEDAL,), f"{_SLOW}, and are braked",
-         f"stands within {BRAKES_S:g} s, and no command moves it", _brake),
-    Step("watchdog", (PEDAL,), f"{_SLOW}, until no command comes",
-         f"stands within {SOON_S:g} s", partial(_silence, mutes=False)),
+    Step("brake", (PEDAL,), f"{_SLOW}, and are braked", f"stands within {BRAKES_S:g} s, latched",
+         partial(_stops, by=lambda jog: jog.vehicle.brake(jog.now()), commands=True,
+                 limit_s=BRAKES_S)),
+    Step("watchdog", (PEDAL,), f"{_SLOW}, until no command comes", f"stands within {SOON_S:g} s",
+         partial(_stops, by=lambda jog: None, commands=None, limit_s=SOON_S)),
     Step("link_watchdog", (PEDAL, SILENCE), f"{_SLOW}, until the driver sends nothing",
-         f"stands within {SOON_S:g} s", partial(_silence, mutes=True)),
-    Step("rearm_refused", (PEDAL, ESTOP), f"{_SLOW}: {_PRESS} {PERSON_CRAWLS_S:g} s",
-         f"stands within {BRAKES_S:g} s; {_WAITS}", _rearm),
+         f"stands within {SOON_S:g} s",
+         partial(_stops, by=lambda jog: jog.vehicle.mute(), commands=True, limit_s=SOON_S)),
+    Step("rearm_refused", (PEDAL, ESTOP), f"{_SLOW}: {_PRESS} {PERSON_CRAWLS_S:g} s", _WAITS,
+         partial(_outranked, cause=ESTOP, crawls=True, limit_s=PERSON_CRAWLS_S)),
 )  # fmt: skip
 
 
 def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
     """Go through the steps until one is not as expected; add a row for each, the rest too."""
     over = ""
-    for step in STEPS:
-        lacks = [need for need in step.needs if need not in jog.has]
-        measured = over or "".join(f"the driver has no {need}. " for need in lacks).rstrip()
-        result = NOT_TRIED if measured else PASSED
+    for name, needs, moves, expected, do in STEPS:
+        lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
+        result, measured = NOT_TRIED, over or ", ".join(f"the driver has no {it}" for it in lacks)
         if not measured:
-            jog.step = step.name
             try:
-                jog.ask(step.moves)
-                measured = step.do(jog)
+                jog.ask(name, moves)
+                measured = do(jog, name)
                 jog.stop()
+                result = PASSED
             except (Exception, KeyboardInterrupt) as error:  # a driver raises anything
                 close_in_time(jog.vehicle)
-                known = isinstance(error, UnexpectedError)
-                result, measured = FAILED, printable(str(error) if known else repr(error))
-                over = f"{step.name} was not as expected"
-        rows.append(
-            {"name": step.name, "expected": step.expected, "measured": measured, "result": result}
-        )
-        print(f"{result:<9} {step.name}: {measured}", flush=True)
+                result, measured = FAILED, str(UserError(str(error) or type(error).__name__))
+                over = f"{name} was not as expected"
+        values = (name, expected, measured, result)
+        rows.append(dict(zip(("name", "expected", "measured", "result"), values)))
+        print(f"{result:<9} {name}: {measured}", flush=True)
 
 
 def ask(name: str, text: str) -> None:
@@ -323,7 +289,7 @@ def ask(name: str, text: str) -> None:
     if sys.stdin.isatty():
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
     if (line := sys.stdin.readline()).strip() or not line:
-        raise UnexpectedError("ended by the operator")
+        raise UserError("ended by the operator")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -340,25 +306,25 @@ def run(arguments: argparse.Namespace) -> int:
     if config.vehicle == NONE:
         raise UserError("no vehicle to jog: name it with --vehicle")
     log.configure("error")
-    manifest = bench_manifest("jog", CONTROL_PERIOD_S)
-    vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
-    car = config.vehicle_settings.get(vehicle.name, {}).get("car", {})
-    interrupted: List[int] = []
+    tables = config.vehicle_settings
+    rows: List[Dict[str, str]] = []
+    vehicle = make_vehicle(config.vehicle, tables, bench_manifest("jog", CONTROL_PERIOD_S))
+    left = tables.get(vehicle.name, {}).get("car", {}).get("full_steering_rad", 1.0)
+    interrupts = iter([KeyboardInterrupt])  # a second one must not keep it from its end
 
     def interrupt(number: int, frame: Any) -> None:
-        interrupted.append(number)
-        if len(interrupted) == 1:  # a second one must not keep it from its end
-            raise KeyboardInterrupt
+        for kind in interrupts:
+            raise kind
 
-    rows: List[Dict[str, str]] = []
     with handled(ENDING_SIGNALS, interrupt):
         try:
-            walk(Jog(vehicle, config.bounds, ask, car.get("full_steering_rad", 1.0)), rows)
+            walk(Jog(vehicle, config.bounds, ask, left), rows)
+        except KeyboardInterrupt:  # between two steps
+            rows = rows[: len(STEPS) - 1]
         finally:
             close_in_time(vehicle)
             passed = len(rows) == len(STEPS) and all(row["result"] != FAILED for row in rows)
             if rows:
-                report = {"steps": rows, "result": PASSED if passed else FAILED}
-                write_json_out(out, report)
-    log.close()
+                write_json_out(out, {"steps": rows, "result": PASSED if passed else FAILED})
+            log.close()
     return 0 if passed else 1

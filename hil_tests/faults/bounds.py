@@ -42,10 +42,11 @@ def leash(rig: Rig) -> Try:
     rig.stop_command(time.monotonic())
     rig.chassis.stands_s(time.monotonic(), STANDS_WITHIN_S)
     rig.rearm()
-    rearmed_s = time.monotonic()
-    stop = rig.stop_command(rearmed_s + rig.recovered_after_s(rearmed_s))
+    rig.wait_until_driving(lambda: rig.chassis.moves)
+    begun_s = rig.chassis.truth[-1][0] - FAST_S  # it was re-armed where it stood
+    stop = rig.stop_command(time.monotonic())
     stands_s = rig.chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
-    heard = [(s, abs(speed_mps(data))) for s, data in rig.monitor.of(SPEED, rearmed_s)]
+    heard = [(s, abs(speed_mps(data))) for s, data in rig.monitor.of(SPEED, begun_s)]
     way = pairwise((s, mps) for s, mps in heard if s < stands_s)
     gone_m = sum(0.5 * (before + after) * (t - s) for (s, before), (t, after) in way)
     fastest_mps = max(mps for _, mps in heard)
@@ -70,6 +71,7 @@ def new_episode(rig: Rig) -> Try:
     or, behind a final state, the last one's.
     """
     sender, kind = rig.sender, rig.number % 3
+    rig.wait_until_driving(lambda: rig.chassis.moves)  # else it may stand now, and move a moment on
     sender.running.clear()
     if kind != 2:
         sender.send_next(final=True)

@@ -1,21 +1,28 @@
 """`edge_runtime jog` against the mock in made-up time: each seeded fault by the step for it."""
 
+import json
 import math
+import threading
+import time
 from dataclasses import replace
 
+import can
 import pytest
 
 from edge_runtime import jog
-from edge_runtime.bounds import NO_BOUNDS
-from edge_runtime.tests.rigs import CARS, STREAM_S
+from edge_runtime.__main__ import main
+from edge_runtime.bounds import NO_BOUNDS, Bounds
+from edge_runtime.tests.rigs import CARS, STREAM_S, BrokenVehicle
+from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
 from edge_runtime.vehicles.hunter import HunterCore, HunterVehicle, protocol
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
+from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.streamed import VehicleState
-from hil_tests.mock_hunter import MODELS, Control, MockHunter
+from hil_tests.mock_hunter import MODELS, Control, MockHunter, Orders, serve
 
 NAMES = [step.name for step in jog.STEPS]
-FASTEST_MPS = 0.3  # of the wheels, whatever is wrong: half more than the crawl
+FASTEST_MPS = 2 * jog.CRAWL_MPS  # of the wheels, whatever is wrong: a stop takes its time
 
 
 class Seeded(MockHunter):
@@ -127,11 +134,12 @@ class Operator:
 
 def walked(vehicle, bounds=NO_BOUNDS, ends_at=""):
     """Walk in made-up time; return the result of each step that was tried."""
-    chassis, rows = vehicle.chassis, []
+    chassis = vehicle.chassis
+    rows: list[dict[str, str]] = []
     chassis.next_s = chassis._now_s = vehicle.now_s - STREAM_S / 2
     operator = Operator(
         lambda name, on: chassis.switch(name, on, vehicle.now_s),
-        lambda: chassis.speed_mps > 0.1,
+        lambda: chassis.speed_mps > 0.05,
         ends_at,
     )
 
@@ -197,3 +205,121 @@ def test_a_seeded_fault_is_found_by_the_step_for_it_and_ends_the_jog_with_a_stop
     assert walked(vehicle) == {**before, found_by: "failed"}
     assert vehicle.closed
     assert vehicle.fastest_mps < FASTEST_MPS
+
+
+@pytest.mark.parametrize("name", ["feedback", "steering", "crawl", "rearm_refused"])
+def test_an_operator_who_interrupts_a_step_ends_the_jog_with_a_stop(name):
+    vehicle = MadeUp(a_chassis())
+    before = dict.fromkeys(NAMES[: NAMES.index(name)], "passed")
+    assert walked(vehicle, ends_at=name) == {**before, name: "failed"}
+    assert vehicle.closed
+
+
+def test_the_operators_bounds_hold_where_they_are_below_its_own():
+    vehicle = MadeUp(a_chassis())
+    assert set(walked(vehicle, Bounds(max_speed_mps=0.1)).values()) == {"passed"}
+    assert 0.07 < vehicle.fastest_mps < 0.11 + 0.02
+    on_a_leash = MadeUp(a_chassis())
+    assert walked(on_a_leash, Bounds(leash_m=0.2))["crawl"] == "failed"
+    with pytest.raises(UserError, match="above the limit"):
+        walked(MadeUp(a_chassis()), Bounds(max_speed_mps=2.0))
+
+
+def test_a_step_that_a_driver_cannot_do_is_not_tried_and_the_rest_is():
+    rows: list[dict[str, str]] = []
+    now_s = [0.0]
+
+    def sleep(seconds):
+        now_s[0] += seconds
+
+    vehicle, asked = MockVehicle(), []
+    jogger = jog.Jog(
+        vehicle, NO_BOUNDS, lambda *words: asked.append(words), now=lambda: now_s[0], sleep=sleep
+    )
+    jog.walk(jogger, rows)
+    told = {row["name"]: row["result"] for row in rows}
+    lacking = {"remote_control", "emergency_stop", "link_watchdog", "rearm_refused"}
+    assert {name for name, result in told.items() if result == "not_tried"} == lacking
+    assert {told[name] for name in told.keys() - lacking} == {"passed"}
+    assert all(row["measured"] for row in rows)
+    assert not {name for name, _ in asked} & lacking
+
+
+def test_a_driver_that_raises_is_a_step_that_failed():
+    vehicle = BrokenVehicle()
+    rows: list[dict[str, str]] = []
+    vehicle.raises["feedback"] = OSError("gone")
+    jog.walk(jog.Jog(vehicle, NO_BOUNDS, lambda *words: None), rows)
+    assert (rows[0]["result"], rows[0]["measured"]) == ("failed", "gone")
+    assert vehicle.asked[-1] == "close"
+
+
+class Terminal:
+    """Stands for stdin: the operator's lines, then its end."""
+
+    def __init__(self, *lines):
+        self.lines = list(lines)
+
+    def isatty(self):
+        return False
+
+    def readline(self):
+        return self.lines.pop(0) if self.lines else ""
+
+
+@pytest.mark.parametrize("lines", [(), ("\n",), ("\n", "q\n"), (" stop\n",)])
+def test_the_end_of_input_or_any_word_ends_it_with_a_report(lines, monkeypatch, tmp_path):
+    monkeypatch.setattr(jog, "SOON_S", 0.05)
+    monkeypatch.setattr(jog.sys, "stdin", Terminal(*lines))
+    out = tmp_path / "jog.json"
+    assert main(["jog", "--vehicle", "mock", "--out", str(out)]) == 1
+    report = json.loads(out.read_text())
+    assert report["result"] == "failed"
+    assert [row["name"] for row in report["steps"]] == NAMES
+    assert [row["result"] for row in report["steps"]].count("failed") == 1
+    assert all(row.keys() == {"name", "expected", "measured", "result"} for row in report["steps"])
+
+
+@pytest.mark.parametrize(
+    "flags", [[], ["--vehicle", "none"], ["--vehicle", "mock", "--out", "/"], ["--config", "no"]]
+)
+def test_bad_input_leaves_no_report(flags):
+    with pytest.raises(UserError):
+        main(["jog", *flags])
+
+
+def test_it_walks_whole_with_the_real_driver_on_a_bus(monkeypatch, tmp_path):
+    """In real time, which is shortened: the stream's own thread falls silent."""
+    for name, value in {"HOLDS_S": 0.15, "SOON_S": 0.5, "CRAWLS_S": 0.2}.items():
+        monkeypatch.setattr(jog, name, value)
+    orders, ending = Orders(), threading.Event()
+    chassis = a_chassis(command_timeout_s=0.3)
+    chassis.next_s = chassis._now_s = time.monotonic()
+    operator = Operator(lambda name, on: orders.put((name, on)), lambda: chassis.speed_mps > 0.05)
+    feedback = HunterVehicle.feedback
+
+    def look(vehicle, now_s):
+        report = feedback(vehicle, now_s)
+        if not report.self_braking:
+            operator.look()
+        return report
+
+    monkeypatch.setattr(HunterVehicle, "feedback", look)
+    monkeypatch.setattr(jog, "ask", operator)
+    out, config = tmp_path / "jog.json", tmp_path / "edge.toml"
+    config.write_text(
+        '[vehicle]\ndriver = "hunter"\nmax_speed_mps = 0.3\n[vehicle.hunter]\nbus = "virtual:jog"\n'
+    )
+    with can.Bus(interface="virtual", channel="jog") as bus:
+        thread = threading.Thread(target=serve, args=(chassis, bus, orders, ending))
+        thread.start()
+        try:
+            status = main(["jog", "--config", str(config), "--out", str(out)])
+        finally:
+            ending.set()
+            thread.join()
+    report = json.loads(out.read_text())
+    assert (status, report["result"]) == (0, "passed"), report
+    assert {row["result"] for row in report["steps"]} == {"passed"}
+    assert chassis.stands
+    assert chassis.brake_locked
