@@ -263,11 +263,10 @@ class VehicleClock(RealTimeClock):
     def receive_feedback(self, payload: bytes) -> None:
         self._send(self._feedback_way, payload, self._feedback_arrives)
 
-    def wait_for_vehicle(self, limit_s: float, vehicle_id: str) -> None:
-        """Wait until the vehicle reports; UserError after ``limit_s``."""
+    def wait_for_vehicle(self, limit_s: float, start: str) -> None:
+        """Wait until the vehicle reports; UserError after ``limit_s``, with what starts one."""
         if not self._wait_until(lambda _: True, limit_s):
-            start = "python -m edge_runtime run --vehicle NAME"
-            raise UserError(f"no vehicle of {vehicle_id} reports after {limit_s:g} s: {start}")
+            raise UserError(f"no vehicle reports after {limit_s:g} s; start one: {start}")
 
     def wait_for_standstill(self) -> None:
         """Wait until the vehicle stands, or STANDSTILL_WAIT_S are over."""

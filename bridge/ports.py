@@ -103,15 +103,15 @@ class SimulatorPort:
         if somebody.matching:
             self._scenes.put(scene_payload(environment, stamps))
 
-    def wait_for_edge(self, limit_s: float, endpoint: str) -> EdgeStatus:
-        """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
+    def wait_for_edge(self, limit_s: float, start: str) -> EdgeStatus:
+        """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``.
+
+        ``start`` is the command that starts one.
+        """
         give_up_s = time.monotonic() + limit_s
         while (status := self.edge_status()) is None:
             if time.monotonic() >= give_up_s:
-                raise UserError(
-                    f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
-                    f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
-                )
+                raise UserError(f"no edge runtime after {limit_s:g} s; start one: {start}")
             time.sleep(RETRY_S)
         return status
 

@@ -30,7 +30,7 @@ from edge_runtime.config import NONE
 from edge_runtime.files import write_json_out
 from edge_runtime.manifest import Task
 from edge_runtime.safety import Event
-from edge_runtime.transport import DEFAULT_ENDPOINT, rearm_command, tls_for
+from edge_runtime.transport import DEFAULT_ENDPOINT, rearm_command, run_command, tls_for
 from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP, State
 
@@ -83,11 +83,12 @@ def run(asked: Namespace) -> int:
         check = CommandCheck(port.session, task)
         clock = stack.enter_context(closing(kind(port.publish_state, check, asked.latency, task)))
         port.hear("command", clock.receive)
-        edge = port.wait_for_edge(wait_s, endpoint)
+        here = (endpoint, asked.vehicle_id, tls)
+        edge = port.wait_for_edge(wait_s, start := run_command(*here))
         if isinstance(clock, VehicleClock):
             port.hear("feedback", clock.receive_feedback)
-            clock.wait_for_vehicle(wait_s, asked.vehicle_id)
-        found = _drive(asked, environment, port, clock, edge)
+            clock.wait_for_vehicle(wait_s, f"{start} --vehicle NAME")
+        found = _drive(asked, environment, port, clock, edge, rearm_command(*here))
     write_json_out(asked.out, found)
     print(report.summary_line(found))
     if found["interrupted"]:
@@ -96,7 +97,12 @@ def run(asked: Namespace) -> int:
 
 
 def _drive(
-    asked: Namespace, environment: Environment, port: SimulatorPort, clock: Clock, edge: EdgeStatus
+    asked: Namespace,
+    environment: Environment,
+    port: SimulatorPort,
+    clock: Clock,
+    edge: EdgeStatus,
+    rearm: str,
 ) -> dict[str, Any]:
     vehicle = clock if isinstance(clock, VehicleClock) else None
     how = {n: getattr(asked, n) for n in ("condition", "seed", "clock", "loop")}
@@ -107,7 +113,7 @@ def _drive(
     origin = Origin(session=port.session, environment=asked.env, latency=network, **how)
     runner = EpisodeRunner(environment, clock, port.publish_scene, task, origin)
     if edge.vehicle != NONE:
-        runner.rearm_command = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
+        runner.rearm_command = rearm
     if not is_same:
         runner.show_task(asked.seed)
         time.sleep(task.control_period_s)  # Its safe stop still finds this end of the wire.

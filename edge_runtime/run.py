@@ -152,7 +152,7 @@ class _Runtime:
             self._notifier,
             vehicle=self._vehicle,
             hold=hold,
-            rearm_command=rearm_command(config.connect, config.vehicle_id),
+            rearm_command=rearm_command(config.connect, config.vehicle_id, self._tls),
         )
         self._over = threading.Event()
         self._failures: List[BaseException] = []

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
 from edge_runtime.reach import check_port_is_free, why_no_link
-from edge_runtime.tls import TlsFiles, load_tls
+from edge_runtime.tls import EDGE, OPERATOR, TlsFiles, common_name, load_tls
 from edge_runtime.util import PathLike, UserError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -140,7 +142,26 @@ def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.
     return take
 
 
-def rearm_command(connect: str, vehicle_id: str) -> str:
+def pasted(words: str, role: str, endpoint: str, vehicle_id: str, tls: Optional[TlsFiles]) -> str:
+    """Return a command for another shell of this machine, as that role.
+
+    Loopback stands for an endpoint that listens at every address. Certificates are looked for
+    beside `tls`, our own, and else are where `deploy certs` makes them.
+    """
+    place = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+    given = ["--connect", place, "--vehicle-id", vehicle_id]
+    if tls is not None:
+        name = common_name(role, vehicle_id)
+        beside = Path(tls.certificate).parent.with_name(name)
+        given += ["--tls", str(beside) if beside.is_dir() else f"certs/{name}"]
+    return f"python -m edge_runtime {words} {' '.join(map(shlex.quote, given))}"
+
+
+def rearm_command(endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None) -> str:
     """Return what an operator types to let a vehicle drive again."""
-    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
-    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
+    return pasted("rearm", OPERATOR, endpoint, vehicle_id, tls)
+
+
+def run_command(endpoint: str, vehicle_id: str, tls: Optional[TlsFiles] = None) -> str:
+    """Return how to start an edge runtime, once the reader has put in the policy's name."""
+    return pasted("run --policy POLICY.onnx", EDGE, endpoint, vehicle_id, tls)

@@ -269,9 +269,9 @@ def test_an_episode_waits_until_there_is_a_vehicle_and_it_stands(monkeypatch):
     monkeypatch.setattr("bridge.clocks.STANDSTILL_WAIT_S", 0.3)
     with contextlib.closing(VehicleRig()) as rig:
         with pytest.raises(UserError):
-            rig.clock.wait_for_vehicle(0.05, "robot-1")
+            rig.clock.wait_for_vehicle(0.05, "start")
         rig.report(-1, speed_mps=1.0, session="another", episode=-1)
-        rig.clock.wait_for_vehicle(PATIENCE_S, "robot-1")
+        rig.clock.wait_for_vehicle(PATIENCE_S, "start")
         rig.clock.begin(0, seed=0)
         threading.Timer(0.1, rig.report, [0], {"speed_mps": 0.0, "session": ""}).start()
         rig.clock.check.sent(5)
