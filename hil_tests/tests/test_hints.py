@@ -45,7 +45,7 @@ def test_printed_commands_work_when_pasted(protocol, host, tmp_path):
 
     with Process(*simulate, "--wait-edge-s", "0") as alone:
         assert alone.wait() == 2
-    start = re.search("start one: (.*)", alone.errors).group(1)
+    start = alone.errors.partition("start one: ")[2].strip()
     policy = f"'{make_policy(tmp_path)}' --allow-unsigned --vehicle mock"
     log = tmp_path / "log"
     with (
@@ -54,7 +54,8 @@ def test_printed_commands_work_when_pasted(protocol, host, tmp_path):
     ):
         try:
             run.wait_for_line("episode 1: the vehicle waits for a re-arm")
-            rearms(re.search(r"episode 1: .*\): (.*)", run.errors).group(1))
+            said = next(line for _, line in run.lines if "episode 1" in line)
+            rearms(said.partition("): ")[2])
             run.wait_for_line("episode 2: the vehicle waits for a re-arm")
             told = re.findall("waits_for_rearm after=episode command=(.*)", log.read_text())
             rearms(ast.literal_eval(told[-1]))
