@@ -21,7 +21,7 @@ from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.streamed import VehicleState
 from hil_tests.mock_hunter import MODELS, Control, MockHunter, Orders, serve
 
-NAMES = [step.name for step in jog.STEPS]
+NAMES = [name for name, *_ in jog.STEPS]
 FASTEST_MPS = 2 * jog.CRAWL_MPS  # of the wheels, whatever is wrong: a stop takes its time
 
 
@@ -143,12 +143,17 @@ def walked(vehicle, bounds=NO_BOUNDS, ends_at=""):
         ends_at,
     )
 
+    def ask(name, text):
+        assert vehicle.core.state is not VehicleState.ENABLED  # whoever waits, waits in a stop
+        assert chassis.stands
+        operator(name, text)
+
     def sleep(seconds):
         vehicle.sleep(seconds)
         if vehicle.core.state is VehicleState.ENABLED:
             operator.look()
 
-    jog.walk(jog.Jog(vehicle, bounds, operator, now=lambda: vehicle.now_s, sleep=sleep), rows)
+    jog.walk(jog.Jog(vehicle, bounds, ask, now=lambda: vehicle.now_s, sleep=sleep), rows)
     assert [row["name"] for row in rows] == NAMES
     assert chassis.stands
     return {row["name"]: row["result"] for row in rows if row["result"] != "not_tried"}
