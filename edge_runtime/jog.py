@@ -39,6 +39,8 @@ PASSED, FAILED, NOT_TRIED = "passed", "failed", "not_tried"
 REMOTE, ESTOP, SILENCE, TURNS = "remote_control", "emergency_stop", "silence", "steering_at_a_stand"
 EXAMPLE = examples("python -m edge_runtime jog --config edge.toml --out jog.json")
 Condition = Callable[[Any], Any]  # of a report
+Ask = Callable[[str, str], None]
+faults: Condition = lambda it: it.faults  # noqa: E731
 nothing: Condition = lambda it: False  # noqa: E731
 stands: Condition = lambda it: abs(it.speed_mps) <= STANDS_MPS  # noqa: E731
 
@@ -62,15 +64,10 @@ class Jog:
     """
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        bounds: Bounds,
-        ask: Callable[[str, str], None],
-        left: float = 1.0,
-        now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, vehicle: Vehicle, bounds: Bounds, ask: Ask, left: float = 1.0, clock: Any = time
     ) -> None:
-        self.vehicle, self.ask, self.now, self._sleep = vehicle, ask, now, sleep
+        self.vehicle, self.ask = vehicle, ask
+        self.now, self._sleep = clock.monotonic, clock.sleep
         vehicle.control_period_s, model = CONTROL_PERIOD_S, vehicle.model_limits
         knows_angle = model.full_steering_rad < math.inf
         most_rad = min(STEERS_RAD, bounds.max_steering_rad, model.max_steering_rad)
@@ -91,11 +88,7 @@ class Jog:
         self.steering, self._most_mps = 0.0, STANDS_MPS
 
     def go_on(
-        self,
-        drives: Optional[bool],
-        limit_s: float,
-        until: Optional[Condition] = None,
-        never: Condition = lambda it: it.faults,
+        self, drives: Optional[bool], limit_s: float, until: Any = None, never: Condition = faults
     ) -> float:
         """Command a crawl or a stand (None: nothing) for a time; return how long it took `until`.
 
@@ -115,7 +108,7 @@ class Jog:
             self._sleep(LOOK_S)
         if until is not None and not comes:
             raise UserError(f"{self.measured()}, after {limit_s:g} s")
-        return now_s - begin_s
+        return float(now_s - begin_s)
 
     def measured(self) -> str:
         """Return the newest report in words."""
