@@ -13,7 +13,7 @@ import sys
 import termios
 import time
 from functools import partial
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 from edge_runtime import log
 from edge_runtime.bounds import STEERING, Bounds, Leash, narrowed
@@ -37,11 +37,10 @@ BRAKES_S = 0.8  # a Hunter's driver locks the parking brake after 1 s
 PERSON_S, PERSON_CRAWLS_S = 30.0, 10.0  # to reach for a button
 PASSED, FAILED, NOT_TRIED = "passed", "failed", "not_tried"
 REMOTE, ESTOP, SILENCE, TURNS = "remote_control", "emergency_stop", "silence", "steering_at_a_stand"
-EXAMPLE = examples(
-    "python -m edge_runtime jog --config edge.toml --out jog.json",
-    "python -m edge_runtime jog --vehicle hunter --bus socketcan:can0",
-)
-Condition = Callable[[VehicleReport], Any]
+EXAMPLE = examples("python -m edge_runtime jog --config edge.toml --out jog.json")
+Condition = Callable[[Any], Any]  # of a report
+Ask = Callable[[str, str], None]
+faults: Condition = lambda it: it.faults  # noqa: E731
 nothing: Condition = lambda it: False  # noqa: E731
 stands: Condition = lambda it: abs(it.speed_mps) <= STANDS_MPS  # noqa: E731
 
@@ -65,15 +64,10 @@ class Jog:
     """
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        bounds: Bounds,
-        ask: Callable[[str, str], None],
-        left: float = 1.0,
-        now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, vehicle: Vehicle, bounds: Bounds, ask: Ask, left: float = 1.0, clock: Any = time
     ) -> None:
-        self.vehicle, self.ask, self.now, self._sleep = vehicle, ask, now, sleep
+        self.vehicle, self.ask = vehicle, ask
+        self.now, self._sleep = clock.monotonic, clock.sleep
         vehicle.control_period_s, model = CONTROL_PERIOD_S, vehicle.model_limits
         knows_angle = model.full_steering_rad < math.inf
         most_rad = min(STEERS_RAD, bounds.max_steering_rad, model.max_steering_rad)
@@ -94,11 +88,7 @@ class Jog:
         self.steering, self._most_mps = 0.0, STANDS_MPS
 
     def go_on(
-        self,
-        drives: Optional[bool],
-        limit_s: float,
-        until: Optional[Condition] = None,
-        never: Condition = lambda it: it.faults,
+        self, drives: Optional[bool], limit_s: float, until: Any = None, never: Condition = faults
     ) -> float:
         """Command a crawl or a stand (None: nothing) for a time; return how long it took `until`.
 
@@ -118,7 +108,7 @@ class Jog:
             self._sleep(LOOK_S)
         if until is not None and not comes:
             raise UserError(f"{self.measured()}, after {limit_s:g} s")
-        return now_s - begin_s
+        return float(now_s - begin_s)
 
     def measured(self) -> str:
         """Return the newest report in words."""
@@ -173,7 +163,9 @@ def _feedback(jog: Jog, name: str) -> str:
     return jog.measured()
 
 
-def _outranked(jog: Jog, name: str, cause: str, crawls: bool, limit_s: float) -> str:
+def _outranked(
+    jog: Jog, name: str, cause: str, crawls: bool = False, limit_s: float = PERSON_S
+) -> str:
     jog.begin(crawls)
     jog.tells(cause, crawls, limit_s)
     took_s = jog.go_on(None, BRAKES_S, stands, never=nothing)
@@ -192,7 +184,7 @@ def _outranked(jog: Jog, name: str, cause: str, crawls: bool, limit_s: float) ->
 def _steering(jog: Jog, name: str) -> str:
     shares = []
     for asked, side in zip(jog.turns, ("LEFT", "RIGHT")):
-        jog.ask(name, f"the front wheels turn a little to the {side}, and back")
+        jog.ask(name, f"what moves: the front wheels, a little to the {side} and back")
         jog.begin()
         jog.steering = asked
         jog.go_on(False, SOON_S)
@@ -217,48 +209,37 @@ def _crawl(jog: Jog, name: str) -> str:
 
 
 def _stops(
-    jog: Jog, name: str, by: Callable[[Jog], Any], commands: Optional[bool], limit_s: float
+    jog: Jog, name: str, by: Callable[[Any], Any], commands: Any = True, limit_s: float = SOON_S
 ) -> str:
     jog.crawl()
     by(jog)
     return f"stood after {jog.go_on(commands, limit_s, stands, never=nothing):.2f} s"
 
 
-class Step(NamedTuple):
-    """`needs`: of `Jog.has`. `do` returns what was measured; where it raises, the jog ends."""
-
-    name: str
-    needs: Tuple[str, ...]
-    moves: str  # what will move, and what the operator does
-    expected: str
-    do: Callable[[Jog, str], str]
-
-
 _SLOW = f"the wheels turn forwards, at {CRAWL_MPS:g} m/s at most"
 _WAITS = f"stops within {BRAKES_S:g} s, tells why, refuses; let go, it stands until a re-arm"
-_PRESS = "then press the emergency stop, and hold it, within"
-STEPS = (
-    Step("feedback", (), "nothing moves; the brake is released", "alive, no fault, stands",
-         _feedback),
-    Step(REMOTE, (REMOTE,), f"nothing moves: then take over by remote control within {PERSON_S:g} s"
-         " and leave its sticks alone", _WAITS,
-         partial(_outranked, cause=REMOTE, crawls=False, limit_s=PERSON_S)),
-    Step(ESTOP, (ESTOP,), f"nothing moves: {_PRESS} {PERSON_S:g} s", _WAITS,
-         partial(_outranked, cause=ESTOP, crawls=False, limit_s=PERSON_S)),
-    Step("steering", (TURNS,), "the front wheels only, twice", f"{1 - STEERING_OFF:.0%} to"
-         f" {1 + STEERING_OFF:.0%} of {math.degrees(STEERS_RAD):.0f} degrees or less", _steering),
-    Step("crawl", (PEDAL,), f"{_SLOW}, for {CRAWLS_S:g} s", f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%}"
-         " of that, or of a lower cap", _crawl),
-    Step("brake", (PEDAL,), f"{_SLOW}, and are braked", f"stands within {BRAKES_S:g} s, latched",
-         partial(_stops, by=lambda jog: jog.vehicle.brake(jog.now()), commands=True,
-                 limit_s=BRAKES_S)),
-    Step("watchdog", (PEDAL,), f"{_SLOW}, until no command comes", f"stands within {SOON_S:g} s",
-         partial(_stops, by=lambda jog: None, commands=None, limit_s=SOON_S)),
-    Step("link_watchdog", (PEDAL, SILENCE), f"{_SLOW}, until the driver sends nothing",
-         f"stands within {SOON_S:g} s",
-         partial(_stops, by=lambda jog: jog.vehicle.mute(), commands=True, limit_s=SOON_S)),
-    Step("rearm_refused", (PEDAL, ESTOP), f"{_SLOW}: {_PRESS} {PERSON_CRAWLS_S:g} s", _WAITS,
-         partial(_outranked, cause=ESTOP, crawls=True, limit_s=PERSON_CRAWLS_S)),
+_PRESS = "after Enter press the emergency stop within"
+_CRAWL = f"{1 - SPEED_OFF:.0%} to {OVER_CAP:.0%} of that, or of a lower cap"
+_ANGLE = f"{1 - STEERING_OFF:.0%} to {1 + STEERING_OFF:.0%} of what is asked, at most 5 degrees"
+# Name, what the driver needs (`Jog.has`), what moves and what the operator does, what is expected,
+# and what does it and returns what was measured; where it raises, the jog is over.
+Step = Tuple[str, Tuple[str, ...], str, str, Callable[[Jog, str], str]]
+STEPS: Tuple[Step, ...] = (
+    ("feedback", (), "nothing; the brake is released", "alive, no fault, stands", _feedback),
+    (REMOTE, (REMOTE,), f"nothing; after Enter take over by remote control, its sticks at rest,"
+     f" within {PERSON_S:g} s", _WAITS, partial(_outranked, cause=REMOTE)),
+    (ESTOP, (ESTOP,), f"nothing; {_PRESS} {PERSON_S:g} s", _WAITS,
+     partial(_outranked, cause=ESTOP)),
+    ("steering", (TURNS,), "the front wheels only", _ANGLE, _steering),
+    ("crawl", (PEDAL,), f"{_SLOW}, for {CRAWLS_S:g} s", _CRAWL, _crawl),
+    ("brake", (PEDAL,), f"{_SLOW}, and are braked", f"stands within {BRAKES_S:g} s, latched",
+     partial(_stops, by=lambda it: it.vehicle.brake(it.now()), limit_s=BRAKES_S)),
+    ("watchdog", (PEDAL,), f"{_SLOW}, until no command comes", f"stands within {SOON_S:g} s",
+     partial(_stops, by=nothing, commands=None)),
+    ("link_watchdog", (PEDAL, SILENCE), f"{_SLOW}, until the driver sends nothing",
+     f"stands within {SOON_S:g} s", partial(_stops, by=lambda it: it.vehicle.mute())),
+    ("rearm_refused", (PEDAL, ESTOP), f"{_SLOW}; {_PRESS} {PERSON_CRAWLS_S:g} s", _WAITS,
+     partial(_outranked, cause=ESTOP, crawls=True, limit_s=PERSON_CRAWLS_S)),
 )  # fmt: skip
 
 
@@ -270,7 +251,7 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
         result, measured = NOT_TRIED, over or ", ".join(f"the driver has no {it}" for it in lacks)
         if not measured:
             try:
-                jog.ask(name, moves)
+                jog.ask(name, f"what moves: {moves}")
                 measured = do(jog, name)
                 jog.stop()
                 result = PASSED
@@ -278,8 +259,8 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
                 close_in_time(jog.vehicle)
                 result, measured = FAILED, str(UserError(str(error) or type(error).__name__))
                 over = f"{name} was not as expected"
-        values = (name, expected, measured, result)
-        rows.append(dict(zip(("name", "expected", "measured", "result"), values)))
+        row = {"name": name, "expected": expected, "measured": measured, "result": result}
+        rows.append(row)
         print(f"{result:<9} {name}: {measured}", flush=True)
 
 
@@ -309,7 +290,8 @@ def run(arguments: argparse.Namespace) -> int:
     tables = config.vehicle_settings
     rows: List[Dict[str, str]] = []
     vehicle = make_vehicle(config.vehicle, tables, bench_manifest("jog", CONTROL_PERIOD_S))
-    left = tables.get(vehicle.name, {}).get("car", {}).get("full_steering_rad", 1.0)
+    car = tables.get(vehicle.name, {}).get("car")
+    left = car.get("full_steering_rad", 1.0) if isinstance(car, dict) else 1.0
     interrupts = iter([KeyboardInterrupt])  # a second one must not keep it from its end
 
     def interrupt(number: int, frame: Any) -> None:

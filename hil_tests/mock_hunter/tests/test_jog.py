@@ -1,10 +1,13 @@
 """`edge_runtime jog` against the mock in made-up time: each seeded fault by the step for it."""
 
+import contextlib
 import json
 import math
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import ClassVar
 
 import can
 import pytest
@@ -12,16 +15,18 @@ import pytest
 from edge_runtime import jog
 from edge_runtime.__main__ import main
 from edge_runtime.bounds import NO_BOUNDS, Bounds
-from edge_runtime.tests.rigs import CARS, STREAM_S, BrokenVehicle
+from edge_runtime.reach import free_endpoint
+from edge_runtime.tests.rigs import CARS, LEFT_TURN, STREAM_S, BrokenVehicle, Ros2Rig
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
 from edge_runtime.vehicles.hunter import HunterCore, HunterVehicle, protocol
 from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.vehicles.ros2 import Ros2Settings, Ros2Vehicle
 from edge_runtime.vehicles.streamed import VehicleState
 from hil_tests.mock_hunter import MODELS, Control, MockHunter, Orders, serve
 
-NAMES = [step.name for step in jog.STEPS]
+NAMES = [name for name, *_ in jog.STEPS]
 FASTEST_MPS = 2 * jog.CRAWL_MPS  # of the wheels, whatever is wrong: a stop takes its time
 
 
@@ -143,12 +148,25 @@ def walked(vehicle, bounds=NO_BOUNDS, ends_at=""):
         ends_at,
     )
 
+    def ask(name, text):
+        assert vehicle.core.state is not VehicleState.ENABLED  # whoever waits, waits in a stop
+        assert chassis.stands
+        operator(name, text)
+
     def sleep(seconds):
         vehicle.sleep(seconds)
         if vehicle.core.state is VehicleState.ENABLED:
             operator.look()
 
-    jog.walk(jog.Jog(vehicle, bounds, operator, now=lambda: vehicle.now_s, sleep=sleep), rows)
+    jog.walk(
+        jog.Jog(
+            vehicle,
+            bounds,
+            ask,
+            clock=SimpleNamespace(monotonic=lambda: vehicle.now_s, sleep=sleep),
+        ),
+        rows,
+    )
     assert [row["name"] for row in rows] == NAMES
     assert chassis.stands
     return {row["name"]: row["result"] for row in rows if row["result"] != "not_tried"}
@@ -234,7 +252,10 @@ def test_a_step_that_a_driver_cannot_do_is_not_tried_and_the_rest_is():
 
     vehicle, asked = MockVehicle(), []
     jogger = jog.Jog(
-        vehicle, NO_BOUNDS, lambda *words: asked.append(words), now=lambda: now_s[0], sleep=sleep
+        vehicle,
+        NO_BOUNDS,
+        lambda *words: asked.append(words),
+        clock=SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep),
     )
     jog.walk(jogger, rows)
     told = {row["name"]: row["result"] for row in rows}
@@ -243,6 +264,45 @@ def test_a_step_that_a_driver_cannot_do_is_not_tried_and_the_rest_is():
     assert {told[name] for name in told.keys() - lacking} == {"passed"}
     assert all(row["measured"] for row in rows)
     assert not {name for name, _ in asked} & lacking
+
+
+class OverRos2(MadeUp):
+    """The ROS 2 driver likewise; its odometry obeys at once and knows of no button."""
+
+    name = "ros2"
+    outranked_by: ClassVar[dict[str, str]] = {}
+    mute = Vehicle.mute
+
+    def __init__(self, **settings):
+        self.rig = Ros2Rig(**settings)
+        self.core, self.now_s, self.closed = self.rig.core, self.rig.now_s, False
+        self.limits, self.model_limits = self.core.similarity.limits(), self.core.similarity.model()
+        self.steers_at_a_stand = "odometry_angular" in settings
+
+    def sleep(self, seconds):
+        self.rig.step(round(seconds / STREAM_S))
+        self.now_s = self.rig.now_s
+
+
+@pytest.mark.parametrize("tells_angle", [True, False])
+def test_a_ros_2_vehicle_is_tried_as_far_as_its_odometry_tells(tells_angle):
+    vehicle = OverRos2(**({"odometry_angular": "steering"} if tells_angle else {}))
+    vehicle.sleep(0.1)
+    rows: list[dict[str, str]] = []
+    clock = SimpleNamespace(monotonic=lambda: vehicle.now_s, sleep=vehicle.sleep)
+    jog.walk(jog.Jog(vehicle, NO_BOUNDS, lambda *words: None, clock=clock), rows)
+    tried = {row["name"]: row["result"] for row in rows if row["result"] != "not_tried"}
+    names = ["feedback", *["steering"] * tells_angle, "crawl", "brake", "watchdog"]
+    assert tried == dict.fromkeys(names, "passed")
+
+
+@pytest.mark.parametrize("angular", ["yaw_rate", "steering"])
+def test_only_two_angles_let_the_ros_2_driver_steer_at_a_stand(angular):
+    settings = Ros2Settings(
+        listen=free_endpoint(), twist_angular="steering", odometry_angular=angular
+    )
+    with contextlib.closing(Ros2Vehicle(settings, LEFT_TURN)) as vehicle:
+        assert vehicle.steers_at_a_stand == (angular == "steering")
 
 
 def test_a_driver_that_raises_is_a_step_that_failed():
