@@ -248,7 +248,7 @@ def walk(jog: Jog, rows: List[Dict[str, str]]) -> None:
     over = ""
     for name, needs, moves, expected, do in STEPS:
         lacks = [need.replace("_", " ") for need in needs if need not in jog.has]
-        result, measured = NOT_TRIED, over or ", ".join(f"the driver has no {it}" for it in lacks)
+        result, measured = NOT_TRIED, over or ", ".join(f"the driver knows no {it}" for it in lacks)
         if not measured:
             try:
                 jog.ask(name, f"what moves: {moves}")

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -11,10 +12,13 @@ from typing import ClassVar
 
 import can
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from edge_runtime import jog
 from edge_runtime.__main__ import main
 from edge_runtime.bounds import NO_BOUNDS, Bounds
+from edge_runtime.cli import AGAIN_S
 from edge_runtime.reach import free_endpoint
 from edge_runtime.tests.rigs import CARS, LEFT_TURN, STREAM_S, BrokenVehicle, Ros2Rig
 from edge_runtime.util import UserError
@@ -24,7 +28,7 @@ from edge_runtime.vehicles.mapping import SPECS, similarity_to
 from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.ros2 import Ros2Settings, Ros2Vehicle
 from edge_runtime.vehicles.streamed import VehicleState
-from hil_tests.mock_hunter import MODELS, Control, MockHunter, Orders, serve
+from hil_tests.mock_hunter import FAULTS, MODELS, Control, MockHunter, Orders, serve
 
 NAMES = [name for name, *_ in jog.STEPS]
 FASTEST_MPS = 2 * jog.CRAWL_MPS  # of the wheels, whatever is wrong: a stop takes its time
@@ -137,8 +141,12 @@ class Operator:
             self.due = ""
 
 
-def walked(vehicle, bounds=NO_BOUNDS, ends_at=""):
-    """Walk in made-up time; return the result of each step that was tried."""
+def walked(vehicle, bounds=NO_BOUNDS, ends_at="", events=()):
+    """Walk in made-up time; return the result of each step that was tried.
+
+    `events`: after how many seconds which fault is switched on or off.
+    """
+    due = sorted(events)
     chassis = vehicle.chassis
     rows: list[dict[str, str]] = []
     chassis.next_s = chassis._now_s = vehicle.now_s - STREAM_S / 2
@@ -155,6 +163,8 @@ def walked(vehicle, bounds=NO_BOUNDS, ends_at=""):
 
     def sleep(seconds):
         vehicle.sleep(seconds)
+        while due and due[0][0] <= vehicle.now_s - 100.0:
+            chassis.switch(*due.pop(0)[1:], vehicle.now_s)
         if vehicle.core.state is VehicleState.ENABLED:
             operator.look()
 
@@ -223,6 +233,30 @@ def test_a_seeded_fault_is_found_by_the_step_for_it_and_ends_the_jog_with_a_stop
     assert walked(vehicle) == {**before, found_by: "failed"}
     assert vehicle.closed
     assert vehicle.fastest_mps < FASTEST_MPS
+
+
+@settings(max_examples=25)
+@given(
+    st.lists(st.tuples(st.floats(0, 30), st.sampled_from(sorted(FAULTS)), st.booleans())),
+    st.tuples(st.sampled_from([-1.0, 0.5, 1.0, 1.0, 3.0]), st.sampled_from([-1.0, 1.0, 2.0])),
+    st.sampled_from(["", *NAMES]),
+)
+def test_whatever_fails_whenever_it_is_never_fast_waits_in_a_stop_and_ends_at_a_stand(
+    events, wheels, ends_at
+):
+    vehicle = MadeUp(a_chassis(wheels=wheels))
+    results = walked(vehicle, ends_at=ends_at, events=events)
+    if "late" not in [name for _, name, _ in events]:  # too late to tell that it is too fast
+        assert vehicle.fastest_mps < FASTEST_MPS
+    assert vehicle.closed == ("failed" in results.values())
+    if wheels != (1.0, 1.0) or ends_at:
+        assert vehicle.closed
+
+
+def test_left_is_where_the_settings_car_has_it():
+    ends = [jog.Jog(MadeUp(a_chassis()), NO_BOUNDS, print, left).turns for left in (1.0, -0.15)]
+    assert ends[0] == ends[1][::-1]
+    assert ends[0][0] > 0.0
 
 
 @pytest.mark.parametrize("name", ["feedback", "steering", "crawl", "rearm_refused"])
@@ -340,6 +374,18 @@ def test_the_end_of_input_or_any_word_ends_it_with_a_report(lines, monkeypatch, 
     assert all(row.keys() == {"name", "expected", "measured", "result"} for row in report["steps"])
 
 
+def test_a_signal_ends_it_with_a_report_and_a_second_one_does_not_break_that(monkeypatch, tmp_path):
+    def close(vehicle):
+        time.sleep(AGAIN_S)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(jog, "ask", lambda *words: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(jog, "close_in_time", close)
+    out = tmp_path / "jog.json"
+    assert main(["jog", "--vehicle", "mock", "--out", str(out)]) == 1
+    assert json.loads(out.read_text())["steps"][0]["result"] == "failed"
+
+
 @pytest.mark.parametrize(
     "flags", [[], ["--vehicle", "none"], ["--vehicle", "mock", "--out", "/"], ["--config", "no"]]
 )
@@ -348,12 +394,13 @@ def test_bad_input_leaves_no_report(flags):
         main(["jog", *flags])
 
 
-def test_it_walks_whole_with_the_real_driver_on_a_bus(monkeypatch, tmp_path):
-    """In real time, which is shortened: the stream's own thread falls silent."""
-    for name, value in {"HOLDS_S": 0.15, "SOON_S": 0.5, "CRAWLS_S": 0.2}.items():
-        monkeypatch.setattr(jog, name, value)
+def test_the_real_driver_on_a_bus_crawls_falls_silent_and_is_refused(monkeypatch, tmp_path):
+    """In real time: the stream's own thread falls silent. The other steps need no thread."""
+    names = ("feedback", "crawl", "link_watchdog", "rearm_refused")
+    monkeypatch.setattr(jog, "STEPS", [step for step in jog.STEPS if step[0] in names])
+    monkeypatch.setattr(jog, "CRAWLS_S", 0.2)
     orders, ending = Orders(), threading.Event()
-    chassis = a_chassis(command_timeout_s=0.3)
+    chassis = a_chassis()
     chassis.next_s = chassis._now_s = time.monotonic()
     operator = Operator(lambda name, on: orders.put((name, on)), lambda: chassis.speed_mps > 0.05)
     feedback = HunterVehicle.feedback
