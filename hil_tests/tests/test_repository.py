@@ -212,6 +212,16 @@ def test_links_and_kept_files_exist(readme):
         assert (ROOT / path).exists(), path
 
 
+@pytest.mark.parametrize("readme", READMES, ids=str)
+def test_commands_in_prose_are_taken(readme, only_parse):
+    blocks = re.findall(r"^ *```(?:bash|sh)\n(.*?)```$", (ROOT / readme).read_text(), re.M | re.S)
+    text = "".join(blocks).replace("\\\n", " ").replace("$AT", "tls/h:1")
+    for line in re.findall(rf"python -m ((?:{'|'.join(ARROWS)}) [^&|;<>\n]+)", text):
+        folder, *words = shlex.split(line, comments=True)
+        with pytest.raises(ParsedError):
+            importlib.import_module(f"{folder}.__main__").main(words)
+
+
 def test_every_folder_has_a_readme_and_what_is_read_first_is_short():
     assert {Path(folder) / "README.md" for folder in ARROWS} <= set(READMES)
     assert len((ROOT / "README.md").read_bytes()) <= 8192
