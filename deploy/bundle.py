@@ -38,7 +38,7 @@ from edge_runtime.vehicles import vehicle_limits
 ROOT = Path(__file__).parents[1]
 NAME = "install.pyz"
 DEFAULT_OUT, KEPT_WHEELS = Path("build/bundles"), Path("build/wheels")
-_OF_THE_BUNDLE = {"policy", "tls", "public_key", "allow_unsigned", "hold"}
+_OF_THE_BUNDLE = {"policy", "tls", "public_key", "allow_unsigned", "armed_at_start"}
 _MAIN = """\
 import sys
 from deploy.installer.__main__ import main
@@ -141,16 +141,18 @@ def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
 
 def _settings(config: Path | None, with_tls: bool) -> bytes:
     """Return the file that the board gets: the given settings behind those of the bundle."""
-    given = config.read_text("utf-8") if config else ""
-    if config and (wrong := _OF_THE_BUNDLE & read_toml(config, "config file").keys()):
+    given = read_toml(config, "config file") if config else {}
+    if wrong := [name for name in given if name in _OF_THE_BUNDLE and given[name] is not False]:
         raise UserError(f"config file {config}: leave {', '.join(wrong)} to the bundle")
     lines = [
         "# Made by `deploy bundle`; paths are of the release's folder, where the service starts.",
         f'policy = "{release.POLICY}"',
         f'public_key = "{release.PUBLIC_KEY}"',
-        'hold = "../../state/hold"  # locked while the installer judges; never armed at the start',
+        ""
+        if "armed_at_start" in given
+        else "armed_at_start = false  # nobody sees a service start",
         f'tls = "{release.TLS}"' if with_tls else "",
-        given,
+        config.read_text("utf-8") if config else "",
     ]
     return "\n".join(lines).encode()
 

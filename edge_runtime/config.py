@@ -51,7 +51,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     public_key: Optional[str] = None
     allow_unsigned: bool = False
     armed_at_start: bool = True
-    hold: Optional[str] = None
     ride_through: RideThrough = RideThrough()
     log_level: str = "info"
     max_speed_mps: Optional[float] = None
@@ -62,12 +61,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def is_armed_at_start(self) -> bool:
-        """Whether a vehicle may drive at once.
-
-        Nobody sees what follows when a hold ends. And a start, which may be a service manager's,
-        gives no new leash: only a re-arm does.
-        """
-        return self.armed_at_start and self.hold is None and self.leash_m is None
+        """Whether a vehicle may drive at once. No start gives a new leash: only a re-arm does."""
+        return self.armed_at_start and self.leash_m is None
 
     @property
     def bounds(self) -> Bounds:

@@ -26,7 +26,7 @@ from edge_runtime.latest import LatestState
 from edge_runtime.link import Link, LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
-from edge_runtime.service import WINDOW, BoardWatch, Hold, Notifier, quantiles_ms
+from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
 from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Rejection, is_foreign
 
 if TYPE_CHECKING:  # Loaded only where there is a vehicle.
@@ -53,11 +53,10 @@ class ControlLoop:
         link: Link,
         notifier: Notifier,
         vehicle: Optional[VehicleRunner] = None,
-        hold: Optional[Hold] = None,
         rearm_command: str = "",
     ) -> None:
         self._policy, self._controller, self._link = policy, controller, link
-        self._vehicle, self._notifier, self._hold = vehicle, notifier, hold
+        self._vehicle, self._notifier = vehicle, notifier
         self._rearm_command = rearm_command
         self._period_s = policy.manifest.control_period_s
         self._link_quality, self._is_poor = LinkQuality(), False
@@ -244,8 +243,7 @@ class ControlLoop:
             if self._vehicle is not None:
                 # A fault whose cause is over ends with `enable`; the next look shows it.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
-            refusal = self._hold.refusal() if self._hold is not None else ""
-            refusal = refusal or self._controller.rearm(now_s)
+            refusal = self._controller.rearm(now_s)
             if not refusal and self._vehicle is not None:
                 self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
@@ -265,7 +263,7 @@ class ControlLoop:
 
     def _send(self, order: Optional[Order]) -> None:
         self._log_transition()
-        if order is None or (self._hold is not None and self._hold.is_on()):
+        if order is None:
             return
         command = order.command(self._policy.policy_id, time.time_ns())
         if not order.ridden:

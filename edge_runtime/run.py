@@ -129,7 +129,6 @@ class _Runtime:
         if vehicle is not None:
             vehicle.take_bounds(config.bounds)
         controller = _controller(config, self._policy, vehicle)
-        hold = None if config.hold is None else service.Hold(config.hold)
         # Both sessions hear only what this vehicle's edge may hear.
         connected = partial(open_session, connect=config.connect, tls=self._tls, access=access)
         self._open_client = partial(connected, mode="client")
@@ -151,7 +150,6 @@ class _Runtime:
             self._link,
             self._notifier,
             vehicle=self._vehicle,
-            hold=hold,
             rearm_command=rearm_command(config.connect, config.vehicle_id),
         )
         self._over = threading.Event()

@@ -1,21 +1,17 @@
-"""The runtime as a service on a board: systemd (sd_notify(3), Type=notify), sensors, durations, and
-an installer's hold.
-"""
+"""The runtime as a service on a board: systemd (sd_notify(3), Type=notify), sensors, durations."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import threading
 from pathlib import Path
-from typing import BinaryIO, Collection, Dict, Mapping, NamedTuple, Optional
+from typing import Collection, Dict, Mapping, NamedTuple, Optional
 
 import numpy as np
 
 from edge_runtime import log
-from edge_runtime.util import open_regular
 
 WINDOW = 1024
 _LOOK_PERIOD_S = 2.0
@@ -94,32 +90,3 @@ def quantiles_ms(durations_ns: Collection[int]) -> Dict[str, float]:
     """p50, p99 and max in milliseconds; zeros where there are no durations."""
     p50, p99, top = np.percentile(np.array([*durations_ns] or [0]) / 1e6, [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}
-
-
-class Hold:
-    """Keeps commands from wire and vehicle while an installer tries this release.
-
-    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies silences no runtime. Once free, this process never asks
-    again. A file that is not there holds nothing.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._stream: Optional[BinaryIO] = None
-        with contextlib.suppress(FileNotFoundError):
-            self._stream = open_regular(path)  # kept until it is free
-
-    def is_on(self) -> bool:
-        """Return whether commands must stay here. Never waits."""
-        if self._stream is not None:
-            try:
-                fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            self._stream.close()
-            self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Say why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

@@ -136,17 +136,13 @@ def rollback(releases: Releases, service: Systemd | None) -> None:
 
 
 def _activate(releases: Releases, service: Systemd | None, version: str) -> None:
-    """Prove a release and switch to it. UnhealthyError where the board stays or is as before.
-
-    With a service the vehicle hears nothing of a release that is being judged.
-    """
+    """Prove a release and switch to it. UnhealthyError where the board stays or is as before."""
     _prove(releases.folder(version), service)
     releases.prepare()
     if service is None:
         releases.link(CURRENT, version)
     else:
-        with releases.holding(service.group()):
-            _switch(releases, service, version)
+        _switch(releases, service, version)
     if releases.linked(BEFORE) != version:  # It is where `rollback` goes from now on.
         releases.move(BEFORE, PREVIOUS)
 

@@ -8,10 +8,9 @@ ROOT/releases/VERSION/       whole releases only; the one installer at work lock
 ROOT/current  -> releases/V  the release that the service runs
 ROOT/previous -> releases/V  the release that `rollback` goes back to
 ROOT/.before  -> releases/V  during a switch: the release that was current before it
-ROOT/state/hold              locked during a switch, and then the service sends no command
 
 Each link changes by one rename. A release that no link names is removed; a folder is one only with
-its contents.json. ROOT/state is the installer's alone. All else in ROOT stays.
+its contents.json. All else in ROOT stays.
 
 A release holds the bundle's files, and
 
@@ -139,7 +138,6 @@ class Releases:
         self.root = Path(os.path.abspath(root))
         self.trusted = self.root / "trusted.pub"
         self._releases = self.root / "releases"
-        self.hold = self.root / "state/hold"
 
     def folder(self, version: str) -> Path:
         return self._releases / version
@@ -158,8 +156,7 @@ class Releases:
         for link in (self.root / name for name in LINKS):
             if link.exists() and not link.is_symlink():
                 raise UserError(f"{link} is no link of an installation; move it away")
-        for folder in (self._releases, self.hold.parent):
-            folder.mkdir(parents=True, exist_ok=True)
+        self._releases.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as undo:
             lock = os.open(self._releases, os.O_RDONLY)  # No program that is started inherits it.
             undo.callback(os.close, lock)
@@ -177,20 +174,6 @@ class Releases:
             is_release = path.name in (DRAFT, DAMAGED) or (path / CONTENTS).exists()
             if is_release and path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-
-    @contextlib.contextmanager
-    def holding(self, gid: int) -> Iterator[None]:
-        """Keep the service from sending any command (`hold` in its settings).
-
-        The lock ends with this process, however that ends. Whoever may read the file could lock
-        it, too: only the service's group `gid` may.
-        """
-        with open(os.open(self.hold, os.O_RDWR | os.O_CREAT, 0o600), "rb") as stream:
-            os.fchown(stream.fileno(), -1, gid)
-            os.fchmod(stream.fileno(), 0o640)
-            if not try_to_lock_file(stream.fileno()):
-                raise UserError(f"another process has locked {self.hold}")
-            yield
 
     def good(self) -> str | None:
         """The version to go back to: of a switch that was cut off, the one before it."""
@@ -252,7 +235,6 @@ class Releases:
         for name in LINKS:
             self._unlink(name)
         self._tidy()
-        shutil.rmtree(self.hold.parent)
         self._unlink(self.trusted.name)
         with contextlib.suppress(OSError):  # What else lies there stays.
             self._releases.rmdir()
