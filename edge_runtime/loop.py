@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from typing import TYPE_CHECKING, Any, Deque, Dict, Optional
+from typing import Any, Deque, Dict, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
@@ -27,10 +27,8 @@ from edge_runtime.link import Link, LinkQuality, is_poor, link_words
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event, Mode
 from edge_runtime.service import WINDOW, BoardWatch, Notifier, quantiles_ms
+from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import HEALTH_HZ, MAX_TEXT_CHARS, Health, Rejection, is_foreign
-
-if TYPE_CHECKING:  # Loaded only where there is a vehicle.
-    from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / HEALTH_HZ
 _JOIN_S = 0.5

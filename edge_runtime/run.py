@@ -9,10 +9,9 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
+from typing import Any, Callable, List, Optional, Union
 
 from edge_runtime import log, service
-from edge_runtime.bounds import narrowed
 from edge_runtime.cli import ENDING_SIGNALS, handled
 from edge_runtime.config import EACH_EPISODE, NONE, Config, add_run_flags, load_config
 from edge_runtime.controller import Controller, ControllerConfig, shared_limits
@@ -23,10 +22,8 @@ from edge_runtime.reach import Listener, why_no_link
 from edge_runtime.tls import EDGE, TlsFiles, check_name, common_name, load_tls, rules_for_edge
 from edge_runtime.transport import open_session, rearm_command
 from edge_runtime.util import PathLike, ends_within, printable
-
-if TYPE_CHECKING:  # Loaded only where there is a vehicle.
-    from edge_runtime.vehicles.base import Vehicle, VehicleRunner
-
+from edge_runtime.vehicles import check_driver, find_vehicle, make_vehicle
+from edge_runtime.vehicles.base import Vehicle, VehicleRunner, close_in_time
 
 _ANNOUNCE_S, _CLOSE_S = 0.5, 2.0
 _WAITING_PERIOD_S = 10.0
@@ -71,10 +68,8 @@ def drive(
         # `unbuilt` closes what a build that fails has opened.
         with handled(ENDING_SIGNALS, stop.by_signal), contextlib.ExitStack() as unbuilt:
             if driver is not None:
-                from edge_runtime.vehicles import check_driver
-
                 check_driver(driver)
-                _close_unless_built(driver, unbuilt)
+                unbuilt.callback(close_in_time, driver)
             loaded = load_config(config, {**flags, "vehicle": vehicle if driver is None else NONE})
             log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
@@ -97,12 +92,6 @@ class _Stop:
         self.on_stop()
 
 
-def _close_unless_built(vehicle: Vehicle, unbuilt: contextlib.ExitStack) -> None:
-    from edge_runtime.vehicles.base import close_in_time
-
-    unbuilt.callback(close_in_time, vehicle)
-
-
 class _Runtime:
     """Opens and connects all parts; `run` closes them. Raises UserError where one cannot be had."""
 
@@ -111,25 +100,23 @@ class _Runtime:
     ) -> None:
         self._config = config
         self._tls: Optional[TlsFiles] = None
-        access: Optional[Dict[str, Any]] = None
         if config.tls is not None:
-            self._tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
+            self._tls = load_tls(config.tls)
             name, expires = self._tls.name, self._tls.expires
             check_name(name, common_name(EDGE, config.vehicle_id))
             log.event("info", "certificate", of=name, expires=f"{expires:%Y-%m-%dT%H:%MZ}")
         if config.vehicle != NONE:
-            from edge_runtime.vehicles import find_vehicle, make_vehicle
-
             find_vehicle(config.vehicle)  # now: a misprint need not wait for the policy
         self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
         manifest = self._policy.manifest
         if config.vehicle != NONE:
             vehicle = make_vehicle(config.vehicle, config.vehicle_settings, manifest)
-            _close_unless_built(vehicle, unbuilt)
+            unbuilt.callback(close_in_time, vehicle)
         if vehicle is not None:
             vehicle.take_bounds(config.bounds)
         controller = _controller(config, self._policy, vehicle)
         # Both sessions hear only what this vehicle's edge may hear.
+        access = None if self._tls is None else rules_for_edge(config.vehicle_id)
         connected = partial(open_session, connect=config.connect, tls=self._tls, access=access)
         self._open_client = partial(connected, mode="client")
         require_free(self._open_client, config.vehicle_id)
@@ -139,8 +126,6 @@ class _Runtime:
         self._link = Link(self._session, config.vehicle_id, manifest, listener)
         self._vehicle: Optional[VehicleRunner] = None
         if vehicle is not None:
-            from edge_runtime.vehicles.base import VehicleRunner
-
             names = [row.name for row in manifest.action]
             self._vehicle = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
         self._notifier = service.Notifier()
@@ -235,7 +220,7 @@ def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> C
     period_s, its_limits = policy.manifest.control_period_s, {}
     if vehicle is not None:
         vehicle.control_period_s = period_s
-        its_limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
+        its_limits = vehicle.allowed_limits
     return Controller(
         ControllerConfig(
             limits=shared_limits(policy.manifest.action, its_limits),

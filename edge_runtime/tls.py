@@ -174,10 +174,7 @@ def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
 
 
 def check_name(name: str, *able: str) -> None:
-    """Raise UserError where a certificate's name is not one of those that may do this.
-
-    Zenoh would not say so: the messages would go nowhere.
-    """
+    """Raise UserError where a certificate's name may not do this: Zenoh would say nothing."""
     if name not in able:
         right = f"name the directory of {' or '.join(able)}"
         raise UserError(f"--tls names the certificate of {name}; {right}")

@@ -10,12 +10,11 @@ import difflib
 import math
 from importlib import import_module
 from importlib.metadata import entry_points
-from numbers import Real
 from typing import Any, Callable, Iterable, Mapping, Tuple, Type, TypeVar
 
 from edge_runtime.bounds import NO_BOUNDS, Bounds, check_bounds, narrowed
 from edge_runtime.config import BUILT_IN, NONE
-from edge_runtime.controller import ActionLimit, Limits
+from edge_runtime.controller import Limits
 from edge_runtime.manifest import Manifest
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle, close_in_time
@@ -58,24 +57,19 @@ def vehicle_limits(
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
-    limits = _checked(name, _call(name, kind.limits_of, settings, manifest))
-    if bounds == NO_BOUNDS:
-        return limits
-    model = _call(name, kind.model_limits_of, settings, manifest)
+    limits, model = _call(name, kind.limits_of, settings, manifest)
     check_bounds(bounds, model, name)
-    return narrowed(limits, bounds, model)
+    return narrowed(_checked(name, limits), bounds, model)
 
 
 def _checked(name: str, limits: Any) -> Limits:
     """Return the limits. Raises UserError for what a comparison would let through, or fail on."""
-
-    def is_limit(limit: Any) -> bool:
-        if not isinstance(limit, ActionLimit) or not all(isinstance(n, Real) for n in limit[:3]):
-            return False
-        return -math.inf < limit.low <= limit.high < math.inf and limit.slew_per_s > 0.0
-
-    if limits and isinstance(limits, dict) and all(map(is_limit, limits.values())):
-        return limits
+    with contextlib.suppress(AttributeError, TypeError):
+        rows = limits.values()
+        within = (-math.inf < row.low <= row.high < math.inf and row.slew_per_s > 0 for row in rows)
+        if rows and all(within):
+            checked: Limits = limits
+            return checked
     form = "{'pedal': ActionLimit(-1.0, 1.0)} of edge_runtime.controller, low <= high, slew > 0"
     raise UserError(f"vehicle {name}: its limits must be like {form}, not {limits!r}")
 

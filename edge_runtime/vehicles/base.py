@@ -11,7 +11,7 @@ import abc
 import threading
 import time
 from functools import partial
-from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence
+from typing import Any, Callable, ClassVar, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from edge_runtime import log
 from edge_runtime.bounds import NO_BOUNDS, Bounds, Leash, Model, check_bounds, narrowed
@@ -51,14 +51,17 @@ class Vehicle(abc.ABC):
         return cls(**settings)
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        """Return `limits` of the driver to be, by default the class's. Opens nothing."""
-        return cls.limits
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
+        """Return `limits` and `model_limits` of the driver to be, by default the class's.
 
-    @classmethod
-    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
-        """Return `model_limits` of the driver to be, by default the class's. Opens nothing."""
-        return cls.model_limits
+        Opens nothing.
+        """
+        return cls.limits, cls.model_limits
+
+    @property
+    def allowed_limits(self) -> Limits:
+        """`limits`, cut to the operator's bounds."""
+        return narrowed(self.limits, self.allowed, self.model_limits)
 
     def take_bounds(self, bounds: Bounds) -> None:
         """Take the operator's bounds, before `enable`. UserError where the model's are below."""
@@ -137,7 +140,7 @@ class VehicleRunner:
         self.on_fault: Callable[[], None] = lambda: None
         self._vehicle, self._action_names, self._publish = vehicle, action_names, publish
         self.allowed = vehicle.allowed
-        self._limits = narrowed(vehicle.limits, vehicle.allowed, vehicle.model_limits)
+        self._limits = vehicle.allowed_limits
         self.leash = Leash(vehicle.allowed.leash_m)
         self._watch = VehicleWatch(
             vehicle.control_period_s, vehicle.limits, vehicle.allowed.max_speed_mps

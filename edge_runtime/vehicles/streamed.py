@@ -270,20 +270,20 @@ class StreamedVehicle(Vehicle):
 
     @classmethod
     def open(cls, settings: Mapping[str, Any], manifest: Manifest) -> Vehicle:
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
+        given, similarity = cls._read(settings, manifest)
         make: Any = cls  # of each driver's own settings
-        made: Vehicle = make(given, given.similarity(cls.name, manifest))
+        made: Vehicle = make(given, similarity)
         return made
 
     @classmethod
-    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Limits:
-        given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given.similarity(cls.name, manifest).limits()
+    def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
+        _, similarity = cls._read(settings, manifest)
+        return similarity.limits(), similarity.model()
 
     @classmethod
-    def model_limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Model:
+    def _read(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Any, Similarity]:
         given = convert(settings, cls.settings_type, f"vehicle.{cls.name}")
-        return given.similarity(cls.name, manifest).model()
+        return given, given.similarity(cls.name, manifest)
 
     def take_bounds(self, bounds: Bounds) -> None:
         super().take_bounds(bounds)
