@@ -88,10 +88,7 @@ def run_bundle(given: argparse.Namespace) -> int:
 
 
 def make_bundle(given: argparse.Namespace) -> tuple[Path, Manifest]:
-    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`.
-
-    `given` are the command's options. Raises UserError as `collect` does, with nothing written.
-    """
+    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`."""
     contents, manifest = collect(given)
     packed = pack(contents)
     path = given.out / f"phil-{given.target}-{manifest.vehicle_id}-{manifest.version}.tar"
@@ -179,7 +176,6 @@ def sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
 
 
 def build_installer() -> bytes:
-    """Make `install.pyz`."""
     shared = (ROOT / f"edge_runtime/{name}.py" for name in ("__init__", "cli", "files", "util"))
     sources = [*(ROOT / "deploy/installer").glob("*.py"), *shared]
     return _zip(sources, {"__main__.py": _MAIN, "deploy/__init__.py": ""})
@@ -207,10 +203,7 @@ def lock_path(target: str) -> Path:
 
 
 def gather(target: str, place: str) -> None:
-    """Bring the lock's wheels to `place`, by way of the folder where they are kept.
-
-    pip checks every hash, and asks an index only where a wheel is missing.
-    """
+    """Bring the lock's wheels to `place`; an index is asked only for those that are not kept."""
     kept = str(KEPT_WHEELS / target)
     locked = ("--require-hashes", "--requirement", str(lock_path(target)), "--find-links", kept)
     try:

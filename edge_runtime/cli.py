@@ -196,10 +196,7 @@ seconds = number("a number of seconds from 0 to 1e9", lambda value: 0.0 <= value
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too, unless they have a handler.
-
-    So sessions are closed and files are finished.
-    """
+    """Raise KeyboardInterrupt in the block for SIGTERM and SIGHUP, too, unless they are handled."""
     ends = (signal.SIG_DFL, signal.default_int_handler)
 
     def interrupt(number: int, frame: Any) -> NoReturn:
@@ -211,10 +208,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def quit_on_signals(ask: Callable[[], Optional[bool]]) -> Iterator[None]:
-    """Let the first signal ask for the end.
-
-    A second one ends the process, and so does the first where ``ask`` returns False.
-    """
+    """Let the first signal `ask` for the end; a second one, or a False answer, ends the process."""
     asked: list[int] = []
 
     def stop(number: int, frame: Any) -> None:

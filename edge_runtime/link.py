@@ -287,10 +287,7 @@ def _ask(open_client: OpenClient, selector: str) -> List[str]:
 def ask(
     connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
 ) -> Dict[str, Any]:
-    """Query a runtime for its JSON reply. Raises UserError where none comes in 2 s.
-
-    `topic` is "status" or "rearm".
-    """
+    """Query a runtime's "status" or "rearm" for its JSON; UserError where none comes in 2 s."""
     selector = key(vehicle_id, topic)
     with open_session(connect=connect, mode="client", tls=tls) as session:
         for reply in session.get(selector, timeout=2.0):
@@ -347,8 +344,6 @@ class _Way:
 
 
 class LinkQuality:
-    """Measures the link by each accepted state and each command that is sent."""
-
     def __init__(self) -> None:
         self._begin("")
 

@@ -39,10 +39,7 @@ _HUNG_S = 2.0
 
 
 class ControlLoop:
-    """Answers states with commands until it is stopped.
-
-    `rearm_command` is what the log names to an operator.
-    """
+    """Answers states with commands until it is stopped; the log names `rearm_command`."""
 
     def __init__(
         self,
@@ -88,8 +85,7 @@ class ControlLoop:
     def run(self) -> None:
         """Be the watchdog until `stop` is called."""
         next_health_s = time.monotonic()
-        alive_period_s = self._notifier.watchdog_period_s
-        next_alive_s = next_health_s if alive_period_s else math.inf
+        next_alive_s = next_health_s
         with self._lock:
             while not self._stopping:
                 now_s = time.monotonic()
@@ -100,9 +96,9 @@ class ControlLoop:
                     self._link.send("health", health)
                     self._log_link(health.link)
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
-                if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
+                if now_s >= next_alive_s and not self._is_hung(now_s):
                     self._notifier.tell("WATCHDOG=1")
-                    next_alive_s = now_s + alive_period_s
+                    next_alive_s = now_s + self._notifier.watchdog_period_s
                 self._sleep(min(next_health_s, max(next_alive_s, now_s + _RETRY_S)))
 
     def stop(self) -> None:
@@ -127,7 +123,6 @@ class ControlLoop:
         return bool(self._latest.accepted or self._latest.rejected)
 
     def health(self) -> Health:
-        """Make the message of the health topic and of the status query."""
         with self._lock:
             safety = self._controller.safety
             return Health(
@@ -154,7 +149,6 @@ class ControlLoop:
             )
 
     def _bounds(self) -> Dict[str, Any]:
-        """Return the fields of health about the operator's bounds; None: none is set."""
         if self._vehicle is None:
             return {}
         found = {**self._vehicle.allowed._asdict(), "leash_left_m": self._vehicle.leash.left_m}

@@ -192,11 +192,7 @@ class Layout:
             raise UserError(f"{found}; the wire carries {MAX_STATE_BYTES - OVERHEAD_BYTES} at most")
 
     def decode(self, payload: bytes) -> Union[State, Rejection]:
-        """Decode a State with finite numbers whose observation is this task's.
-
-        A state that names another task is handed on as it is, so that its sender can be told; the
-        policy must not see it.
-        """
+        """Decode a state of this task. One of another task passes: its sender is to be told."""
         state = decode_state(payload, self.max_payload_bytes)
         if isinstance(state, Rejection) or is_foreign(state, self.task_text):
             return state

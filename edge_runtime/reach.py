@@ -19,10 +19,7 @@ _KEPT: Deque[socket.socket] = deque(maxlen=100)  # a long campaign would run out
 
 
 def why_no_link(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
-    """Return whether anybody answers at `endpoint`, and the error of a link; "" if there is none.
-
-    Zenoh says "Unable to connect" for every cause. Of udp this knows nothing.
-    """
+    """Return whether anybody answers at `endpoint`, and why there is no link; "" if there is."""
     protocol, host, port = _parts(endpoint)
     answers = False
     try:
@@ -87,10 +84,7 @@ class Listener:
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """Return a Zenoh endpoint on loopback that nobody listens on, for demos and tests.
-
-    The port stays reserved until this process ends or has asked for a hundred more.
-    """
+    """Return a free endpoint on loopback, and reserve it: for demos and tests."""
     probe = socket.socket()
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # One may listen there all the same
     probe.bind(("127.0.0.1", 0))

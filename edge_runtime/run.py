@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import Any, Callable, List, Optional, Union
+from typing import Any, List, Optional, Union
 
 from edge_runtime import log, service
 from edge_runtime.cli import ENDING_SIGNALS, handled
@@ -63,10 +63,16 @@ def drive(
     """
     driver = None if vehicle is None or isinstance(vehicle, str) else vehicle
     flags = {"policy": policy and str(policy), "connect": connect, **settings}
-    stop = _Stop()
+    runtime: Optional[_Runtime] = None
+
+    def end(number: int, frame: Any) -> None:
+        if runtime is None:
+            raise KeyboardInterrupt
+        runtime.stop()
+
     try:
         # `unbuilt` closes what a build that fails has opened.
-        with handled(ENDING_SIGNALS, stop.by_signal), contextlib.ExitStack() as unbuilt:
+        with handled(ENDING_SIGNALS, end), contextlib.ExitStack() as unbuilt:
             if driver is not None:
                 check_driver(driver)
                 unbuilt.callback(close_in_time, driver)
@@ -74,22 +80,10 @@ def drive(
             log.configure(loaded.log_level)
             runtime = _Runtime(loaded, driver, unbuilt)
             unbuilt.pop_all()
-            ended = runtime.run(stop, until)
+            ended = runtime.run(until)
     finally:
         written = log.close()
     return ended and written
-
-
-class _Stop:
-    """Ends the drive at a signal; before there is one, the signal is ^C."""
-
-    def __init__(self) -> None:
-        self.on_stop: Optional[Callable[[], None]] = None
-
-    def by_signal(self, number: int, frame: Any) -> None:
-        if self.on_stop is None:
-            raise KeyboardInterrupt
-        self.on_stop()
 
 
 class _Runtime:
@@ -129,23 +123,15 @@ class _Runtime:
             names = [row.name for row in manifest.action]
             self._vehicle = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
         self._notifier = service.Notifier()
-        self._loop = ControlLoop(
-            self._policy,
-            controller,
-            self._link,
-            self._notifier,
-            vehicle=self._vehicle,
-            rearm_command=rearm_command(config.connect, config.vehicle_id),
-        )
+        hint = rearm_command(config.connect, config.vehicle_id)
+        parts = (self._policy, controller, self._link, self._notifier, self._vehicle, hint)
+        self._loop = ControlLoop(*parts)
+        self.stop = self._loop.stop
         self._over = threading.Event()
         self._failures: List[BaseException] = []
 
-    def run(self, stop: _Stop, until: Optional[threading.Event]) -> bool:
-        """Drive until it is told to stop; returns False where a thread hangs.
-
-        Raises UserError where a vehicle cannot be enabled, and where it gave way.
-        """
-        stop.on_stop = self._loop.stop
+    def run(self, until: Optional[threading.Event]) -> bool:
+        """Drive until it is told to stop; returns False where a thread hangs. Raises UserError."""
         if until is not None:
             threading.Thread(target=self._stop_when, args=(until,), daemon=True).start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
@@ -171,22 +157,19 @@ class _Runtime:
 
     def _stop_when(self, until: threading.Event) -> None:
         until.wait()
-        self._loop.stop()
+        self.stop()
 
     def _announce(self) -> None:
         """Show that it is there, print "ready", and log what keeps states away."""
         config, policy = self._config, self._policy
         try:
-            self._link.appear(self._open_client, self._loop.stop)
+            self._link.appear(self._open_client, self.stop)
             if policy.trust != VERIFIED:
                 log.event("warning", "policy_not_verified", trust=policy.trust)
             health = self._loop.health()
-            print(
-                f"ready vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
-                f" connect={config.connect} policy_id={policy.policy_id}"
-                f" verified_by={printable(policy.public_key or 'none')}",
-                flush=True,
-            )
+            where = f"vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
+            what = f"policy_id={policy.policy_id} verified_by={policy.public_key or 'none'}"
+            print(printable(f"ready {where} connect={config.connect} {what}"), flush=True)
             self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
             while not self._over.wait(_WAITING_PERIOD_S) and not self._loop.has_heard():
                 answers, why = why_no_link(config.connect, self._tls)
@@ -194,7 +177,7 @@ class _Runtime:
                 log.event("warning", "waiting", why=f"{config.connect}: {state}")
         except BaseException as error:  # the main thread raises it
             self._failures.append(error)
-            self._loop.stop()
+            self.stop()
 
     def _close(self, announcer: threading.Thread) -> bool:
         """End the threads, brake and close the vehicle; returns False where one of them hangs."""
@@ -217,18 +200,17 @@ class _Runtime:
 
 
 def _controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> Controller:
-    period_s, its_limits = policy.manifest.control_period_s, {}
+    manifest, its_limits = policy.manifest, {}
     if vehicle is not None:
-        vehicle.control_period_s = period_s
+        vehicle.control_period_s = manifest.control_period_s
         its_limits = vehicle.allowed_limits
-    return Controller(
-        ControllerConfig(
-            limits=shared_limits(policy.manifest.action, its_limits),
-            control_period_s=period_s,
-            needs_rearm=vehicle is not None,
-            armed_at_start=config.is_armed_at_start,
-            task=policy.layout.task_text,
-            ride_s=config.ride_through.max_s,
-            each_episode=config.rearm == EACH_EPISODE,
-        )
+    rules = ControllerConfig(
+        limits=shared_limits(manifest.action, its_limits),
+        control_period_s=manifest.control_period_s,
+        needs_rearm=vehicle is not None,
+        armed_at_start=config.is_armed_at_start,
+        task=policy.layout.task_text,
+        ride_s=config.ride_through.max_s,
+        each_episode=config.rearm == EACH_EPISODE,
     )
+    return Controller(rules)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import socket
 import threading
@@ -18,17 +19,13 @@ _LOOK_PERIOD_S = 2.0
 
 
 class Notifier:
-    """Sends READY, WATCHDOG, STATUS and STOPPING to systemd, where it runs under systemd.
-
-    Never waits: a message for which systemd has no room is dropped.
-    """
+    """Tells systemd, where it runs under systemd; a message without room there is dropped."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        self.watchdog_period_s: Optional[float] = None
-        """Half of the time that systemd waits; None where it does not watch this process."""
+        self.watchdog_period_s = math.inf
+        """Half of the time that systemd waits; inf where it does not watch this process."""
         if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
-            timeout_us = int(environment.get("WATCHDOG_USEC", "0"))
-            self.watchdog_period_s = timeout_us / 2e6 or None
+            self.watchdog_period_s = int(environment.get("WATCHDOG_USEC", "0")) / 2e6 or math.inf
         address = environment.get("NOTIFY_SOCKET", "")
         # "@" stands for the NUL byte with which an abstract address begins.
         self._address = "\0" + address[1:] if address.startswith("@") else address
@@ -36,7 +33,6 @@ class Notifier:
         self._socket.setblocking(False)
 
     def tell(self, text: str) -> None:
-        """Send a state of sd_notify(3), like `READY=1`; never waits."""
         if self._address:
             try:
                 self._socket.sendto(text.encode(), self._address)

@@ -181,10 +181,7 @@ def check_name(name: str, *able: str) -> None:
 
 
 def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
-    """Make Zenoh's `access_control` for a listener: the rights of every party of these vehicles.
-
-    All else is denied: other names, other keys, and `delete` for everybody.
-    """
+    """Make a listener's `access_control`: the rights of each party of these vehicles, no more."""
     parties = {
         common_name(role, vehicle_id): _rules(rights, vehicle_id)
         for role, rights in ROLES.items()

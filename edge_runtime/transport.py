@@ -128,10 +128,7 @@ def _settings(
 
 
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
-    """Make a subscriber's callback that drops what was not put to this very key.
-
-    Zenoh delivers whatever intersects: a put to `phil/*/state` comes to every vehicle.
-    """
+    """Make a callback that drops what was put to `phil/*/state` and the like, not to this key."""
 
     def take(sample: zenoh.Sample) -> None:
         if str(sample.key_expr) == key:

@@ -56,10 +56,7 @@ def open_regular(path: PathLike) -> BinaryIO:
 
 
 def read_bytes(path: PathLike, what: str, most_mib: int = MAX_FILE_MIB) -> bytes:
-    """Read a regular file of at most `most_mib`; UserError where that fails.
-
-    `what` names the file in the error, as in "policy file".
-    """
+    """Read a regular file, called `what` in the UserError, of at most `most_mib`."""
     try:
         with open_regular(path) as stream:
             data = stream.read((most_mib << 20) + 1)

@@ -54,7 +54,6 @@ def render(status: Status) -> List[str]:
 
 
 def _who(status: Status) -> str:
-    """Say who may move the vehicle now."""
     if status["vehicle"] == "none":
         return "nobody: no vehicle"
     return "NOBODY until a re-arm" if status["needs_rearm"] else "THE POLICY"

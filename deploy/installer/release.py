@@ -149,10 +149,7 @@ class Releases:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Be the only installer here; before and after, remove what no link names.
-
-        Raises UserError where another installer is at work, or a link's place is taken.
-        """
+        """Be the only installer here; before and after, remove what no link names."""
         for link in (self.root / name for name in LINKS):
             if link.exists() and not link.is_symlink():
                 raise UserError(f"{link} is no link of an installation; move it away")
@@ -191,7 +188,6 @@ class Releases:
         self.move(".next", name)
 
     def move(self, link: str, to: str) -> None:
-        """Let one link take another's place."""
         os.replace(self.root / link, self.root / to)
         os.sync()
 
@@ -251,10 +247,7 @@ def _contents(folder: Path) -> bytes:
 
 
 def unpack_wheel(data: bytes, site: Path) -> None:
-    """Write a wheel's packages into `site`, without pip, which a board may lack (PEP 427).
-
-    Scripts and data files stay out. No name leaves `site`: zipfile sees to that.
-    """
+    """Write a wheel's packages into `site`; a board may lack pip. Scripts and data stay out."""
     with zipfile.ZipFile(io.BytesIO(data)) as wheel:
         for member in wheel.infolist():
             folder, _, rest = member.filename.partition("/")

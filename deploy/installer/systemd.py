@@ -84,7 +84,6 @@ class Systemd:
                 _run("systemctl", "stop", TRIAL_UNIT, check=False)
 
     def stop(self) -> None:
-        """End the service, if there is one."""
         if (UNIT_FOLDER / MAIN_UNIT).exists():
             _run("systemctl", "stop", MAIN_UNIT)
 
@@ -107,7 +106,6 @@ class Systemd:
         _require_active(MAIN_UNIT)
 
     def describe(self) -> str:
-        """The service's state, such as "active"."""
         return _run("systemctl", "is-active", MAIN_UNIT, check=False).strip()
 
     def remove(self) -> None:

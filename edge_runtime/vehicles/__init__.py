@@ -25,10 +25,7 @@ Tables = Mapping[str, Mapping[str, Any]]  # [vehicle.NAME] of the settings, by n
 
 
 def make_vehicle(name: str, tables: Tables, manifest: Manifest) -> Vehicle:
-    """Open the driver of a name for a policy. Nothing is sent before it is enabled.
-
-    Raises UserError where there is none, for its settings, and where it cannot be opened.
-    """
+    """Open the driver of a name for a policy; UserError where that fails. Nothing is sent."""
     kind, settings = _find(name, tables)
     vehicle = _call(name, kind.open, settings, manifest)
     check_driver(vehicle)
@@ -49,11 +46,7 @@ def check_driver(vehicle: Any) -> None:
 def vehicle_limits(
     name: str, tables: Tables, manifest: Manifest, bounds: Bounds = NO_BOUNDS
 ) -> Limits:
-    """Return the limits of the vehicle of a name without opening anything; of "none": {}.
-
-    They are cut to the operator's bounds. Raises UserError where there is none, and for its
-    settings.
-    """
+    """Return the limits of a vehicle within the bounds, opening nothing; of "none": {}."""
     if name == NONE:
         return {}
     kind, settings = _find(name, tables)
@@ -102,10 +95,7 @@ def find_vehicle(name: str) -> Type[Vehicle]:
 
 
 def installed_as(own_name: str) -> str:
-    """Return the installed name of the driver that calls itself `own_name`, as a recording has it.
-
-    Where none is installed it is `own_name` itself.
-    """
+    """Return the installed name of the driver that calls itself `own_name`, if there is one."""
     for point in _others():
         with contextlib.suppress(UserError):
             if find_vehicle(point.value).name == own_name:

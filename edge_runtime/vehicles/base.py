@@ -52,10 +52,7 @@ class Vehicle(abc.ABC):
 
     @classmethod
     def limits_of(cls, settings: Mapping[str, Any], manifest: Manifest) -> Tuple[Limits, Model]:
-        """Return `limits` and `model_limits` of the driver to be, by default the class's.
-
-        Opens nothing.
-        """
+        """Return `limits` and `model_limits` of the driver to be, by default the class's."""
         return cls.limits, cls.model_limits
 
     @property
@@ -186,10 +183,7 @@ class VehicleRunner:
         return self._seen_fault(now_s) or (heard.standing[0] if heard and heard.standing else "")
 
     def start(self, armed: bool = True) -> None:
-        """Start the vehicle's feedback, and enable it unless that is to wait for an operator.
-
-        Raises UserError where it cannot be enabled.
-        """
+        """Start the feedback, and enable the vehicle where `armed`; UserError where that fails."""
         self._enable_due = armed
         self._watch.begin(time.monotonic())
         self._thread.start()
@@ -199,10 +193,7 @@ class VehicleRunner:
             raise UserError(f"vehicle {self.name} cannot be enabled: {words}")
 
     def enable(self) -> None:
-        """Have the vehicle enabled again: an operator has re-armed it.
-
-        A command that is still on its way is dropped: a stop from before would undo it.
-        """
+        """Enable the vehicle again, after a re-arm. A stop from before, on its way, is dropped."""
         with self._due:
             self._enable_due, self._next = True, None
             self._due.notify()
@@ -210,11 +201,7 @@ class VehicleRunner:
     def command(
         self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
     ) -> None:
-        """Hand on a command, in place of one that the driver has not taken yet.
-
-        `scenario_speed_mps` is that of the state it answers. A safe stop with `latch` False may
-        be followed by a drive without `enable`.
-        """
+        """Hand on a command in place of the last; not `latch`: a stop that needs no `enable`."""
         with self._due:
             self._next = _Order(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()

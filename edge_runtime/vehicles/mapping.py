@@ -172,10 +172,7 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """Return the command of an action, within -1 to 1.
-
-    Raises ValueError for what is not finite, and for what leaves out how fast to drive.
-    """
+    """Return an action's command, within -1 to 1; ValueError: not finite, or no speed in it."""
     if not all(map(math.isfinite, [*action.values(), scenario_speed_mps or 0.0])):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
     if not action or ("pedal" not in action and scenario_speed_mps is None):
@@ -195,7 +192,6 @@ class SetPoint:
         self._similarity = similarity
 
     def take_bounds(self, bounds: Bounds) -> None:
-        """Stay within the operator's bounds as well."""
         spec = self.spec
         self.spec = spec._replace(
             max_speed_mps=min(spec.max_speed_mps, bounds.max_speed_mps),

@@ -110,7 +110,6 @@ class Speeds:
 
     @property
     def stands(self) -> bool:
-        """Whether it stood when it was last heard."""
         return abs(self.speed_mps) < STANDS_MPS
 
     def acceleration_mps2(self) -> float:
@@ -220,7 +219,6 @@ class StreamedCore(abc.ABC):
         self.cause, self.words = finding if after is VehicleState.STOPPED else (None, "")
 
     def _look(self, now_s: float) -> None:
-        """Find what time alone tells."""
         if self.state is VehicleState.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
             words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
             if why := self._hindrance(now_s):

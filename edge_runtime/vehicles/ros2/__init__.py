@@ -45,10 +45,7 @@ STEERS_FROM_MPS = 0.2
 
 
 def topic_key(namespace: str, topic: str) -> str:
-    """Return the Zenoh key of a topic: below the namespace unless it begins with a slash.
-
-    Raises UserError for names that ROS would not take.
-    """
+    """Return a topic's Zenoh key: below the namespace unless it begins with a slash."""
     for name in (topic, *([] if namespace == "/" else [namespace])):
         if not _NAME.fullmatch(name):
             raise UserError(f"ROS name {name!r} is not valid: write it like /hunter01/odom")
@@ -183,10 +180,7 @@ class Ros2Core(StreamedCore):
         self._apply(Finding(VehicleEvent.CLOSE), now_s)
 
     def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
-        """Take finite odometry; it counts where it is newer than the last by its own stamp.
-
-        A sender that leaves its stamps at 0 is believed by the time of arrival alone.
-        """
+        """Take finite odometry; one counts that is newer by its own stamp, or has none (0)."""
         # While nothing is driven, a clock set back is believed; a repetition is not.
         is_older = stamp_ns < self._stamp_ns and self._has_asked
         if stamp_ns > 0 and (is_older or stamp_ns == self._stamp_ns):
@@ -198,7 +192,6 @@ class Ros2Core(StreamedCore):
         self._apply(lie or Finding(VehicleEvent.CONFIRMED), now_s)
 
     def tick(self, now_s: float) -> Optional[Motion]:
-        """Return what to publish now; None while DISABLED."""
         self._look(now_s)
         if self.state is VehicleState.DISABLED:
             return None
@@ -226,10 +219,7 @@ class Ros2Core(StreamedCore):
 
 
 class Ros2Vehicle(StreamedVehicle):
-    """Opens its session and announces its topics when made; publishes nothing before `enable`.
-
-    Raises UserError, when made, for settings that are not valid and for a busy port.
-    """
+    """Opens its session and announces its topics when made; publishes nothing before `enable`."""
 
     name: ClassVar[str] = "ros2"
     settings_type: ClassVar[Type[RobotSettings]] = Ros2Settings
