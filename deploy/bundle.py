@@ -98,11 +98,7 @@ def make_bundle(given: argparse.Namespace) -> tuple[Path, Manifest]:
 
 
 def collect(given: argparse.Namespace) -> tuple[dict[str, bytes], Manifest]:
-    """Return the files of a bundle, by path, and the manifest among them.
-
-    Raises UserError for a policy that may not drive or was not signed by the public key's owner,
-    settings that do not hold, certificates of another party, and a key that cannot sign.
-    """
+    """Return a bundle's files, by path, and its manifest. Raises UserError for what is wrong."""
     tls.read_signing_key(given.key)
     policy = load_policy(given.policy, given.public_key)
     flags = {"policy": str(given.policy), "tls": given.tls and str(given.tls)}
@@ -244,17 +240,14 @@ def push(parser: argparse.ArgumentParser) -> None:
 
 
 def run_push(given: argparse.Namespace) -> int:
-    """Copy and install over ssh; return the first status that is not 0.
-
-    The installer that runs there is this workstation's own: what verifies the bundle must not come
-    out of it.
-    """
+    """Copy and install over ssh; return the first status that is not 0."""
     # What the board would refuse is not sent.
     manifest, _ = release.read_bundle(given.bundle, release.read_public_key(given.trust))
     place = f"phil-push-{manifest.version}"
     install = ["sudo", "-n", f"python{manifest.python}", f"{place}/{NAME}", "install"]
     install += [f"{place}/{given.bundle.name}", "--trust", f"{place}/{given.trust.name}"]
     with tempfile.TemporaryDirectory() as folder:
+        # This workstation's own: what verifies the bundle must not come out of it.
         installer = Path(folder, NAME)
         installer.write_bytes(build_installer())
         # Absolute: scp would take "a:b" for a file of the host a.

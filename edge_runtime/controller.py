@@ -135,12 +135,9 @@ class Received(NamedTuple):
 
     @property
     def trip_s(self) -> Optional[float]:
-        """How long the newest command that the sender had heard, and this state, were under way.
-
-        None where the sender does not say. The stamps of each clock are subtracted first: two of
-        different clocks may be decades apart.
-        """
+        """Round trip of the newest command heard, and this state; None where nobody tells it."""
         heard_sent_ns, heard_ns = self.state.heard_sent_ns, self.state.heard_ns
+        # The stamps of each clock first: two of different clocks may be decades apart.
         if isinstance(heard_sent_ns, int) and isinstance(heard_ns, int):
             held_ns = self.state.sent_ns - heard_ns
             return (self.arrived_ns - heard_sent_ns - held_ns) * 1e-9
@@ -195,8 +192,8 @@ class ControllerConfig(NamedTuple):
 class Controller:
     """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
 
-    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. Raises
-    UserError where no plan can be as long as `ride_s`.
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes. UserError
+    where no plan can be as long as `ride_s`.
     """
 
     def __init__(self, config: ControllerConfig) -> None:

@@ -101,11 +101,7 @@ class Link:
         ]
 
     def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
-        """Show that it is alive, and look for others with this vehicle id.
-
-        It gives way to an elder one: it sends nothing more, and calls `stop`. `stop` is called,
-        too, when its certificate has expired.
-        """
+        """Show that it is alive. Call `stop` for an elder one, or an expired certificate."""
 
         def give_way() -> None:
             self.gave_way = True

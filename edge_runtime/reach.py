@@ -50,8 +50,7 @@ def _context(files: TlsFiles) -> ssl.SSLContext:
 class Listener:
     """The far end of a TLS link, and until when its certificate and our own hold.
 
-    Zenoh closes a link when the far end's expires, and opens it again within 0.2 s: TLS believes
-    the certificate to the end of the second, and the new link stays.
+    Zenoh closes a link whose certificate expires, and lets a new one in before the second is over.
     """
 
     def __init__(self, endpoint: str, files: TlsFiles) -> None:

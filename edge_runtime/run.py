@@ -133,7 +133,7 @@ class _Runtime:
     def run(self, until: Optional[threading.Event]) -> bool:
         """Drive until it is told to stop; returns False where a thread hangs. Raises UserError."""
         if until is not None:
-            threading.Thread(target=self._stop_when, args=(until,), daemon=True).start()
+            threading.Thread(target=lambda: until.wait() and self.stop(), daemon=True).start()
         # Apart from the watchdog, which is the main thread: a reader of stdout may be stalled.
         announcer = threading.Thread(target=self._announce, name="announce", daemon=True)
         # What is loaded stays: the collector need not look at it again in the middle of a drive.
@@ -154,10 +154,6 @@ class _Runtime:
         if self._tls is not None:
             self._tls.require_valid(time.time())
         return ended
-
-    def _stop_when(self, until: threading.Event) -> None:
-        until.wait()
-        self.stop()
 
     def _announce(self) -> None:
         """Show that it is there, print "ready", and log what keeps states away."""

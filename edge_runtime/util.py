@@ -27,11 +27,7 @@ class UserError(Exception):
 
 
 def name_in_file(name: str, said: str, option: str) -> str:
-    """Return a name that a file holds, of something to load: built in, or an entry point.
-
-    `said` are the words before it, as in "F was trained in". Raises UserError for `module:thing`:
-    no file decides what is imported, so a person must type that after `option`.
-    """
+    """Return what a file names to load. UserError for `module:thing`: a person must type that."""
     if ":" in name:
         rule = f"a module is imported only when it is typed: give {option} {shlex.quote(name)}"
         raise UserError(f"{said} {name}: {rule}")

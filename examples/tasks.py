@@ -115,7 +115,6 @@ class LanderExpert:
         self.env = env
 
     def act(self) -> np.ndarray:
-        """Return the main engine's and the side engines' throttle, each in [-1, 1]."""
         from gymnasium.envs.box2d.lunar_lander import heuristic
 
         return np.clip(heuristic(self.env, self.env.seen), -1.0, 1.0)

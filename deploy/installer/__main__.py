@@ -154,7 +154,7 @@ def _prove(folder: Path, service: Systemd | None) -> None:
 
 def _switch(releases: Releases, service: Systemd, version: str) -> None:
     """Stop, switch and start; whatever goes wrong, start what was good."""
-    good = releases.good()
+    good = releases.linked(BEFORE)
     try:
         service.stop()
         # Units first: `choose` knows by them who runs an installation that was cut off.

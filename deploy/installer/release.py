@@ -82,11 +82,7 @@ class Manifest(NamedTuple):
 
 
 def read_bundle(path: PathLike, trusted: str) -> tuple[Manifest, dict[str, bytes]]:
-    """Read a bundle that the owner of the key `trusted` has signed: manifest, and files by path.
-
-    It is read once, verified and used from memory, so nobody can change it in between.
-    Raises UserError, having written nothing.
-    """
+    """Read a bundle once; UserError where the owner of the key `trusted` has not signed it."""
     data = read_bytes(path, "bundle", _MAX_BUNDLE_MIB)
     with tempfile.NamedTemporaryFile("w") as signers:
         signers.write(f"owner {trusted}\n")
@@ -171,10 +167,6 @@ class Releases:
             is_release = path.name in (DRAFT, DAMAGED) or (path / CONTENTS).exists()
             if is_release and path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-
-    def good(self) -> str | None:
-        """The version to go back to: of a switch that was cut off, the one before it."""
-        return self.linked(BEFORE if os.path.lexists(self.root / BEFORE) else CURRENT)
 
     def prepare(self) -> None:
         """Note what is current: going back is then one rename, which needs no room on the disk."""

@@ -338,11 +338,7 @@ class VehicleRunner:
 
 
 def _plain(report: VehicleReport, names: Sequence[str]) -> VehicleReport:
-    """Return the report in Python's own types: a driver's numbers may be numpy's.
-
-    Raises for what is no report, and where an action of these names is missing: nobody could see
-    whether the vehicle obeys.
-    """
+    """Return the report in Python's own types; raises where it is none, or lacks one of `names`."""
     action = {name: float(value) for name, value in report.action.items()}
     if lacking := [name for name in names if name not in action]:
         raise ValueError(f"feedback without {', '.join(lacking)}")

@@ -47,11 +47,7 @@ class HunterSpec(NamedTuple):
     max_steering_rate_radps: float
 
     def inner_rad(self, centre_rad: float) -> float:
-        """Return the inner wheel's angle for a centre angle, within its limit.
-
-        The inner wheel's circle is half a track narrower: tan(inner) = wheelbase / (radius -
-        track/2) with the radius wheelbase / tan(centre) of the rear axle's middle (Ackermann).
-        """
+        """Return the inner wheel's angle for a centre angle (Ackermann), within its limit."""
         most_rad = self.centre_rad(self.max_inner_steering_rad)
         return self._turned(min(abs(centre_rad), most_rad), centre_rad, -0.5 * self.track_m)
 
@@ -92,10 +88,7 @@ class Similarity(NamedTuple):
         return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
 
     def centre_rad(self, steering: float) -> float:
-        """Return the angle of a wheel in the middle of the front axle, for a steering in -1 to 1.
-
-        The robot is a bicycle that turns about its rear axle: tan(angle) = wheelbase x curvature.
-        """
+        """Return the centre angle for a steering: the robot is a bicycle about its rear axle."""
         return math.atan(self.spec.wheelbase_m * (self.car.curvature(steering) / self.scale))
 
     def steering(self, centre_rad: float) -> float:

@@ -250,9 +250,8 @@ class StreamedCore(abc.ABC):
 class StreamedVehicle(Vehicle):
     """A lock around every call of a core, and a thread that sends what the core asks for.
 
-    A driver is made of its settings and the similarity of its robot to the policy's car, and starts
-    `_stream` at the end of `__init__`. Bus and network are called outside of the lock, so that no
-    caller waits for them.
+    A driver starts `_stream` at the end of `__init__`. Bus and network are called outside of the
+    lock, so that no caller waits for them.
     """
 
     settings_type: ClassVar[Type[RobotSettings]]
