@@ -163,9 +163,9 @@ class _Runtime:
             if policy.trust != VERIFIED:
                 log.event("warning", "policy_not_verified", trust=policy.trust)
             health = self._loop.health()
-            where = f"vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
+            who = f"ready vehicle_id={config.vehicle_id} vehicle={health.vehicle}"
             what = f"policy_id={policy.policy_id} verified_by={policy.public_key or 'none'}"
-            print(printable(f"ready {where} connect={config.connect} {what}"), flush=True)
+            print(printable(f"{who} connect={config.connect} {what}"), flush=True)
             self._notifier.tell(f"READY=1\nSTATUS={health.mode}")
             while not self._over.wait(_WAITING_PERIOD_S) and not self._loop.has_heard():
                 answers, why = why_no_link(config.connect, self._tls)
