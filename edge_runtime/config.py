@@ -40,7 +40,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """All settings of `run`. Relative paths start at the working directory.
 
     `vehicle_settings` are the tables [vehicle.NAME], by name; each driver checks its own. The four
-    before it are of [vehicle]: bounds (inf: none), and which episodes need a re-arm.
+    before it are of [vehicle]: bounds (None: none), and which episodes need a re-arm.
     """
 
     policy: Optional[str] = None
@@ -53,20 +53,21 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     armed_at_start: bool = True
     ride_through: RideThrough = RideThrough()
     log_level: str = "info"
-    max_speed_mps: float = math.inf
-    max_steering_rad: float = math.inf
-    leash_m: float = math.inf
+    max_speed_mps: Optional[float] = None
+    max_steering_rad: Optional[float] = None
+    leash_m: Optional[float] = None
     rearm: str = EACH_EPISODE
     vehicle_settings: Dict[str, Dict[str, Any]] = msgspec.field(default_factory=dict)
 
     @property
     def is_armed_at_start(self) -> bool:
         """Whether a vehicle may drive at once. No start gives a new leash: only a re-arm does."""
-        return self.armed_at_start and self.leash_m == math.inf
+        return self.armed_at_start and self.leash_m is None
 
     @property
     def bounds(self) -> Bounds:
-        return Bounds(self.max_speed_mps, self.max_steering_rad, self.leash_m)
+        given = {name: getattr(self, name) for name in Bounds._fields}
+        return Bounds(**{name: value for name, value in given.items() if value is not None})
 
 
 # The settings that are flags as well: metavar and help.
@@ -165,8 +166,8 @@ def _check(config: Config) -> Config:
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("vehicle.rearm", config.rearm, REARM)
     for name, value in config.bounds._asdict().items():
-        if not value > 0.0:  # nor is NaN
-            raise UserError(f"vehicle.{name} {value:g} is not valid: it must be above 0")
+        if getattr(config, name) is not None and not 0.0 < value < math.inf:
+            raise UserError(f"vehicle.{name} {value:g} is not valid: it must be finite, above 0")
     return config
 
 
