@@ -1,6 +1,7 @@
 """The runtime as a service, and its loop: real threads between a fake policy and a fake link."""
 
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -115,7 +116,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, systemd):
 
 
 def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
-    assert Notifier({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}).watchdog_period_s is None
+    assert Notifier({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}).watchdog_period_s == math.inf
     end = Systemd(str(tmp_path / "notify"))
     notifier = end.notifier()
     for _ in range(2000):  # more than the socket takes
