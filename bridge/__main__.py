@@ -9,7 +9,10 @@ from edge_runtime.cli import program, run_cli
 
 COMMANDS = {
     "simulate": ("bridge.simulate", "serve an environment to an edge runtime"),
-    "sense": ("bridge.sense", "serve a robot's own senses to an edge runtime, not a simulator's"),
+    "sense": (
+        "edge_runtime.sense",
+        "serve a robot's own senses to an edge runtime, not a simulator's",
+    ),
     "router": ("bridge.ports:ROUTER", "connect simulators, edge runtimes and viewers"),
     "record": ("bridge.ports:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": ("bridge.replay", "run recorded states through a policy, and compare"),

@@ -89,16 +89,6 @@ class RecordedEpisode:
         return made
 
 
-def read_episode(path: Path, vehicle_id: str | None, number: int | None) -> RecordedEpisode:
-    """Read an episode; ``number`` None: the only one."""
-    drives = read_episodes(path, vehicle_id, number)
-    number = 0 if number is None and len(drives) == 1 else number
-    if number is None or number >= len(drives):
-        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
-        raise UserError(f"{path} holds {which}")
-    return drives[number]
-
-
 def read_episodes(
     path: Path, vehicle_id: str | None = None, number: int | None = None
 ) -> list[RecordedEpisode]:
@@ -225,9 +215,13 @@ def add_place(parser: Any) -> None:
 
 
 def find_fork(recording: str, asked: Namespace) -> tuple[RecordedEpisode, int]:
-    """Return the drive that the options name, and the step of the fork."""
-    drive = read_episode(Path(recording), asked.vehicle_id, asked.episode)
-    return drive, drive.step_at(asked.at)
+    """Return the drive that the options name, or the only one, and the step of the fork."""
+    drives = read_episodes(Path(recording), asked.vehicle_id, asked.episode)
+    number = 0 if asked.episode is None and len(drives) == 1 else asked.episode
+    if number is None or number >= len(drives):
+        which = f"{counted(len(drives), 'drive')} with scenes; --episode says which, from 0"
+        raise UserError(f"{recording} holds {which}")
+    return drives[number], drives[number].step_at(asked.at)
 
 
 def _add_fork_arguments(parser: Any) -> None:

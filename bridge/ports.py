@@ -25,7 +25,7 @@ import zenoh
 from bridge.environments import picture_of, say_once, scene_of
 from bridge.messages import DECODERS, SHADOW, TOKEN_TOPICS, Heard, Scene, encode_scene
 from bridge.network import SHORT_GRAMMAR, parse_spec
-from bridge.recording import RecordingWriter, new_recording, read_whole
+from bridge.recording import Recording, RecordingWriter, choose_vehicle, heard_of, new_recording
 from bridge.rerun import FOXGLOVE_PORT, SERVE, SPAWN
 from edge_runtime import cli
 from edge_runtime import tls as access
@@ -259,7 +259,9 @@ def open_source(arguments: Any) -> Iterator[Iterator[Heard | None]]:
     simulator goes; None where none comes for a moment.
     """
     if arguments.recording:
-        yield read_whole(arguments.recording, arguments.vehicle_id)
+        recording = Recording(Path(arguments.recording))
+        yield heard_of(recording, choose_vehicle(recording, arguments.vehicle_id))
+        recording.say_trouble()
         return
     where, vehicle_id = arguments.connect, arguments.vehicle_id or DEFAULT_VEHICLE_ID
     tls = tls_for(arguments.tls, where)

@@ -140,18 +140,6 @@ def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
             yield Heard(channel.topic, topic, data, message.log_time, len(data))
 
 
-def read_whole(path: str, vehicle_id: str | None) -> Iterator[Heard]:
-    """Return the messages of one vehicle; at the end it prints what is wrong with the file."""
-    recording = Recording(Path(path))
-    vehicle_id = choose_vehicle(recording, vehicle_id)
-
-    def read() -> Iterator[Heard]:
-        yield from heard_of(recording, vehicle_id)
-        recording.say_trouble()
-
-    return read()
-
-
 def valid_messages(recording: Recording, vehicle_id: str) -> Iterator[tuple[Heard, Any]]:
     """Yield a drive's messages, heard and decoded; the invalid, and a shadow's, are left out."""
     for heard in heard_of(recording, vehicle_id):

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fork import RecordedEpisode, read_episode
+from bridge import fork
+from bridge.fork import RecordedEpisode
 from bridge.tests.recordings import record_in_process
 from hil_tests.testing.commands import call
 from hil_tests.testing.policies import write_policy
@@ -22,7 +23,8 @@ def recorded(tmp_path, monkeypatch, one_thread) -> RecordedEpisode:
     write_policy("policy.onnx", "constant", 0.2)
     drive = Path("drive.mcap")
     record_in_process(drive, "left_turn", Path("policy.onnx"), 3, "50ms", "variant")
-    return read_episode(drive, None, None)
+    (episode,) = fork.read_episodes(drive)
+    return episode
 
 
 def test_a_persons_fork_begins_where_the_drive_was_and_is_a_demonstration(
